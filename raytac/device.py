@@ -1,0 +1,115 @@
+"""Where the work runs: choose CPU or CUDA once, and find the LLVM library that Dr.Jit compiles CPU code with.
+
+Nothing here imports Mitsuba, Dr.Jit or Warp, so that asking is cheap and safe.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.metadata
+import os
+import re
+import sys
+from pathlib import Path
+
+from raytac.errors import BackendError, InputError
+
+__all__ = ["DEVICES", "cuda_device_count", "llvm_library", "optix_library", "resolve_device"]
+
+DEVICES = ("auto", "cpu", "cuda")
+"""Names that every ``device`` option accepts."""
+
+LLVM_MINIMUM = 16
+"""Oldest LLVM looked for on the system: 14 is refused by Dr.Jit 1.5, and 15 was seen to abort the process."""
+
+
+def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
+    """Return ``"cuda"`` or ``"cpu"`` for a ``device`` option.
+
+    ``"auto"`` is CUDA when a device answers (and, for ``ray_tracing``, the driver brings OptiX), else the CPU.
+
+    Raises:
+        InputError: ``device`` is not one of ``DEVICES``.
+        BackendError: ``"cuda"`` was asked for and does not work here.
+    """
+    if device not in DEVICES:
+        raise InputError("device", value=device, rule="must be a known device", choices=DEVICES)
+    if device == "cpu":
+        return "cpu"
+    missing = _cuda_missing(ray_tracing)
+    if not missing:
+        return "cuda"
+    if device == "cuda":
+        raise BackendError(f"device 'cuda' does not work here: {missing}; use device 'cpu' or 'auto' (`raytac doctor` tells more)")
+    return "cpu"
+
+
+def _cuda_missing(ray_tracing: bool) -> str:
+    if cuda_device_count() == 0:
+        return "no NVIDIA driver or no visible CUDA device"
+    if ray_tracing and optix_library() is None:
+        return "the NVIDIA driver brings no OptiX (libnvoptix.so.1; in a container ask for the 'graphics' capability)"
+    return ""
+
+
+@functools.cache
+def cuda_device_count() -> int:
+    """Number of CUDA devices that the driver shows this process; 0 without a driver. Creates no CUDA context."""
+    driver = _load(("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so"))
+    if driver is None or driver.cuInit(0) != 0:
+        return 0
+    count = ctypes.c_int(0)
+    return count.value if driver.cuDeviceGetCount(ctypes.byref(count)) == 0 else 0
+
+
+@functools.cache
+def optix_library() -> str | None:
+    """Name of the OptiX library that can be loaded (``DRJIT_LIBOPTIX_PATH`` wins, as in Dr.Jit), or None."""
+    names = [os.environ.get("DRJIT_LIBOPTIX_PATH", ""), "nvoptix.dll" if sys.platform == "win32" else "libnvoptix.so.1"]
+    return next((name for name in names if name and _load((name,)) is not None), None)
+
+
+def llvm_library() -> Path | None:
+    """The libLLVM that Dr.Jit should use, or None if there is none.
+
+    In this order: ``DRJIT_LIBLLVM_PATH`` as the user set it (even if the file is missing: Dr.Jit then says so), the one that the
+    ``karellen-llvm-core`` package brought, the newest one of version 16 or later on the system.
+    """
+    if chosen := os.environ.get("DRJIT_LIBLLVM_PATH"):
+        return Path(chosen)
+    return _packaged_llvm() or _system_llvm()
+
+
+def _packaged_llvm() -> Path | None:
+    try:
+        files = importlib.metadata.files("karellen-llvm-core") or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    named = [file for file in files if file.name in ("libLLVM.so", "libLLVM.dylib", "LLVM-C.dll")]
+    found = [Path(str(file.locate())) for file in named]
+    beside = [Path(sys.prefix) / "lib" / name for name in ("libLLVM.so", "libLLVM.dylib")]  # RECORD may not list links
+    return next((path.resolve() for path in (*found, *beside) if path.exists()), None)
+
+
+def _system_llvm() -> Path | None:
+    folders = [Path(sys.prefix) / "lib", Path("/usr/lib"), Path("/usr/lib64"), Path("/usr/local/lib")]
+    folders += Path("/usr/lib").glob("*-linux-gnu")
+    folders += [path for top in ("/usr/lib", "/opt/homebrew/opt", "/usr/local/opt") for path in Path(top).glob("llvm*/lib")]
+    candidates: dict[Path, int] = {}
+    for folder in folders:
+        for path in (*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib")):
+            match = re.fullmatch(r"libLLVM[-.](?:so\.)?(\d+)(?:\.\d+)*(?:\.so(?:\.\d+)*|\.dylib)?", path.name)
+            version = re.search(r"(\d+)", path.parent.parent.name) if not match else match
+            if version and int(version[1]) >= LLVM_MINIMUM:
+                candidates[path] = int(version[1])
+    return max(candidates, key=lambda path: candidates[path], default=None)
+
+
+def _load(names: tuple[str, ...]) -> ctypes.CDLL | None:
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    return None
