@@ -1,0 +1,75 @@
+"""Multi-layer OpenEXR files of float32 channels by name, with text in the header.
+
+Conventions (OpenEXR technical introduction): ``R G B`` linear; ``led_red.R`` … one layer a light; ``N.X N.Y N.Z`` normals;
+``P.X P.Y P.Z`` position [m]; ``Z`` camera-axis depth [m], not distance along the ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from raytac.errors import InputError
+
+__all__ = ["HEADER_PREFIX", "read_exr", "vector_channels", "write_exr"]
+
+HEADER_PREFIX = "raytac:"
+"""Header attributes of this package are ``raytac:sensor``, ``raytac:seed``, …; all are text."""
+
+
+def vector_channels(name: str, image: np.ndarray, suffixes: str = "XYZ") -> dict[str, np.ndarray]:
+    """``("N", (H, W, 3))`` to ``{"N.X": (H, W), …}``; an empty name gives ``{"R": …}`` for suffixes ``"RGB"``."""
+    if image.ndim != 3 or image.shape[2] != len(suffixes):
+        raise InputError(f"channels {name!r}", value=image.shape, rule=f"must have shape (H, W, {len(suffixes)})")
+    return {f"{name}.{s}" if name else s: image[:, :, i] for i, s in enumerate(suffixes)}
+
+
+def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[str, str] | None = None) -> None:
+    """Write float32 channels, losslessly compressed; ``header`` keys get the prefix ``raytac:``.
+
+    Args:
+        path: file to write.
+        channels: name to image of shape (H, W), all of one shape.
+        header: text attributes.
+
+    Raises:
+        InputError: no channels, shapes that differ, or a header value that is not text.
+    """
+    if not channels:
+        raise InputError("channels", value={}, rule="must hold at least one image")
+    shape = next(iter(channels.values())).shape
+    for name, image in channels.items():
+        if image.ndim != 2 or image.shape != shape:
+            raise InputError(f"channel {name!r}", value=image.shape, rule=f"must have the shape of the others, {shape}")
+    for key, value in (header or {}).items():
+        if not isinstance(value, str):
+            raise InputError(f"header {key!r}", value=value, rule="must be text")
+
+    import OpenEXR
+
+    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    attributes |= {HEADER_PREFIX + key: value for key, value in (header or {}).items()}
+    images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
+    with OpenEXR.File(attributes, images) as file:
+        file.write(str(path))
+
+
+def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Channels by name, each shape (H, W), and the ``raytac:`` header attributes without their prefix.
+
+    Raises:
+        InputError: the file is missing or is not an EXR file.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise InputError("EXR file", value=path, rule="must exist")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            header = {k.removeprefix(HEADER_PREFIX): v for k, v in file.header().items() if k.startswith(HEADER_PREFIX)}
+    except RuntimeError as error:
+        raise InputError("EXR file", value=path, rule=f"must be readable as OpenEXR ({error})") from error
+    return channels, header

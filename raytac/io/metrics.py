@@ -1,0 +1,96 @@
+"""``metrics.json``: one flat object of dotted keys to numbers or strings, beside everything that a command or experiment writes."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import numbers
+import platform
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from raytac.errors import InputError
+
+__all__ = ["REQUIRED", "VERSIONED", "Metric", "check_metrics", "read_metrics", "versions", "write_metrics"]
+
+Metric = int | float | str
+
+REQUIRED = ("device", "wall_s")
+"""Keys that every file has, besides at least one ``versions.*``."""
+
+VERSIONED = ("raytac", "numpy", "mitsuba", "drjit", "mujoco", "OpenEXR", "trimesh", "matplotlib")
+"""Distributions whose versions go into every file."""
+
+_KEY = re.compile(r"[A-Za-z0-9_\-]+(\.[A-Za-z0-9_\-]+)*")
+
+
+def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
+    """``versions.python`` and ``versions.<distribution>`` of what is installed; what is not is left out."""
+    found = {"versions.python": platform.python_version()}
+    for name in distributions:
+        try:
+            found[f"versions.{name}"] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    if "versions.raytac" not in found:  # a plain checkout that was never installed
+        import raytac
+
+        found["versions.raytac"] = raytac.__version__
+    return found
+
+
+def check_metrics(values: Mapping[str, object]) -> dict[str, Metric]:
+    """The metrics as plain ints, floats and strings, in their order.
+
+    Raises:
+        InputError: a key that is not dotted words, a value that is not a finite number or a string, or a missing required key.
+    """
+    checked: dict[str, Metric] = {}
+    for key, value in values.items():
+        if not isinstance(key, str) or not _KEY.fullmatch(key):
+            raise InputError("metrics key", value=key, rule="must be words of letters, digits, _ and - joined by dots")
+        checked[key] = _plain(key, value)
+    for key in REQUIRED:
+        if key not in checked:
+            raise InputError("metrics", value=sorted(checked), rule=f"must hold the key {key!r}")
+    if not any(key.startswith("versions.") for key in checked):
+        raise InputError("metrics", value=sorted(checked), rule="must hold at least one 'versions.*' key")
+    return checked
+
+
+def _plain(key: str, value: object) -> Metric:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise InputError(f"metrics[{key!r}]", value=value, rule="must be a number or a string, not a list, a table or a truth value")
+    if not math.isfinite(value):
+        raise InputError(f"metrics[{key!r}]", value=value, rule="must be finite (leave the key out, or say in a string why)")
+    return int(value) if isinstance(value, numbers.Integral) else float(value)
+
+
+def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]:
+    """Check ``values``, write them as JSON with one key a line, and return them as written.
+
+    Raises:
+        InputError: see ``check_metrics``; nothing is written then.
+    """
+    checked = check_metrics(values)
+    path.write_text(json.dumps(checked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return checked
+
+
+def read_metrics(path: Path) -> dict[str, Metric]:
+    """Read and check a ``metrics.json``.
+
+    Raises:
+        InputError: the file is not one flat object of dotted keys to numbers or strings.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise InputError("metrics file", value=path, rule=f"must be JSON ({error})") from error
+    if not isinstance(values, dict):
+        raise InputError("metrics file", value=path, rule="must hold one JSON object")
+    return check_metrics(values)

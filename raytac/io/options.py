@@ -1,0 +1,52 @@
+"""The options that every experiment and every command that computes shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from raytac.errors import InputError
+
+__all__ = ["CommonOptions", "DeviceName", "parse_outputs", "parse_resolution"]
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Base of an ``Args`` dataclass: ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
+
+    out: Path
+    """Folder to write to; it is created, and ``metrics.json`` goes in it."""
+    device: DeviceName = "auto"
+    """Where to compute; auto is CUDA if it works, else the CPU."""
+    seed: int = 0
+    """Seed of every random number; the same seed gives the same result."""
+
+
+def parse_resolution(text: str) -> tuple[int, int]:
+    """``"320x240"`` to (width, height) [px].
+
+    Raises:
+        InputError: not two positive whole numbers joined by ``x``.
+    """
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.strip().isdecimal() and height.strip().isdecimal() and int(width) > 0 and int(height) > 0):
+        raise InputError("resolution", value=text, rule="must be WIDTHxHEIGHT in pixels, as in 320x240")
+    return int(width), int(height)
+
+
+def parse_outputs(text: str, choices: tuple[str, ...]) -> tuple[str, ...]:
+    """``"rgb,depth"`` to names in the order of ``choices``, each once.
+
+    Raises:
+        InputError: an unknown name, or none.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in choices:
+            raise InputError("outputs", value=name, rule="must be known outputs joined by commas", choices=choices)
+    if not names:
+        raise InputError("outputs", value=text, rule="must name at least one output", choices=choices)
+    return tuple(name for name in choices if name in names)
