@@ -1,0 +1,46 @@
+"""Sensors, lights and press scenes as data: dataclasses in SI units, and the only readers of TOML in the package."""
+
+from __future__ import annotations
+
+from raytac.specs.files import available
+from raytac.specs.mesh import load_mesh
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.specs.press_file import load_press, validate_press
+from raytac.specs.sensor import (
+    CameraSpec,
+    CaseSpec,
+    CoatSpec,
+    GelpadSpec,
+    LedSpec,
+    LightsSpec,
+    MarkerSpec,
+    RefractionSpec,
+    ResponseSpec,
+    SensorSpec,
+)
+from raytac.specs.sensor_check import validate_sensor
+from raytac.specs.sensor_file import load_lights, load_sensor, with_lights
+
+__all__ = [
+    "CameraSpec",
+    "CaseSpec",
+    "CoatSpec",
+    "GelpadSpec",
+    "LedSpec",
+    "LightsSpec",
+    "MarkerSpec",
+    "ObjectSpec",
+    "PressScene",
+    "RefractionSpec",
+    "ResponseSpec",
+    "SensorSpec",
+    "StageSpec",
+    "available",
+    "load_lights",
+    "load_mesh",
+    "load_press",
+    "load_sensor",
+    "validate_press",
+    "validate_sensor",
+    "with_lights",
+]

@@ -1,0 +1,49 @@
+"""From a name or a path to the file that holds a sensor, its lights or a press scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from raytac.assets import AssetKind, asset_root
+from raytac.errors import SpecError
+
+__all__ = ["available", "find_file"]
+
+_FOLDERS: dict[str, tuple[AssetKind, str]] = {"sensor": ("scenes", "sensors"), "press scene": ("scenes", "press"), "lights": ("lights", "")}
+
+
+def available(what: str) -> tuple[str, ...]:
+    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"`` or ``"lights"``."""
+    return tuple(sorted(path.stem for path in _folder(what).glob("*.toml")))
+
+
+def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) -> Path:
+    """Absolute path of the TOML file that ``name_or_path`` means.
+
+    A bare word (``coin``) is a shipped file. Anything with a folder or the suffix ``.toml`` is a path: relative to ``base``, or,
+    with no ``base``, to the working directory first and then to the folder that holds the shipped ``scenes/`` and ``lights/``, so
+    that ``scenes/press/coin.toml`` means the same inside and outside a checkout.
+
+    Raises:
+        SpecError: no such name (the message lists those there are), or no such file.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, str) and not text.endswith(".toml") and not set(text) & {"/", "\\"}:
+        names = available(what)
+        if text not in names:
+            raise SpecError("no shipped file of this name, and not a path to a .toml file", key=what, value=text, choices=names)
+        return _folder(what) / f"{text}.toml"
+    path = Path(name_or_path).expanduser()
+    candidates = [base / path] if base is not None else [Path.cwd() / path, asset_root(_FOLDERS[what][0]).parent / path]
+    for candidate in candidates:
+        try:
+            if candidate.is_file():
+                return candidate.resolve()
+        except (OSError, ValueError):
+            continue
+    raise SpecError("the file does not exist", file=candidates[0], key=what, value=text)
+
+
+def _folder(what: str) -> Path:
+    kind, folder = _FOLDERS[what]
+    return asset_root(kind) / folder

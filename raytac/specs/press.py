@@ -1,0 +1,63 @@
+"""What a press scene is: an object, and the motion that presses it into the pad. SI units, pad frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from raytac.specs.sensor import Vec3
+
+__all__ = ["ObjectSpec", "PressScene", "StageSpec"]
+
+
+@dataclass(frozen=True)
+class ObjectSpec:
+    """The indenter, a union of convex or concave parts rigidly joined.
+
+    Parts are MuJoCo geoms (``sphere capsule ellipsoid cylinder box mesh``); cone, torus, pins and coin are meshes generated in
+    code from a few lengths, so that no binary asset is needed.
+    """
+
+    kind: str
+    """``none sphere cylinder edge cone torus pins coin mesh``."""
+    params: dict[str, float | int | str]
+    """Lengths [m] and counts of the kind; for ``mesh`` also the absolute ``path`` and ``scale``."""
+    position: Vec3
+    """Offset of the object's origin from first touch above the pad centre, pad frame [m]; z is not used (contact sets it)."""
+    quaternion: tuple[float, float, float, float]
+    """``pad_from_object`` rotation, wxyz, normalised."""
+    mass: float
+    """Mass of the object [kg] (matters only for force-driven stages)."""
+
+
+@dataclass(frozen=True)
+class StageSpec:
+    """One leg of the trajectory; targets are absolute, measured from first touch at zero shear and twist."""
+
+    kind: str
+    """``indent shear twist release``."""
+    depth: float | None = None
+    """Indentation depth at the end of an ``indent`` stage [m] (exclusive with ``force``)."""
+    force: float | None = None
+    """Normal force at the end of an ``indent`` stage [N] (exclusive with ``depth``)."""
+    shear: tuple[float, float] = (0.0, 0.0)
+    """Tangential displacement along x and y at the end of a ``shear`` stage [m]."""
+    twist: float = 0.0
+    """Rotation about +z at the end of a ``twist`` stage [rad]."""
+    duration: float = 0.5
+    """Time that the leg takes [s]."""
+
+
+@dataclass(frozen=True)
+class PressScene:
+    name: str
+    object: ObjectSpec
+    trajectory: tuple[StageSpec, ...]
+    """Empty for an untouched pad."""
+    source: Path | None = None
+
+    @property
+    def peak_stage(self) -> int:
+        """Index of the stage whose end is imaged: the last one that is not a release; −1 if there is none."""
+        kinds = [s.kind for s in self.trajectory]
+        return max((i for i, k in enumerate(kinds) if k != "release"), default=-1)

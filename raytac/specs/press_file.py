@@ -1,0 +1,181 @@
+"""Reads press scenes from TOML: the schemas of ``scenes/press/*.toml``, and the rules between scene and sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from raytac.errors import MeshError, SpecError
+from raytac.specs.files import find_file
+from raytac.specs.mesh import load_mesh
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.specs.sensor import SensorSpec
+from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
+
+__all__ = ["OBJECT_SCHEMA", "POSE_SCHEMA", "STAGE_SCHEMA", "load_press", "validate_press"]
+
+_LENGTH = Number("(0, 100]")
+
+OBJECT_SCHEMA: Final[dict[str, Schema]] = {
+    "none": {},
+    "sphere": {"radius_mm": _LENGTH},
+    "cylinder": {"radius_mm": _LENGTH, "length_mm": _LENGTH},
+    "edge": {"side_mm": _LENGTH},
+    "cone": {"radius_mm": _LENGTH, "height_mm": _LENGTH, "tip_radius_mm": _LENGTH},
+    "torus": {"major_radius_mm": _LENGTH, "minor_radius_mm": _LENGTH},
+    "pins": {
+        "rows": Integer("[1, 50]"),
+        "columns": Integer("[1, 50]"),
+        "pitch_mm": _LENGTH,
+        "pin_radius_mm": _LENGTH,
+        "pin_height_mm": _LENGTH,
+    },
+    "coin": {"radius_mm": _LENGTH, "thickness_mm": _LENGTH, "relief_height_mm": _LENGTH},
+    "mesh": {"path": Text(), "scale_m_per_unit": Number("(0, 10]")},
+}
+"""Kind of object to the keys of its own in ``[object]``."""
+
+POSE_SCHEMA: Final[Schema] = {
+    "position_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
+    "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
+    "mass_kg": Number("[0.0001, 100]", default=0.1),
+}
+"""Keys of ``[object]`` that every kind but ``none`` has."""
+
+_KIND = "kind"
+_DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
+STAGE_SCHEMA: Final[dict[str, Schema]] = {
+    "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
+    "shear": {"shear_mm": Number("[-50, 50]", length=2), **_DURATION},
+    "twist": {"twist_deg": Number("[-180, 180]"), **_DURATION},
+    "release": {**_DURATION},
+}
+"""Kind of stage to its keys in ``[[trajectory]]``."""
+
+
+def load_press(name_or_path: str | Path) -> PressScene:
+    """Read and check a press scene.
+
+    Args:
+        name_or_path: shipped name such as ``"coin"``, or path of a TOML file (see ``scenes/README.md``).
+
+    Returns:
+        The scene in SI units; its name is the file's stem. A mesh is read once to check it; ``params["path"]`` is its absolute path.
+
+    Raises:
+        SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, an object whose lengths
+            contradict each other, or a trajectory in an impossible order.
+        MeshError: the object's mesh cannot be used (see ``load_mesh``).
+    """
+    path = find_file("press scene", name_or_path)
+    top = read_toml(path)
+    top.read({}, sections=("object", "trajectory"))
+    target = _read_object(top.section("object"))
+    stages = top.sections("trajectory")
+    if target.kind == "none" and stages:
+        raise top.error("must be absent where there is no object", "trajectory")
+    if target.kind != "none" and not stages:
+        raise top.error("at least one [[trajectory]] stage is needed to press the object", "trajectory")
+    return PressScene(path.stem, target, _read_trajectory(stages), source=path)
+
+
+def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
+    """Check a scene against the sensor that it is pressed into.
+
+    Raises:
+        SpecError: an indent as deep as the pad is thick or deeper, or an object whose origin starts or is sheared off the pad.
+    """
+    pad = sensor.gelpad
+    half = (pad.size[0] / 2, pad.size[1] / 2)
+    x, y, _ = scene.object.position
+    if scene.object.kind != "none" and (abs(x) > half[0] or abs(y) > half[1]):
+        rule = f"the object must start on the pad of {sensor.name}: |x| <= {half[0] * 1e3:.4g} mm, |y| <= {half[1] * 1e3:.4g} mm"
+        raise SpecError(rule, file=scene.source, key="object.position_mm", value=[x * 1e3, y * 1e3])
+    for index, stage in enumerate(scene.trajectory):
+        if stage.depth is not None and not stage.depth < pad.thickness:
+            rule = f"the press must be less deep than the pad of {sensor.name} is thick, {pad.thickness * 1e3:.4g} mm"
+            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].depth_mm", value=_mm(stage.depth))
+        dx, dy = stage.shear
+        if abs(x + dx) > half[0] or abs(y + dy) > half[1]:
+            rule = (
+                f"the shear must leave the object on the pad of {sensor.name}: from {[_mm(x), _mm(y)]} mm to "
+                f"|x| <= {half[0] * 1e3:.4g} mm, |y| <= {half[1] * 1e3:.4g} mm"
+            )
+            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].shear_mm", value=[_mm(dx), _mm(dy)])
+
+
+def _read_object(table: Table) -> ObjectSpec:
+    kind = table.read_one(_KIND, Text(choices=tuple(OBJECT_SCHEMA)))
+    pose = {} if kind == "none" else POSE_SCHEMA
+    values = table.read({_KIND: Text(), **OBJECT_SCHEMA[kind], **pose})
+    del values[_KIND]
+    if kind == "none":
+        return ObjectSpec(kind, {}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0)
+    x, y = values.pop("position")
+    quaternion, mass = values.pop("quaternion"), values.pop("mass")
+    length = math.hypot(*quaternion)
+    if abs(length - 1) > 0.01:
+        rule = f"must be a unit quaternion w, x, y, z (to 1 %, then normalised); its length is {length:.4g}"
+        raise table.error(rule, "quaternion_wxyz", table.data["quaternion_wxyz"])
+    w, i, j, k = (component / length for component in quaternion)
+    _check_lengths(table, kind, values)
+    if kind == "mesh":
+        _resolve_mesh(table, values)
+    return ObjectSpec(kind, values, (x, y, 0.0), (w, i, j, k), mass)
+
+
+def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
+    """Lengths [m] of one object that contradict each other."""
+    if kind == "cone":
+        # A sphere of radius r that touches the side has its centre r √(R² + h²) / R above the sharp apex: it must lie below the base.
+        largest = p["radius"] * p["height"] / math.hypot(p["radius"], p["height"])
+        if p["tip_radius"] >= largest:
+            raise _length_error(table, "tip_radius_mm", f"must be less than {_mm(largest)} mm for this radius and height")
+    elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
+        raise _length_error(table, "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}")
+    elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] <= 2 * p["pin_radius"]:
+        raise _length_error(table, "pitch_mm", f"pins must stand apart: more than twice pin_radius_mm = {_mm(p['pin_radius'])}")
+    elif kind == "coin" and p["relief_height"] >= p["thickness"]:
+        raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
+
+
+def _resolve_mesh(table: Table, values: dict[str, Any]) -> None:
+    path = (table.file.parent / Path(values["path"]).expanduser()).resolve()
+    try:
+        load_mesh(path, values["scale"])
+    except MeshError as error:
+        key = "scale_m_per_unit" if error.key == "scale" else "path"
+        raise MeshError(
+            f"{error.rule} (mesh {path})", file=table.file, key=f"object.{key}", value=table.data[key], choices=error.choices
+        ) from error
+    values["path"] = str(path)
+
+
+def _read_trajectory(tables: tuple[Table, ...]) -> tuple[StageSpec, ...]:
+    stages: list[StageSpec] = []
+    touching = False
+    for table in tables:
+        kind = table.read_one(_KIND, Text(choices=tuple(STAGE_SCHEMA)))
+        values = table.read({_KIND: Text(), **STAGE_SCHEMA[kind]})
+        if kind == "indent":
+            if (values["depth"] is None) == (values["force"] is None):
+                given = {key: table.data[key] for key in ("depth_mm", "force_n") if key in table.data}
+                rule = "an indent needs exactly one of depth_mm and force_n"
+                raise table.error(f"{rule}, got both" if given else f"{rule}, got neither", "depth_mm", given.get("depth_mm"))
+            touching = True
+        elif not touching:
+            raise table.error("must come after an indent that has not been released", _KIND, kind)
+        elif kind == "release":
+            touching = False
+        stages.append(StageSpec(**values))
+    return tuple(stages)
+
+
+def _length_error(table: Table, key: str, rule: str) -> SpecError:
+    return table.error(rule, key, table.data[key])
+
+
+def _mm(length: float) -> float:
+    return float(f"{length * 1e3:.6g}")

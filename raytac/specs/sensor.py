@@ -1,0 +1,177 @@
+"""What a sensor is: gelpad, coat, case, camera, response, markers and lights, in SI units.
+
+Frames. Everything is given in the **pad frame**: origin at the centre of the undeformed outer gel surface, +z out of the
+sensor towards the object, +x image right, +y image down. The camera and the LEDs therefore lie at z < 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+
+__all__ = [
+    "CameraSpec",
+    "CaseSpec",
+    "CoatSpec",
+    "GelpadSpec",
+    "LedSpec",
+    "LightsSpec",
+    "MarkerSpec",
+    "RefractionSpec",
+    "ResponseSpec",
+    "SensorSpec",
+]
+
+
+@dataclass(frozen=True)
+class GelpadSpec:
+    """The elastomer block under the coat."""
+
+    size: Vec2
+    """Extent along x (image right) and y (image down) [m]."""
+    thickness: float
+    """Distance from the bonded face to the outer surface at the pad centre [m]."""
+    dome_radius: Vec2
+    """Radii of curvature along x and y of the outer surface at rest [m]; ``inf`` is flat."""
+    youngs_modulus: float
+    """Young's modulus E [Pa]."""
+    poisson_ratio: float
+    """Poisson's ratio ν, 0 <= ν < 0.5."""
+    density: float
+    """Mass density ρ [kg/m³]."""
+    friction: float
+    """Coulomb friction coefficient μ against the object."""
+
+
+@dataclass(frozen=True)
+class CoatSpec:
+    """The pigmented skin that the camera sees: a diffuse base blended with a rough (GGX) specular lobe."""
+
+    reflectance: Vec3
+    """Diffuse albedo per camera channel (linear R, G, B), each in [0, 1]."""
+    specular: float
+    """Share of the rough specular lobe in the blend, in [0, 1); 0 is Lambertian."""
+    roughness: float
+    """GGX roughness α of the specular lobe, in [0.05, 1]."""
+
+
+@dataclass(frozen=True)
+class CaseSpec:
+    """The inside of the housing: four walls around the light and a floor behind the camera."""
+
+    size: Vec2
+    """Inner extent along x and y [m]."""
+    floor_z: float
+    """Pad-frame z of the floor (the camera board) [m], below the camera."""
+    reflectance: float
+    """Diffuse albedo of walls and floor, in [0, 1)."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A pinhole looking along +z, given by what is measured with a ruler: the pixel pitch on the gel plane z = 0."""
+
+    resolution: tuple[int, int]
+    """Native (width, height) [px] of the image that the specification describes."""
+    pixel_pitch: Vec2
+    """Size of one native pixel on the plane z = 0 along x and y [m]."""
+    position: Vec3
+    """Pinhole (effective centre of projection) in the pad frame [m]; z < 0. The image centre looks along +z."""
+    principal_point: Vec2
+    """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
+
+
+@dataclass(frozen=True)
+class ResponseSpec:
+    """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · L + black)^(1/γ)."""
+
+    exposure: float
+    """Common gain from radiance [W/(m² sr), relative] to full scale 1."""
+    white_balance: Vec3
+    """Gain of each channel after the exposure."""
+    gamma: float
+    """Encoding exponent γ (1 is linear)."""
+    black_level: Vec3
+    """Offset per channel in linear full scale."""
+    vignetting: Vec3
+    """Coefficients (a1, a2, a3) of 1 + a1 r² + a2 r⁴ + a3 r⁶ with r = distance from the principal point over half the
+    image diagonal; all 0 is none (cos⁴ fall-off of the pinhole is not added)."""
+
+
+@dataclass(frozen=True)
+class MarkerSpec:
+    """A regular grid of dots printed on the coat; rows = columns = 0 means none."""
+
+    rows: int
+    columns: int
+    pitch: Vec2
+    """Spacing along x (columns) and y (rows) [m]."""
+    offset: Vec2
+    """Position of the grid's centre in the pad frame [m]."""
+    radius: float
+    """Dot radius [m]."""
+    reflectance: float
+    """Diffuse albedo of a dot, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class RefractionSpec:
+    """Planar layers between the air around camera and LEDs and the coat; ``model`` is ``"none"`` or ``"slab"``.
+
+    ``"slab"``: the gel and its support plate, index-matched, with a flat air interface at z = −(thickness + plate).
+    """
+
+    model: str
+    ior: float
+    """Refractive index of gel and plate (one medium)."""
+    plate_thickness: float
+    """Thickness of the support plate behind the gelpad [m]."""
+
+
+@dataclass(frozen=True)
+class LedSpec:
+    """One LED: a rectangle that emits from its front side with radiance ∝ cos^(n−1) θ, i.e. intensity ∝ cosⁿ θ."""
+
+    name: str
+    layer: str
+    """Name of the layer (colour group, e.g. ``"red"``) that it is rendered into."""
+    position: Vec3
+    """Centre of the emitting rectangle, pad frame [m]."""
+    axis: Vec3
+    """Unit emission axis (front normal of the rectangle), pad frame."""
+    size: Vec2
+    """Edge lengths of the rectangle [m]; the first edge lies along the direction of z × axis (or x if parallel)."""
+    lobe: float
+    """Lobe exponent n >= 1; 1 is a Lambertian emitter."""
+    power: Vec3
+    """Intensity on the axis per camera channel (linear R, G, B) [W/sr, relative]: point-light equivalent at n and size."""
+
+
+@dataclass(frozen=True)
+class LightsSpec:
+    leds: tuple[LedSpec, ...]
+    source: Path | None = None
+    """File that it was read from."""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Layer names in order of first appearance."""
+        return tuple(dict.fromkeys(led.layer for led in self.leds))
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    name: str
+    gelpad: GelpadSpec
+    coat: CoatSpec
+    case: CaseSpec
+    camera: CameraSpec
+    response: ResponseSpec
+    markers: MarkerSpec
+    refraction: RefractionSpec
+    lights: LightsSpec
+    source: Path | None = None
+    """File that it was read from."""

@@ -1,0 +1,153 @@
+"""Rules that need more than one value of a sensor: what must fit, see, or stay clear of what."""
+
+from __future__ import annotations
+
+import math
+
+from raytac.errors import SpecError
+from raytac.specs.sensor import GelpadSpec, LedSpec, SensorSpec, Vec3
+
+__all__ = ["validate_sensor"]
+
+_SLACK = 1e-9
+"""Tolerance of geometric comparisons [m]: a part may touch the case or the gel."""
+
+
+def validate_sensor(sensor: SensorSpec) -> None:
+    """Check a sensor as a whole; for sensors changed in code (``dataclasses.replace``), files are checked on loading.
+
+    Raises:
+        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or does not see the pad; the
+            vignette has no light left; markers do not lie on the pad; an LED lies in the gel, above the dome, or outside the case.
+            The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
+    """
+    _check_dome(sensor)
+    _check_camera(sensor)
+    _check_vignetting(sensor)
+    _check_markers(sensor)
+    for index, led in enumerate(sensor.lights.leds):
+        _check_led(sensor, index, led)
+
+
+def _check_dome(sensor: SensorSpec) -> None:
+    pad = sensor.gelpad
+    half = (pad.size[0] / 2, pad.size[1] / 2)
+    if any(radius <= extent for radius, extent in zip(pad.dome_radius, half, strict=True)):
+        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), f"must be more than half the pad, {_mm(half)} mm; inf is flat")
+    depth = dome_depth(pad, *half)
+    if depth >= pad.thickness:
+        rule = f"the dome falls by {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
+        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
+
+
+def _check_camera(sensor: SensorSpec) -> None:
+    pad, case, camera = sensor.gelpad, sensor.case, sensor.camera
+    back = _back_face(sensor)
+    x, y, z = camera.position
+    if z >= -back:
+        rule = f"the camera must lie behind the gel, z < {-back * 1e3:.4g} mm, and look along +z"
+        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+    if not _in_case(sensor, camera.position):
+        raise _error(sensor, "camera.position_mm", _mm(camera.position), f"the camera must lie inside the case, {_case_rule(sensor)}")
+    view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
+    centre = tuple(
+        at + (n / 2 - principal) * pitch
+        for at, n, principal, pitch in zip((x, y), camera.resolution, camera.principal_point, camera.pixel_pitch, strict=True)
+    )
+    if any(abs(c) > size / 2 for c, size in zip(centre, pad.size, strict=True)):
+        rule = f"the camera does not see the pad: its view is centred at {_mm(centre)} mm, off the pad of {_mm(pad.size)} mm"
+        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+    for outer, name in ((pad.size, "pad"), (case.size, "case")):
+        if any(v > size + _SLACK for v, size in zip(view, outer, strict=True)):
+            rule = f"the view of {_mm(view)} mm (resolution times pitch) must not be larger than the {name}, {_mm(outer)} mm"
+            raise _error(sensor, "camera.pixel_pitch_mm", _mm(camera.pixel_pitch), rule)
+
+
+def _check_vignetting(sensor: SensorSpec) -> None:
+    camera, (a1, a2, a3) = sensor.camera, sensor.response.vignetting
+    (width, height), (px, py) = camera.resolution, camera.principal_point
+    farthest = max(math.hypot(u - px, v - py) for u in (0, width) for v in (0, height)) / (math.hypot(width, height) / 2)
+    for step in range(257):
+        r2 = (farthest * step / 256) ** 2
+        if 1 + r2 * (a1 + r2 * (a2 + r2 * a3)) <= 0:
+            rule = "1 + a1 r² + a2 r⁴ + a3 r⁶ must stay above 0 over the whole image"
+            raise _error(sensor, "response.vignetting", list(sensor.response.vignetting), rule)
+
+
+def _check_markers(sensor: SensorSpec) -> None:
+    markers, size = sensor.markers, sensor.gelpad.size
+    if (markers.rows == 0) != (markers.columns == 0):
+        raise _error(sensor, "markers.rows", markers.rows, f"rows and columns must both be 0 or both be positive; columns = {markers.columns}")
+    if markers.rows == 0:
+        return
+    if markers.radius <= 0:
+        raise _error(sensor, "markers.radius_mm", markers.radius * 1e3, "must be > 0 where there are markers")
+    counts = (markers.columns, markers.rows)
+    if any(n > 1 and pitch < 2 * markers.radius for n, pitch in zip(counts, markers.pitch, strict=True)):
+        rule = f"dots must not overlap: each pitch at least {2e3 * markers.radius:.4g} mm"
+        raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
+    reach = [abs(o) + (n - 1) / 2 * p + markers.radius for o, n, p in zip(markers.offset, counts, markers.pitch, strict=True)]
+    if any(r > s / 2 + _SLACK for r, s in zip(reach, size, strict=True)):
+        rule = f"the grid reaches {_mm(reach)} mm from the centre: must stay on the pad, half of which is {_mm([s / 2 for s in size])} mm"
+        raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
+
+
+def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
+    pad, back = sensor.gelpad, _back_face(sensor)
+    half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
+    file, key, value = sensor.lights.source, f"led[{index}].position_mm", _mm(led.position)
+    for x, y, z in (led.position, *led_corners(led)):
+        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
+            behind = "gel and its plate" if back > pad.thickness else "gel"
+            rule = f"LED {led.name!r} lies inside the {behind}: under the pad every part of it must have z <= {-back * 1e3:.4g} mm"
+            raise SpecError(rule, file=file, key=key, value=value)
+        rest = -dome_depth(pad, min(abs(x), half_x), min(abs(y), half_y))
+        if z > rest + _SLACK:
+            rule = f"LED {led.name!r} lies above the dome: beside the pad every part of it must have z <= {rest * 1e3:.4g} mm"
+            raise SpecError(rule, file=file, key=key, value=value)
+        if not _in_case(sensor, (x, y, z)):
+            raise SpecError(f"LED {led.name!r} must lie inside the case with all its area, {_case_rule(sensor)}", file=file, key=key, value=value)
+
+
+def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:
+    """Corners of the emitting rectangle, pad frame [m], by the convention of ``LedSpec.size``."""
+    ax, ay, az = led.axis
+    flat = math.hypot(ax, ay)
+    u = (-ay / flat, ax / flat, 0.0) if flat > 1e-9 else (1.0, 0.0, 0.0)
+    v = (ay * u[2] - az * u[1], az * u[0] - ax * u[2], ax * u[1] - ay * u[0])
+    a, b = led.size[0] / 2, led.size[1] / 2
+    p = led.position
+
+    def corner(s: float, t: float) -> Vec3:
+        return (p[0] + s * u[0] + t * v[0], p[1] + s * u[1] + t * v[1], p[2] + s * u[2] + t * v[2])
+
+    return corner(-a, -b), corner(a, -b), corner(a, b), corner(-a, b)
+
+
+def dome_depth(pad: GelpadSpec, x: float, y: float) -> float:
+    """How far the surface at rest lies below the pad centre at x, y [m], as the sum of two circular arcs [m]."""
+    return sum(0.0 if math.isinf(r) else r - math.sqrt(r * r - at * at) for r, at in zip(pad.dome_radius, (x, y), strict=True))
+
+
+def _back_face(sensor: SensorSpec) -> float:
+    """Distance of the face towards the camera from z = 0 [m]: of the gel, or of its support plate where that refracts."""
+    slab = sensor.refraction.plate_thickness if sensor.refraction.model == "slab" else 0.0
+    return sensor.gelpad.thickness + slab
+
+
+def _in_case(sensor: SensorSpec, point: Vec3) -> bool:
+    (sx, sy), (x, y, z) = sensor.case.size, point
+    return abs(x) <= sx / 2 + _SLACK and abs(y) <= sy / 2 + _SLACK and z >= sensor.case.floor_z - _SLACK
+
+
+def _case_rule(sensor: SensorSpec) -> str:
+    (sx, sy), floor = sensor.case.size, sensor.case.floor_z
+    return f"|x| <= {sx * 500:.4g} mm, |y| <= {sy * 500:.4g} mm, z >= {floor * 1e3:.4g} mm"
+
+
+def _mm(values: tuple[float, ...] | list[float]) -> list[float]:
+    return [float(f"{v * 1e3:.6g}") for v in values]
+
+
+def _error(sensor: SensorSpec, key: str, value: object, rule: str) -> SpecError:
+    return SpecError(rule, file=sensor.source, key=key, value=value)

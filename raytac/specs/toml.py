@@ -1,0 +1,250 @@
+"""A small validating reader: a schema of fields in, a dict of SI values out, one precise error otherwise.
+
+A schema maps a TOML key to a field. The key carries its unit as a suffix (``thickness_mm``); the value comes out in SI under
+the bare name (``thickness``), so that a section can be handed to its dataclass as keyword arguments. Ranges are written in the
+unit of the file, because that is what an error must show.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from raytac.errors import SpecError
+
+__all__ = ["REQUIRED", "Integer", "Interval", "Number", "Schema", "Table", "Text", "Unit", "read_toml", "split_unit"]
+
+REQUIRED: Final = object()
+"""Default of a field that a file must give."""
+
+_UNITS: Final[dict[str, tuple[float, float, str]]] = {
+    "m_per_unit": (1.0, 1.0, "m per file unit"),
+    "w_per_sr": (1.0, 1.0, "W/sr"),
+    "kg_m3": (1.0, 1.0, "kg/m³"),
+    "wxyz": (1.0, 1.0, ""),
+    "kpa": (1000.0, 1.0, "kPa"),
+    "deg": (math.pi, 180.0, "°"),
+    "mm": (1.0, 1000.0, "mm"),
+    "px": (1.0, 1.0, "px"),
+    "kg": (1.0, 1.0, "kg"),
+    "n": (1.0, 1.0, "N"),
+    "s": (1.0, 1.0, "s"),
+}
+"""Suffix: (numerator and denominator of the factor to SI, how the unit is written). Longer suffixes stand first. Dividing by 1000
+gives the float nearest to the decimal in the file; multiplying by 0.001 does not."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The unit that a key carries: ``si = value * numerator / denominator``, and how it is written in messages."""
+
+    numerator: float = 1.0
+    denominator: float = 1.0
+    text: str = ""
+
+    def to_si(self, value: float) -> float:
+        return value * self.numerator / self.denominator
+
+
+def split_unit(key: str) -> tuple[str, Unit]:
+    """``"thickness_mm"`` to ``("thickness", millimetres)``; a key without a unit suffix is its own name and keeps its value."""
+    for suffix, parts in _UNITS.items():
+        if key.endswith("_" + suffix):
+            return key[: -len(suffix) - 1], Unit(*parts)
+    return key, Unit()
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A range of numbers, written as in mathematics: ``[0, 1)``. A closed infinite end admits ``inf`` itself."""
+
+    low: float
+    high: float
+    low_open: bool
+    high_open: bool
+
+    @classmethod
+    def parse(cls, text: str) -> Interval:
+        match = re.fullmatch(r"([\[(])\s*(\S+)\s*,\s*(\S+?)\s*([\])])", text)
+        if match is None:
+            raise ValueError(f"interval {text!r} is not of the form [low, high)")
+        return cls(float(match[2]), float(match[3]), match[1] == "(", match[4] == ")")
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self.low_open else value >= self.low
+        below = value < self.high if self.high_open else value <= self.high
+        return above and below  # False for NaN
+
+
+class _Refused(Exception):
+    """Why a field does not take a value: the rule, and the choices if there are some."""
+
+    def __init__(self, rule: str, choices: Sequence[str] = ()) -> None:
+        super().__init__(rule)
+        self.rule = rule
+        self.choices = tuple(choices)
+
+
+@dataclass(frozen=True)
+class Number:
+    """A real number, or ``length`` of them, in ``interval`` (in the unit of the file)."""
+
+    interval: str
+    length: int = 0
+    default: Any = REQUIRED
+    _range: Interval = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_range", Interval.parse(self.interval))
+
+    def rule(self, unit: Unit) -> str:
+        number = f"{self.length} numbers, each" if self.length else "a number"
+        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
+
+    def parse(self, value: object, unit: Unit) -> float | tuple[float, ...]:
+        if not self.length:
+            return self._one(value, unit)
+        if not isinstance(value, list) or len(value) != self.length:
+            raise _Refused(self.rule(unit))
+        return tuple(self._one(v, unit) for v in value)
+
+    def _one(self, value: object, unit: Unit) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise _Refused(self.rule(unit))
+        try:
+            number = float(value)
+        except OverflowError:
+            raise _Refused(self.rule(unit)) from None
+        if number not in self._range:
+            raise _Refused(self.rule(unit))
+        return unit.to_si(number)
+
+
+@dataclass(frozen=True)
+class Integer:
+    """A whole number, or ``length`` of them, in ``interval``."""
+
+    interval: str
+    length: int = 0
+    default: Any = REQUIRED
+
+    def rule(self, unit: Unit) -> str:
+        number = f"{self.length} whole numbers, each" if self.length else "a whole number"
+        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
+
+    def parse(self, value: object, unit: Unit) -> int | tuple[int, ...]:
+        values = value if self.length and isinstance(value, list) else [value]
+        if len(values) != max(self.length, 1) or (self.length and not isinstance(value, list)):
+            raise _Refused(self.rule(unit))
+        allowed = Interval.parse(self.interval)
+        for v in values:
+            if isinstance(v, bool) or not isinstance(v, int) or v not in allowed:
+                raise _Refused(self.rule(unit))
+        return tuple(values) if self.length else values[0]
+
+
+@dataclass(frozen=True)
+class Text:
+    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words)."""
+
+    choices: tuple[str, ...] = ()
+    pattern: str = r"(?s).+"
+    described: str = "a non-empty string"
+    default: Any = REQUIRED
+
+    def rule(self, unit: Unit) -> str:
+        return "must be a known name" if self.choices else f"must be {self.described}"
+
+    def parse(self, value: object, unit: Unit) -> str:
+        if not isinstance(value, str) or (self.choices and value not in self.choices):
+            raise _Refused(self.rule(unit), self.choices)
+        if not re.fullmatch(self.pattern, value) or "\0" in value:
+            raise _Refused(self.rule(unit))
+        return value
+
+
+Schema = Mapping[str, Number | Integer | Text]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of a TOML file, with the file and the dotted prefix that its errors name."""
+
+    data: Mapping[str, Any]
+    file: Path
+    prefix: str = ""
+
+    def error(self, rule: str, key: str = "", value: object = None, choices: Sequence[str] = ()) -> SpecError:
+        """An error about ``key`` of this table (about the whole table if empty)."""
+        return SpecError(rule, file=self.file, key=self._dotted(key), value=value, choices=choices)
+
+    def read_one(self, key: str, spec: Number | Integer | Text) -> Any:
+        """One field in SI, checked; the other keys of the table are left alone.
+
+        Raises:
+            SpecError: missing key, wrong type, or a value out of its range.
+        """
+        _, unit = split_unit(key)
+        if key not in self.data:
+            if spec.default is REQUIRED:
+                raise self.error(f"missing key: {spec.rule(unit)}", key)
+            return spec.default
+        try:
+            return spec.parse(self.data[key], unit)
+        except _Refused as refused:
+            raise self.error(refused.rule, key, self.data[key], refused.choices) from None
+
+    def read(self, schema: Schema, *, sections: Sequence[str] = ()) -> dict[str, Any]:
+        """Every field of ``schema``, in SI, under its name without unit; ``sections`` are sub-tables read elsewhere.
+
+        Raises:
+            SpecError: an unknown key (checked first, so that a misspelt key is called that and not missing), a missing key, a
+                wrong type, or a value out of its range.
+        """
+        known = (*schema, *sections)
+        for key in self.data:
+            if key not in known:
+                raise SpecError("unknown key", file=self.file, key=self._dotted(key), choices=known, hint_for=key)
+        return {split_unit(key)[0]: self.read_one(key, spec) for key, spec in schema.items()}
+
+    def section(self, name: str) -> Table:
+        """The sub-table ``[name]``; a missing one or another type is an error."""
+        if name not in self.data:
+            raise self.error(f"missing table [{name}]", name)
+        value = self.data[name]
+        if not isinstance(value, dict):
+            raise self.error(f"must be a table [{name}]", name, value)
+        return Table(value, self.file, self._dotted(name))
+
+    def sections(self, name: str) -> tuple[Table, ...]:
+        """The array of tables ``[[name]]``, empty if absent; errors name them ``name[0]``, ``name[1]``…"""
+        value = self.data.get(name, [])
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise self.error(f"must be an array of tables [[{name}]]", name, value)
+        return tuple(Table(item, self.file, f"{self._dotted(name)}[{i}]") for i, item in enumerate(value))
+
+    def _dotted(self, key: str) -> str:
+        return ".".join(part for part in (self.prefix, key) if part)
+
+
+def read_toml(path: Path) -> Table:
+    """The top table of a TOML file.
+
+    Raises:
+        SpecError: the file is missing, cannot be read, or is not TOML.
+    """
+    try:
+        with path.open("rb") as stream:
+            data = tomllib.load(stream)
+    except FileNotFoundError:
+        raise SpecError("the file does not exist", file=path) from None
+    except OSError as error:
+        raise SpecError(f"the file cannot be read ({error.strerror})", file=path) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise SpecError(f"the file is not valid TOML ({error})", file=path) from error
+    return Table(data, path)
