@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from raytac.assets import AssetKind, asset_root
 from raytac.errors import SpecError
 
 __all__ = ["available", "find_file"]
 
-_FOLDERS: dict[str, tuple[AssetKind, str]] = {"sensor": ("scenes", "sensors"), "press scene": ("scenes", "press"), "lights": ("lights", "")}
+_FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
+    "sensor": ("scenes", "sensors"),
+    "press scene": ("scenes", "press"),
+    "lights": ("lights", ""),
+}
 
 
 def available(what: str) -> tuple[str, ...]:

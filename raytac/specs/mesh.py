@@ -52,7 +52,7 @@ def load_mesh(path: str | Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
     extent = float(np.ptp(mesh.vertices, axis=0).max()) * scale
     if not SIZE_RANGE[0] <= extent <= SIZE_RANGE[1]:
         low, high = (1e3 * s for s in SIZE_RANGE)
-        rule = f"the object is {extent * 1e3:.4g} mm long: must be {low:g} to {high:g} mm; scale is metres per file unit (mm: 0.001)"
+        rule = f"the object is {extent * 1e3:.4g} mm long, must be {low:g} to {high:g} mm: scale is metres per file unit"
         raise MeshError(rule, file=path, key="scale", value=scale)
     return np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int32)
 

@@ -62,7 +62,7 @@ def load_press(name_or_path: str | Path) -> PressScene:
         name_or_path: shipped name such as ``"coin"``, or path of a TOML file (see ``scenes/README.md``).
 
     Returns:
-        The scene in SI units; its name is the file's stem. A mesh is read once to check it; ``params["path"]`` is its absolute path.
+        The scene in SI units; its name is the file's stem. A mesh is read once to check it; ``params["path"]`` is absolute.
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, an object whose lengths
@@ -129,7 +129,7 @@ def _read_object(table: Table) -> ObjectSpec:
 def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
     """Lengths [m] of one object that contradict each other."""
     if kind == "cone":
-        # A sphere of radius r that touches the side has its centre r √(R² + h²) / R above the sharp apex: it must lie below the base.
+        # A sphere of radius r that touches the side has its centre r √(R² + h²) / R above the sharp apex: at most at the base.
         largest = p["radius"] * p["height"] / math.hypot(p["radius"], p["height"])
         if p["tip_radius"] >= largest:
             raise _length_error(table, "tip_radius_mm", f"must be less than {_mm(largest)} mm for this radius and height")

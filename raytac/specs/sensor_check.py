@@ -18,7 +18,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
     Raises:
         SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or does not see the pad; the
-            vignette has no light left; markers do not lie on the pad; an LED lies in the gel, above the dome, or outside the case.
+            vignette leaves no light; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case.
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
@@ -33,10 +33,11 @@ def _check_dome(sensor: SensorSpec) -> None:
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)
     if any(radius <= extent for radius, extent in zip(pad.dome_radius, half, strict=True)):
-        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), f"must be more than half the pad, {_mm(half)} mm; inf is flat")
+        rule = f"must be more than half the pad, {_mm(half)} mm; inf is flat"
+        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
     depth = dome_depth(pad, *half)
     if depth >= pad.thickness:
-        rule = f"the dome falls by {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
+        rule = f"the dome falls {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
         raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
 
 
@@ -48,7 +49,8 @@ def _check_camera(sensor: SensorSpec) -> None:
         rule = f"the camera must lie behind the gel, z < {-back * 1e3:.4g} mm, and look along +z"
         raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
     if not _in_case(sensor, camera.position):
-        raise _error(sensor, "camera.position_mm", _mm(camera.position), f"the camera must lie inside the case, {_case_rule(sensor)}")
+        rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
+        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
     view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
     centre = tuple(
         at + (n / 2 - principal) * pitch
@@ -77,7 +79,8 @@ def _check_vignetting(sensor: SensorSpec) -> None:
 def _check_markers(sensor: SensorSpec) -> None:
     markers, size = sensor.markers, sensor.gelpad.size
     if (markers.rows == 0) != (markers.columns == 0):
-        raise _error(sensor, "markers.rows", markers.rows, f"rows and columns must both be 0 or both be positive; columns = {markers.columns}")
+        rule = f"rows and columns must both be 0 or both be positive; columns = {markers.columns}"
+        raise _error(sensor, "markers.rows", markers.rows, rule)
     if markers.rows == 0:
         return
     if markers.radius <= 0:
@@ -88,7 +91,7 @@ def _check_markers(sensor: SensorSpec) -> None:
         raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
     reach = [abs(o) + (n - 1) / 2 * p + markers.radius for o, n, p in zip(markers.offset, counts, markers.pitch, strict=True)]
     if any(r > s / 2 + _SLACK for r, s in zip(reach, size, strict=True)):
-        rule = f"the grid reaches {_mm(reach)} mm from the centre: must stay on the pad, half of which is {_mm([s / 2 for s in size])} mm"
+        rule = f"the grid reaches {_mm(reach)} mm from the centre: must stay on the pad of {_mm(size)} mm"
         raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
 
 
@@ -99,14 +102,15 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     for x, y, z in (led.position, *led_corners(led)):
         if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
             behind = "gel and its plate" if back > pad.thickness else "gel"
-            rule = f"LED {led.name!r} lies inside the {behind}: under the pad every part of it must have z <= {-back * 1e3:.4g} mm"
+            rule = f"LED {led.name!r} lies inside the {behind}: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
         rest = -dome_depth(pad, min(abs(x), half_x), min(abs(y), half_y))
         if z > rest + _SLACK:
-            rule = f"LED {led.name!r} lies above the dome: beside the pad every part of it must have z <= {rest * 1e3:.4g} mm"
+            rule = f"LED {led.name!r} lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
         if not _in_case(sensor, (x, y, z)):
-            raise SpecError(f"LED {led.name!r} must lie inside the case with all its area, {_case_rule(sensor)}", file=file, key=key, value=value)
+            rule = f"LED {led.name!r} must lie inside the case with all its area, {_case_rule(sensor)}"
+            raise SpecError(rule, file=file, key=key, value=value)
 
 
 def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:

@@ -25,7 +25,7 @@ from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
 
 __all__ = ["LED_SCHEMA", "SENSOR_SCHEMA", "load_lights", "load_sensor", "with_lights"]
 
-_NAME = {"pattern": r"[a-z][a-z0-9_]*", "described": "a name of lower-case letters, digits and underscores"}
+_NAME = Text(pattern=r"[a-z][a-z0-9_]*", described="a name of lower-case letters, digits and underscores")
 
 SENSOR_SCHEMA: Final[dict[str, Schema]] = {
     "": {"lights": Text()},
@@ -78,8 +78,8 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
 """Table (``""``: the top of the file) to its keys."""
 
 LED_SCHEMA: Final[Schema] = {
-    "name": Text(**_NAME),
-    "layer": Text(**_NAME),
+    "name": _NAME,
+    "layer": _NAME,
     "position_mm": Number("[-500, 500]", length=3),
     "axis": Number("[-1000, 1000]", length=3),
     "size_mm": Number("(0, 50]", length=2),

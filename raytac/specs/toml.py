@@ -138,14 +138,16 @@ class Integer:
         return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
 
     def parse(self, value: object, unit: Unit) -> int | tuple[int, ...]:
-        values = value if self.length and isinstance(value, list) else [value]
-        if len(values) != max(self.length, 1) or (self.length and not isinstance(value, list)):
+        if not self.length:
+            return self._one(value, unit)
+        if not isinstance(value, list) or len(value) != self.length:
             raise _Refused(self.rule(unit))
-        allowed = Interval.parse(self.interval)
-        for v in values:
-            if isinstance(v, bool) or not isinstance(v, int) or v not in allowed:
-                raise _Refused(self.rule(unit))
-        return tuple(values) if self.length else values[0]
+        return tuple(self._one(v, unit) for v in value)
+
+    def _one(self, value: object, unit: Unit) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or value not in Interval.parse(self.interval):
+            raise _Refused(self.rule(unit))
+        return value
 
 
 @dataclass(frozen=True)
