@@ -91,8 +91,8 @@ def _warn_of_foreign_ipc() -> None:
     where = foreign_ipc()
     if where is not None:
         warnings.warn(
-            f"`import ipc` finds {where}, not the solver that belongs to raytac; the rigid pad still works, the soft pad will not. "
-            "Uninstall the other package, or put raytac's folder first on the path (`raytac doctor` tells more).",
+            f"`import ipc` finds {where}, not the solver that belongs to raytac; the rigid pad still works, the "
+            "soft pad will not. Uninstall the other package, or put raytac first on the path (`raytac doctor` tells more).",
             RuntimeWarning,
             stacklevel=3,
         )

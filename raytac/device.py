@@ -41,7 +41,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
     if not missing:
         return "cuda"
     if device == "cuda":
-        raise BackendError(f"device 'cuda' does not work here: {missing}; use device 'cpu' or 'auto' (`raytac doctor` tells more)")
+        raise BackendError(f"device 'cuda' does not work here: {missing}; use 'cpu' or 'auto' (`raytac doctor` tells more)")
     return "cpu"
 
 
@@ -100,7 +100,7 @@ def _system_llvm() -> Path | None:
     for folder in folders:
         for path in (*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib")):
             match = re.fullmatch(r"libLLVM[-.](?:so\.)?(\d+)(?:\.\d+)*(?:\.so(?:\.\d+)*|\.dylib)?", path.name)
-            version = re.search(r"(\d+)", path.parent.parent.name) if not match else match
+            version = match or re.search(r"(\d+)", path.parent.parent.name)
             if version and int(version[1]) >= LLVM_MINIMUM:
                 candidates[path] = int(version[1])
     return max(candidates, key=lambda path: candidates[path], default=None)

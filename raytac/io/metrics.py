@@ -1,4 +1,4 @@
-"""``metrics.json``: one flat object of dotted keys to numbers or strings, beside everything that a command or experiment writes."""
+"""``metrics.json``: one flat object of dotted keys to numbers or strings, beside all that a command or experiment writes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _plain(key: str, value: object) -> Metric:
     if isinstance(value, str):
         return value
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise InputError(f"metrics[{key!r}]", value=value, rule="must be a number or a string, not a list, a table or a truth value")
+        raise InputError(f"metrics[{key!r}]", value=value, rule="must be a number or a string, not a list, table or truth value")
     if not math.isfinite(value):
         raise InputError(f"metrics[{key!r}]", value=value, rule="must be finite (leave the key out, or say in a string why)")
     return int(value) if isinstance(value, numbers.Integral) else float(value)

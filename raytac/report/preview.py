@@ -1,0 +1,244 @@
+"""``preview.png``: what was pressed and what the sensor saw, on one sheet fit for a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
+from matplotlib.ticker import MaxNLocator
+
+from raytac.gel.surface import PadGrid
+from raytac.specs.sensor import CameraSpec, SensorSpec
+
+__all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
+
+DIFFERENCE_RANGE = 64
+"""Grey levels (of 255) that the difference panel shows to full scale, in either direction; the same in every preview."""
+
+_STYLE = {
+    "font.family": "sans-serif",
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.titlepad": 4,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 7.5,
+    "axes.labelpad": 1.5,
+    "axes.linewidth": 0.6,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.major.pad": 2,
+    "ytick.major.pad": 2,
+}
+_GEL, _REST, _OBJECT = "#9fc5cf", "#22586b", "#5b5b60"
+_TICKS_MM = (-15, -10, -5, 0, 5, 10, 15)
+_UNTOUCHED = 1e-6
+"""Indentation [m] below which the pad counts as untouched when the section's plane is chosen."""
+
+
+@dataclass(frozen=True)
+class PreviewData:
+    """One environment's arrays; a panel whose array is None is left out."""
+
+    title: str
+    grid: PadGrid
+    height: np.ndarray
+    """Coat surface, pad frame [m], shape (Ny, Nx)."""
+    contact: np.ndarray
+    """Contact mask, shape (Ny, Nx), bool."""
+    extent_mm: tuple[float, float, float, float]
+    """Left, right, bottom and top edge of the image on the plane z = 0 [mm]; bottom > top because +y is image down."""
+    object_height: np.ndarray | None = None
+    """z of the object's underside, pad frame [m], shape (Ny, Nx), not finite where there is no object."""
+    rgb: np.ndarray | None = None
+    """Tactile image, shape (H, W, 3), uint8."""
+    rest_rgb: np.ndarray | None = None
+    """Image of the untouched pad, shape (H, W, 3), uint8."""
+    normals: np.ndarray | None = None
+    """Unit normals, pad frame, n_z < 0, shape (H, W, 3)."""
+    section: tuple[float, float] | None = None
+    """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
+
+
+def camera_extent_mm(camera: CameraSpec) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top edge of the whole image on the plane z = 0 [mm]."""
+    (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
+    x, y = camera.position[:2]
+    return tuple(1e3 * v for v in (x - cx * px, x + (width - cx) * px, y + (height - cy) * py, y - cy * py))  # type: ignore[return-value]
+
+
+def difference_to_rest(rgb: np.ndarray, rest_rgb: np.ndarray, full_scale: float = DIFFERENCE_RANGE) -> np.ndarray:
+    """Signed difference of two 8-bit images with grey for none: 0.5 + (rgb − rest) / (2 · full_scale), clipped to [0, 1]."""
+    return np.clip(0.5 + (rgb.astype(np.float32) - rest_rgb.astype(np.float32)) / (2.0 * full_scale), 0.0, 1.0)
+
+
+def write_preview(path: Path, data: PreviewData, sensor: SensorSpec, *, dpi: int = 300) -> None:
+    """Draw the preview of ``data`` and save it as PNG."""
+    draw_preview(data, sensor).savefig(path, dpi=dpi)
+
+
+def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
+    """A figure 7.16 inches wide (two columns of a paper), three panels a row; maps in mm at one scale."""
+    panels: list[Callable[[Axes], None]] = [lambda axes: _object_panel(axes, data), lambda axes: _indentation_panel(axes, data)]
+    if data.rgb is not None:
+        panels.append(lambda axes: _image_panel(axes, data))
+    panels.append(lambda axes: _section_panel(axes, data, sensor))
+    if data.normals is not None:
+        panels.append(lambda axes: _normals_panel(axes, data))
+    if data.rgb is not None and data.rest_rgb is not None:
+        panels.append(lambda axes: _difference_panel(axes, data))
+    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
+        return _lay_out(panels, data)
+
+
+def _lay_out(panels: list[Callable[[Axes], None]], data: PreviewData) -> Figure:
+    """Place the panels by hand, so that they line up whatever their labels are."""
+    left, right, bottom, top = data.extent_mm
+    wide = 1.73
+    high = wide * float(np.clip((bottom - top) / (right - left), 0.5, 1.3))
+    margin, between, above, below, heading = 0.43, 0.70, 0.22, 0.36, 0.24  # inches
+    rows = -(-len(panels) // 3)
+    width, total = 7.16, heading + rows * (above + high + below)
+    figure = Figure(figsize=(width, total))
+    figure.text(margin / width, 1.0 - 0.55 * heading / total, data.title, fontsize=8.5, va="center", weight="bold")
+    for index, draw in enumerate(panels):
+        row, column = divmod(index, 3)
+        x, y = margin + column * (wide + between), total - heading - (row + 1) * (above + high) - row * below
+        axes = figure.add_axes((x / width, y / total, wide / width, high / total))
+        draw(axes)
+        axes.set_title(f"({'abcdef'[index]}) {axes.get_title(loc='left')}", loc="left")
+    return figure
+
+
+def _map_axes(axes: Axes, data: PreviewData, title: str) -> None:
+    axes.set_title(title, loc="left")
+    left, right, bottom, top = data.extent_mm
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
+    axes.set_yticks([t for t in _TICKS_MM if top <= t <= bottom])
+
+
+def _grid_extent_mm(grid: PadGrid) -> tuple[float, float, float, float]:
+    """Outer edges of the cells whose centres are the grid's nodes."""
+    dx, dy = grid.pitch
+    return (
+        1e3 * (grid.x[0] - dx / 2), 1e3 * (grid.x[-1] + dx / 2), 1e3 * (grid.y[-1] + dy / 2), 1e3 * (grid.y[0] - dy / 2),
+    )  # fmt: skip
+
+
+def _hillshade(height: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
+    """Lambert shading of a height map seen from −z, lit from the upper left; shape as ``height``, in [0, 1]."""
+    zy, zx = np.gradient(height, pitch[1], pitch[0])
+    normal = np.stack([zx, zy, -np.ones_like(zx)], axis=-1) / np.sqrt(1.0 + zx**2 + zy**2)[..., None]
+    light = np.array([-0.5, -0.6, -1.0]) / np.linalg.norm([0.5, 0.6, 1.0])
+    return np.clip(normal @ light, 0.0, 1.0)
+
+
+def _object_panel(axes: Axes, data: PreviewData) -> None:
+    if data.object_height is None or not np.isfinite(data.object_height).any():
+        _map_axes(axes, data, "object: none")
+        return
+    _map_axes(axes, data, "object, face to the gel")
+    there = np.isfinite(data.object_height)
+    filled = np.where(there, data.object_height, np.nanmax(np.where(there, data.object_height, np.nan)))
+    shade = 0.25 + 0.70 * _hillshade(filled, data.grid.pitch)
+    image = np.dstack([shade, shade, shade, there.astype(float)])
+    axes.imshow(image, extent=_grid_extent_mm(data.grid), interpolation="bilinear")
+    if data.contact.any() and not data.contact.all():
+        x, y = 1e3 * data.grid.x, 1e3 * data.grid.y
+        axes.contour(x, y, data.contact.astype(float), levels=[0.5], colors="#d55e00", linewidths=0.7)
+        axes.text(0.03, 0.04, "contact", color="#d55e00", fontsize=7, transform=axes.transAxes)
+
+
+def _indentation_panel(axes: Axes, data: PreviewData) -> None:
+    _map_axes(axes, data, "indentation [mm]")
+    indentation = 1e3 * (data.grid.rest - data.height)
+    low, high = min(0.0, float(indentation.min())), max(float(indentation.max()), 1e-3)
+    extent = _grid_extent_mm(data.grid)
+    shown = axes.imshow(indentation, extent=extent, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
+    axes.axhline(_section_point(data)[1], color="white", linewidth=0.6, linestyle=(0, (4, 3)))
+    bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.025, 0.0, 0.035, 1.0)))
+    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    bar.locator = MaxNLocator(nbins=4)
+    bar.update_ticks()
+
+
+def _image_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.rgb is not None
+    _map_axes(axes, data, "tactile image")
+    axes.imshow(data.rgb, extent=data.extent_mm, interpolation="nearest")
+
+
+def _normals_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.normals is not None
+    _map_axes(axes, data, "surface normals")
+    axes.imshow(_normal_colours(data.normals), extent=data.extent_mm, interpolation="nearest")
+    key = axes.inset_axes((0.80, 0.73, 0.19, 0.25))
+    key.set_axis_off()
+    u, v = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 96))
+    ball = np.dstack([u, v, -np.sqrt(np.clip(1 - u**2 - v**2, 0, 1))])
+    disc = key.imshow(_normal_colours(ball), extent=(-1, 1, 1, -1))
+    circle = Circle((0, 0), 1.0, fill=False, edgecolor="white", linewidth=0.9, transform=key.transData)
+    disc.set_clip_path(circle)
+    key.add_patch(circle)
+    key.set(xlim=(-1.08, 1.08), ylim=(1.08, -1.08), aspect="equal")
+
+
+def _normal_colours(normals: np.ndarray) -> np.ndarray:
+    """R, G, B = (n_x, n_y, −n_z) from [−1, 1] to [0, 1]."""
+    return np.clip(0.5 + 0.5 * normals * np.array([1.0, 1.0, -1.0]), 0.0, 1.0)
+
+
+def _difference_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.rgb is not None and data.rest_rgb is not None
+    _map_axes(axes, data, f"image − rest (±{DIFFERENCE_RANGE} of 255)")
+    axes.imshow(difference_to_rest(data.rgb, data.rest_rgb), extent=data.extent_mm, interpolation="nearest")
+
+
+def _section_point(data: PreviewData) -> tuple[int, float]:
+    """Grid row of the cross-section and its y [mm]: through ``section``, else through the deepest point."""
+    indentation = data.grid.rest - data.height
+    if data.section is not None and np.isfinite(data.section).all():
+        row = int(np.argmin(np.abs(data.grid.y - data.section[1])))
+        if data.contact[row].any():
+            return row, 1e3 * float(data.grid.y[row])
+    deepest = int(np.unravel_index(np.argmax(indentation), indentation.shape)[0])
+    row = deepest if indentation.max() > _UNTOUCHED else len(data.grid.y) // 2
+    return row, 1e3 * float(data.grid.y[row])
+
+
+def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
+    row, y_mm = _section_point(data)
+    x, surface, rest = 1e3 * data.grid.x, 1e3 * data.height[row], 1e3 * data.grid.rest[row]
+    depth = float(np.max(1e3 * (data.grid.rest - data.height)))
+    low = max(-1e3 * sensor.gelpad.thickness, min(float(surface.min()), float(rest.min())) - max(0.6 * depth, 0.3))
+    high = max(1.2 * depth, 0.5)
+    axes.fill_between(x, low, surface, color=_GEL, linewidth=0)
+    if data.object_height is not None:
+        under = 1e3 * data.object_height[row]
+        inside = np.isfinite(under) & (under < high)
+        under = np.where(inside, np.maximum(under, low), high)
+        axes.fill_between(x, under, high, color=_OBJECT, linewidth=0)
+    axes.plot(x, rest, color=_REST, linewidth=0.7, linestyle=(0, (4, 2)))
+    axes.plot(x, surface, color=_REST, linewidth=1.0)
+    left, right = data.extent_mm[:2]
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="z [mm]")
+    axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
+    stretch = abs((data.extent_mm[2] - data.extent_mm[3]) / (high - low))
+    axes.set_title(f"section y = {y_mm + 0.0:.1f} mm (z × {stretch:.1f})", loc="left")
+    handles = [
+        Patch(facecolor=_GEL, edgecolor=_REST, linewidth=0.6, label="gel"),
+        Patch(facecolor=_OBJECT, label="object"),
+        Line2D([], [], color=_REST, linewidth=0.8, linestyle=(0, (3, 1.5)), label="rest"),
+    ]
+    axes.legend(handles=handles, loc="lower center", fontsize=7, ncols=3, handlelength=1.2, columnspacing=0.9, frameon=False)

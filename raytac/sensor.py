@@ -1,0 +1,214 @@
+"""``TactileSensor``: one sensor, one physics, one optical mode; a press or a surface goes in, a ``TactileFrame`` comes out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.frame import OUTPUTS, TactileFrame
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
+
+if TYPE_CHECKING:
+    from raytac.optics.base import OpticalMode
+    from raytac.physics.rigid import ContactState, RigidPad
+
+__all__ = ["INTEGRATORS", "OPTICS", "PHYSICS", "TactileSensor"]
+
+PHYSICS = ("rigid",)
+"""Names that ``physics=`` accepts."""
+OPTICS = ("raytrace",)
+"""Names that ``optics=`` accepts."""
+INTEGRATORS = ("fast", "reference")
+"""Names that ``integrator=`` accepts."""
+OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
+"""Outputs that need an optical mode; without them no renderer is imported."""
+DEFAULT_PITCH = 0.1e-3
+"""Spacing of the pad's grid [m]."""
+
+
+class TactileSensor:
+    """A simulated GelSight sensor.
+
+    .. code-block:: python
+
+        sensor = TactileSensor("gelsight_mini", outputs=("rgb", "depth"))
+        frame = sensor.press("coin")
+        frame.rgb  # (B, H, W, 3) uint8
+
+    The optical mode is built at the first image and reused for every later one.
+    """
+
+    spec: SensorSpec
+    outputs: tuple[str, ...]
+    resolution: tuple[int, int]
+    """(width, height) of every image [px]."""
+    grid: PadGrid
+    """Nodes of the pad's surface."""
+
+    def __init__(
+        self,
+        sensor: str | Path | SensorSpec = "gelsight_mini",
+        *,
+        physics: str = "rigid",
+        optics: str = "raytrace",
+        outputs: Sequence[str] = ("rgb",),
+        resolution: tuple[int, int] | None = None,
+        integrator: str = "fast",
+        spp: int | None = None,
+        device: str = "auto",
+        seed: int = 0,
+        num_envs: int = 1,
+        pitch: float = DEFAULT_PITCH,
+        optics_options: dict[str, Any] | None = None,
+    ) -> None:
+        """Check everything and compute nothing yet.
+
+        Args:
+            sensor: name of a shipped sensor, path of a sensor file, or a specification.
+            physics: how the gel deforms, one of ``PHYSICS``.
+            optics: how images are made, one of ``OPTICS``.
+            outputs: what a frame holds, from ``raytac.frame.OUTPUTS``; nothing else is computed.
+            resolution: (width, height) of the images [px]; None is the sensor's own.
+            integrator: one of ``INTEGRATORS``.
+            spp: samples a pixel of a sampled integrator; None is the integrator's own.
+            device: ``auto``, ``cpu`` or ``cuda``.
+            seed: of every random number.
+            num_envs: number of environments B that a press simulates.
+            pitch: spacing of the pad's grid [m].
+            optics_options: further keyword arguments of the optical mode.
+
+        Raises:
+            InputError: an unknown name or a value out of range; the message lists the choices.
+            SpecError: the sensor or light file breaks a rule.
+        """
+        _check_name("physics", physics, PHYSICS)
+        _check_name("optics", optics, OPTICS)
+        _check_name("integrator", integrator, INTEGRATORS)
+        _check_name("device", device, ("auto", "cpu", "cuda"))
+        if isinstance(outputs, str):
+            raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
+        for name in outputs:
+            _check_name("outputs", name, OUTPUTS)
+        _check_whole("num_envs", num_envs)
+        _check_whole("spp", 1 if spp is None else spp)
+        for side in resolution or ():
+            _check_whole("resolution", side)
+        self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
+        self.physics, self.optics, self.integrator, self.spp = physics, optics, integrator, spp
+        self.outputs = tuple(name for name in OUTPUTS if name in outputs)
+        self.resolution = tuple(resolution) if resolution is not None else self.spec.camera.resolution
+        self.device, self.seed, self.num_envs = device, int(seed), num_envs
+        self.grid = make_grid(self.spec.gelpad, pitch)
+        self._pitch = pitch
+        self._optics_options = dict(optics_options or {})
+        self._mode: OpticalMode | None = None
+        self._pad: RigidPad | None = None
+
+    @property
+    def label(self) -> str:
+        """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports."""
+        return f"{self.physics}+{self.optics}-{self.integrator}" if self._optical_outputs else self.physics
+
+    @property
+    def _optical_outputs(self) -> tuple[str, ...]:
+        return tuple(name for name in self.outputs if name in OPTICAL_OUTPUTS)
+
+    def press(self, scene: str | Path | PressScene) -> TactileFrame:
+        """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
+
+        Raises:
+            SpecError: the scene breaks a rule, alone or together with this sensor.
+        """
+        press = scene if isinstance(scene, PressScene) else load_press(scene)
+        validate_press(self.spec, press)
+        start = time.perf_counter()
+        pad = self.load(press)
+        state = pad.peak(pad.run())
+        physics_ms = 1e3 * (time.perf_counter() - start)
+        frame = self.update(state)
+        return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
+
+    def load(self, scene: str | Path | PressScene) -> RigidPad:
+        """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``."""
+        from raytac.physics.rigid import RigidPad
+
+        press = scene if isinstance(scene, PressScene) else load_press(scene)
+        self._pad = RigidPad(self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed)
+        return self._pad
+
+    def update(self, state: ContactState | GelSurface) -> TactileFrame:
+        """Frame of a gel surface, or of a state of the physics that ``load`` or ``press`` set up.
+
+        Raises:
+            InputError: a state, and no scene was loaded.
+        """
+        start = time.perf_counter()
+        surface = state if isinstance(state, GelSurface) else self._surface(state)
+        done = time.perf_counter()
+        time_ms = {"surface": 1e3 * (done - start)}
+        height = surface.height if "height" in self.outputs else None
+        if not self._optical_outputs:
+            return TactileFrame(surface=surface, height=height, time_ms=time_ms)
+        images = self.optical_mode.render(surface)
+        time_ms["optics"] = 1e3 * (time.perf_counter() - done)
+        return TactileFrame(
+            surface=surface,
+            rgb=images.rgb,
+            layers=images.layers,
+            normals=images.normals,
+            position=images.position,
+            depth=images.depth,
+            height=height,
+            contact=images.contact,
+            time_ms=time_ms,
+        )
+
+    def rest(self) -> TactileFrame:
+        """Frame of one untouched pad (B = 1), what every difference image is taken from."""
+        rest = self.grid.rest[None].astype(np.float32)
+        return self.update(GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan)))
+
+    def _surface(self, state: ContactState) -> GelSurface:
+        if self._pad is None:
+            raise InputError("state", value=type(state).__name__, rule="needs a scene: call load(scene) first, or give a GelSurface")
+        return self._pad.surface(state)
+
+    @property
+    def optical_mode(self) -> OpticalMode:
+        """The renderer, built on first use.
+
+        Raises:
+            BackendError: the renderer or the device does not work here.
+        """
+        if self._mode is None:
+            from raytac.optics.raytrace import RayTracer
+
+            self._mode = RayTracer(
+                self.spec,
+                integrator=self.integrator,
+                resolution=self.resolution,
+                spp=self.spp,
+                outputs=self._optical_outputs,
+                device=self.device,
+                seed=self.seed,
+                **self._optics_options,
+            )
+        return self._mode
+
+
+def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(name, value=value, rule="must be a known name", choices=choices)
+
+
+def _check_whole(name: str, value: object) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(name, value=value, rule="must be a whole number >= 1")
