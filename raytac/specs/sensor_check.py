@@ -109,7 +109,7 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
             rule = f"LED {led.name!r} lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
         if not _in_case(sensor, (x, y, z)):
-            rule = f"LED {led.name!r} must lie inside the case with all its area, {_case_rule(sensor)}"
+            rule = f"LED {led.name!r}, {_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
             raise SpecError(rule, file=file, key=key, value=value)
 
 

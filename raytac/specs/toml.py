@@ -36,7 +36,7 @@ _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "s": (1.0, 1.0, "s"),
 }
 """Suffix: (numerator and denominator of the factor to SI, how the unit is written). Longer suffixes stand first. Dividing by 1000
-gives the float nearest to the decimal in the file; multiplying by 0.001 does not."""
+rounds once, where multiplying by 0.001, itself rounded, makes 36 mm 0.036000000000000004 m."""
 
 
 @dataclass(frozen=True)
