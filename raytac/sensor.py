@@ -58,7 +58,7 @@ class TactileSensor:
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
         physics: str = "rigid",
-        optics: str = "raytrace",
+        optics: str | OpticalMode = "raytrace",
         outputs: Sequence[str] = ("rgb",),
         resolution: tuple[int, int] | None = None,
         integrator: str = "fast",
@@ -74,7 +74,8 @@ class TactileSensor:
         Args:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
             physics: how the gel deforms, one of ``PHYSICS``.
-            optics: how images are made, one of ``OPTICS``.
+            optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
+                outputs and device).
             outputs: what a frame holds, from ``raytac.frame.OUTPUTS``; nothing else is computed.
             resolution: (width, height) of the images [px]; None is the sensor's own.
             integrator: one of ``INTEGRATORS``.
@@ -90,7 +91,8 @@ class TactileSensor:
             SpecError: the sensor or light file breaks a rule.
         """
         _check_name("physics", physics, PHYSICS)
-        _check_name("optics", optics, OPTICS)
+        if isinstance(optics, str):
+            _check_name("optics", optics, OPTICS)
         _check_name("integrator", integrator, INTEGRATORS)
         _check_name("device", device, ("auto", "cpu", "cuda"))
         if isinstance(outputs, str):
@@ -102,20 +104,27 @@ class TactileSensor:
         for side in resolution or ():
             _check_whole("resolution", side)
         self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
-        self.physics, self.optics, self.integrator, self.spp = physics, optics, integrator, spp
+        self.physics, self.integrator, self.spp = physics, integrator, spp
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
         self.resolution = tuple(resolution) if resolution is not None else self.spec.camera.resolution
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
         self.grid = make_grid(self.spec.gelpad, pitch)
         self._pitch = pitch
         self._optics_options = dict(optics_options or {})
-        self._mode: OpticalMode | None = None
+        self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
+        self._optics_name = f"{optics}-{integrator}" if isinstance(optics, str) else optics.label
         self._pad: RigidPad | None = None
+        self._scene: PressScene | None = None
 
     @property
     def label(self) -> str:
         """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports."""
-        return f"{self.physics}+{self.optics}-{self.integrator}" if self._optical_outputs else self.physics
+        return f"{self.physics}+{self._optics_name}" if self._optical_outputs else self.physics
+
+    @property
+    def device_used(self) -> str:
+        """``cpu`` or ``cuda``: where the images are made; ``cpu`` if there are none."""
+        return self.optical_mode.device if self._optical_outputs else "cpu"
 
     @property
     def _optical_outputs(self) -> tuple[str, ...]:
@@ -141,6 +150,7 @@ class TactileSensor:
         from raytac.physics.rigid import RigidPad
 
         press = scene if isinstance(scene, PressScene) else load_press(scene)
+        self._scene = press
         self._pad = RigidPad(self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed)
         return self._pad
 
@@ -176,9 +186,20 @@ class TactileSensor:
         rest = self.grid.rest[None].astype(np.float32)
         return self.update(GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan)))
 
+    def object_height(self, surface: GelSurface) -> np.ndarray | None:
+        """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where there is
+        none; None if the surface has no object."""
+        if self._scene is None or surface.pad_from_object is None:
+            return None
+        from raytac.gel.object_height import object_height
+        from raytac.physics.objects import object_parts
+
+        parts = object_parts(self._scene.object)
+        return object_height(parts, surface.pad_from_object, surface.grid.x, surface.grid.y) if parts else None
+
     def _surface(self, state: ContactState) -> GelSurface:
         if self._pad is None:
-            raise InputError("state", value=type(state).__name__, rule="needs a scene: call load(scene) first, or give a GelSurface")
+            raise InputError("state", value=type(state).__name__, rule="needs a scene: call load() first, or give a GelSurface")
         return self._pad.surface(state)
 
     @property

@@ -17,8 +17,8 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 class CommonOptions:
     """Base of an ``Args`` dataclass: ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
 
-    out: Path
-    """Folder to write to; it is created, and ``metrics.json`` goes in it."""
+    out: Path | None = None
+    """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""
     device: DeviceName = "auto"
     """Where to compute; auto is CUDA if it works, else the CPU."""
     seed: int = 0

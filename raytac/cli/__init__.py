@@ -1,0 +1,33 @@
+"""The ``raytac`` command: one subcommand a file; errors of the user's making are one line, not a traceback."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from raytac.cli.doctor import DoctorArgs
+from raytac.cli.press import PressArgs
+from raytac.errors import RaytacError
+
+__all__ = ["main"]
+
+_Command = (
+    Annotated[PressArgs, tyro.conf.subcommand("press", description=PressArgs.__doc__)]
+    | Annotated[DoctorArgs, tyro.conf.subcommand("doctor", description=DoctorArgs.__doc__)]
+)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0 done, 1 the doctor found the default job broken, 2 wrong input."""
+    command = tyro.cli(_Command, prog="raytac", description="Simulate GelSight tactile sensors.", args=args)  # type: ignore[call-overload]
+    try:
+        return command.run()
+    except RaytacError as error:
+        print(f"raytac: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("raytac: interrupted, nothing written", file=sys.stderr)
+        return 130

@@ -1,0 +1,42 @@
+"""What a sensor returns: one dataclass of arrays, each present only if it was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+
+__all__ = ["OUTPUTS", "TactileFrame"]
+
+OUTPUTS = ("rgb", "layers", "normals", "depth", "height")
+"""Names that ``TactileSensor(outputs=…)`` and ``raytac press --outputs`` accept."""
+
+
+@dataclass(frozen=True)
+class TactileFrame:
+    """Images of B sensors at one instant; an output that was not asked for is None.
+
+    All images have shape (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
+    """
+
+    surface: GelSurface
+    rgb: np.ndarray | None = None
+    """8-bit image after the camera response, shape (B, H, W, 3), uint8."""
+    layers: dict[str, np.ndarray] | None = None
+    """Linear radiance by light layer, each shape (B, H, W, 3), float32; their sum is the linear image."""
+    normals: np.ndarray | None = None
+    """Unit normal of the coat towards the camera side (n_z < 0), pad frame, shape (B, H, W, 3), float32."""
+    position: np.ndarray | None = None
+    """Seen point of the coat, pad frame [m], shape (B, H, W, 3), float32 (comes with ``normals``)."""
+    depth: np.ndarray | None = None
+    """Camera-axis depth z − z_camera [m], shape (B, H, W), float32 (not distance along the ray)."""
+    height: np.ndarray | None = None
+    """Surface height on the pad grid [m], shape (B, Ny, Nx), float32."""
+    contact: np.ndarray | None = None
+    """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
+    force: np.ndarray | None = None
+    """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
+    time_ms: dict[str, float] = field(default_factory=dict)
+    """Wall time of ``physics``, ``surface`` and ``optics`` for the whole batch [ms]."""

@@ -1,0 +1,136 @@
+"""Run one press and write its folder: rgb.png, frame.exr, height.npy, preview.png, metrics.json."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from raytac.frame import TactileFrame
+from raytac.io.exr import vector_channels, write_exr
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.png import write_png
+from raytac.sensor import TactileSensor
+from raytac.specs import PressScene
+
+__all__ = ["exr_channels", "exr_header", "press_metrics", "run_press"]
+
+
+def run_press(
+    sensor: TactileSensor, scene: PressScene, out: Path, *, outputs: tuple[str, ...], start: float | None = None
+) -> list[Path]:
+    """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
+
+    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. Returns the files written.
+    Nothing is in ``out`` until everything is computed and written.
+    """
+    start = time.perf_counter() if start is None else start
+    with result_folder(out) as folder:
+        began = time.perf_counter()
+        rest = sensor.rest()
+        setup_ms = 1e3 * (time.perf_counter() - began)
+        frame = sensor.press(scene)
+        if "rgb" in outputs and frame.rgb is not None:
+            write_png(folder / "rgb.png", frame.rgb[0])
+        channels = exr_channels(frame, outputs)
+        if channels:
+            write_exr(folder / "frame.exr", channels, exr_header(sensor, scene))
+        if "height" in outputs:
+            np.save(folder / "height.npy", frame.surface.height[0].astype(np.float32))
+        _write_preview(folder / "preview.png", sensor, scene, frame, rest, outputs)
+        metrics = press_metrics(sensor, scene, frame, rest) | {"time.setup_ms": setup_ms}
+        write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
+        names = sorted(path.name for path in folder.iterdir())
+    return [Path(out) / name for name in names]
+
+
+def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) -> dict[str, np.ndarray]:
+    """Channels of ``frame.exr`` for one environment, each (H, W) float32; empty if ``outputs`` name no image.
+
+    ``R G B``: linear image, the sum of the layers; ``led_<layer>.R`` …: each layer; ``N.X`` …: normal; ``P.X`` …: position [m];
+    ``Z``: camera-axis depth [m].
+    """
+    channels: dict[str, np.ndarray] = {}
+    if frame.layers is not None and "rgb" in outputs:
+        channels |= vector_channels("", np.sum([layer[env] for layer in frame.layers.values()], axis=0), "RGB")
+    if frame.layers is not None and "layers" in outputs:
+        for name, layer in frame.layers.items():
+            channels |= vector_channels(f"led_{name}", layer[env], "RGB")
+    if frame.normals is not None and "normals" in outputs:
+        channels |= vector_channels("N", frame.normals[env])
+        if frame.position is not None:
+            channels |= vector_channels("P", frame.position[env])
+    if frame.depth is not None and "depth" in outputs:
+        channels["Z"] = frame.depth[env]
+    return channels
+
+
+def exr_header(sensor: TactileSensor, scene: PressScene) -> dict[str, str]:
+    """What is needed to know where an image came from; all text."""
+    header = {
+        "sensor": sensor.spec.name,
+        "scene": scene.name,
+        "mode": sensor.label,
+        "seed": str(sensor.seed),
+        "layers": " ".join(f"led_{name}" for name in sensor.spec.lights.layers),
+        "unitsRadiance": "linear, relative W/(m^2 sr)",
+        "unitsPosition": "m",
+        "unitsDepth": "m",
+        "frame": "pad: origin at the centre of the gel surface at rest, +x image right, +y image down, +z towards the object",
+    }
+    return header | {key.replace("versions.", "version:"): value for key, value in versions().items()}
+
+
+def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame, rest: TactileFrame) -> dict[str, Metric]:
+    """Everything of ``metrics.json`` but ``wall_s``; environment 0."""
+    surface = frame.surface
+    dx, dy = surface.grid.pitch
+    metrics: dict[str, Metric] = {
+        "command": "press",
+        "sensor": sensor.spec.name,
+        "scene": scene.name,
+        "mode": sensor.label,
+        "device": sensor.device_used,
+        "seed": sensor.seed,
+        "machine.cpus": os.cpu_count() or 1,
+        "image.width_px": sensor.resolution[0],
+        "image.height_px": sensor.resolution[1],
+        "contact.max_indentation_mm": 1e3 * float(surface.indentation[0].max()),
+        "contact.area_mm2": 1e6 * dx * dy * int(surface.contact[0].sum()),
+    }
+    if np.isfinite(surface.contact_centre[0]).all():
+        metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"] = (1e3 * float(v) for v in surface.contact_centre[0])
+    if frame.force is not None:
+        for axis, value in zip("xyz", frame.force[0], strict=True):
+            metrics[f"contact.force_{axis}_n"] = float(value)
+    if frame.rgb is not None and rest.rgb is not None:
+        change = np.abs(frame.rgb[0].astype(float) - rest.rgb[0])
+        metrics["image.change_from_rest_mean_u8"] = float(change.mean())
+        metrics["image.change_from_rest_max_u8"] = float(change.max())
+    metrics |= {f"time.{name}_ms": value for name, value in frame.time_ms.items()}
+    return metrics | versions()
+
+
+def _write_preview(
+    path: Path, sensor: TactileSensor, scene: PressScene, frame: TactileFrame, rest: TactileFrame, outputs: tuple[str, ...]
+) -> None:
+    from raytac.report.preview import PreviewData, camera_extent_mm, write_preview
+
+    surface = frame.surface
+    under = sensor.object_height(surface)
+    data = PreviewData(
+        title=f"{scene.name} · {sensor.spec.name} · {sensor.label}",
+        grid=surface.grid,
+        height=surface.height[0],
+        contact=surface.contact[0],
+        extent_mm=camera_extent_mm(sensor.spec.camera),
+        object_height=under[0] if under is not None else None,
+        rgb=frame.rgb[0] if frame.rgb is not None and "rgb" in outputs else None,
+        rest_rgb=rest.rgb[0] if rest.rgb is not None else None,
+        normals=frame.normals[0] if frame.normals is not None else None,
+        section=(float(surface.contact_centre[0, 0]), float(surface.contact_centre[0, 1])),
+    )
+    write_preview(path, data, sensor.spec)
