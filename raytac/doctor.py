@@ -166,7 +166,7 @@ PROBES = (
     ),
     Probe(
         "mitsuba-llvm", _TRACE.format(device="cpu"), False,
-        "pip install karellen-llvm-core, or set DRJIT_LIBLLVM_PATH to a libLLVM version 16 or newer (14 is refused, 15 may abort)",
+        "pip install karellen-llvm-core, or set DRJIT_LIBLLVM_PATH to libLLVM 16 or newer (14 is refused, 15 may abort)",
         _no_llvm,
     ),
     Probe("mujoco", _MUJOCO, True, "pip install 'mujoco>=4.0,<5'"),

@@ -106,7 +106,7 @@ class TactileSensor:
         self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
         self.physics, self.integrator, self.spp = physics, integrator, spp
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
-        self.resolution = tuple(resolution) if resolution is not None else self.spec.camera.resolution
+        self.resolution = (resolution[0], resolution[1]) if resolution is not None else self.spec.camera.resolution
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
         self.grid = make_grid(self.spec.gelpad, pitch)
         self._pitch = pitch
@@ -209,10 +209,11 @@ class TactileSensor:
         Raises:
             BackendError: the renderer or the device does not work here.
         """
-        if self._mode is None:
+        mode = self._mode
+        if mode is None:
             from raytac.optics.raytrace import RayTracer
 
-            self._mode = RayTracer(
+            mode = self._mode = RayTracer(
                 self.spec,
                 integrator=self.integrator,
                 resolution=self.resolution,
@@ -222,7 +223,7 @@ class TactileSensor:
                 seed=self.seed,
                 **self._optics_options,
             )
-        return self._mode
+        return mode
 
 
 def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -15,8 +15,8 @@ from raytac.errors import RaytacError
 __all__ = ["main"]
 
 _Command = (
-    Annotated[PressArgs, tyro.conf.subcommand("press", description=PressArgs.__doc__)]
-    | Annotated[DoctorArgs, tyro.conf.subcommand("doctor", description=DoctorArgs.__doc__)]
+    Annotated[PressArgs, tyro.conf.subcommand("press")]
+    | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -25,7 +26,7 @@ class PressArgs(CommonOptions):
     metrics.json; nothing is left half-written if it is interrupted.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Name of a shipped press scene, such as coin, or path of a scene file."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""

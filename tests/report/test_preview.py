@@ -1,0 +1,85 @@
+"""The preview shows what it was given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.gel.surface import GelSurface
+from raytac.io.png import read_png
+from raytac.report.preview import (
+    DIFFERENCE_RANGE,
+    PreviewData,
+    camera_extent_mm,
+    difference_to_rest,
+    draw_preview,
+    write_preview,
+)
+from raytac.specs.sensor import SensorSpec
+from tests.conftest import ball_under, make_surface, shade
+
+
+@pytest.fixture(scope="module")
+def data(sensor_spec: SensorSpec, ball_surface: GelSurface) -> PreviewData:
+    frame, rest = shade(ball_surface, (80, 60), sensor_spec), shade(make_surface(0.0), (80, 60), sensor_spec)
+    assert frame.rgb is not None and rest.rgb is not None and frame.normals is not None
+    return PreviewData(
+        title="test",
+        grid=ball_surface.grid,
+        height=ball_surface.height[0],
+        contact=ball_surface.contact[0],
+        extent_mm=camera_extent_mm(sensor_spec.camera),
+        object_height=ball_under(ball_surface.grid),
+        rgb=frame.rgb[0],
+        rest_rgb=rest.rgb[0],
+        normals=frame.normals[0],
+        section=(0.0, 0.0),
+    )
+
+
+def titles(data: PreviewData, sensor: SensorSpec) -> list[str]:
+    return [axes.get_title(loc="left") for axes in draw_preview(data, sensor).axes if axes.get_title(loc="left")]
+
+
+def test_all_panels_are_there_and_none_is_empty(data: PreviewData, sensor_spec: SensorSpec, tmp_path: Path) -> None:
+    write_preview(tmp_path / "preview.png", data, sensor_spec, dpi=100)
+    image = read_png(tmp_path / "preview.png").astype(float)
+    height, width = image.shape[:2]
+    assert width == 716
+    for row in range(2):
+        for column in range(3):
+            panel = image[row * height // 2 : (row + 1) * height // 2, column * width // 3 : (column + 1) * width // 3]
+            assert panel.std() > 10.0, (row, column)
+            assert (panel.min(axis=2) < 250).mean() > 0.1, (row, column)
+    assert [title[:3] for title in titles(data, sensor_spec)] == ["(a)", "(b)", "(c)", "(d)", "(e)", "(f)"]
+
+
+def test_a_press_changes_the_picture(data: PreviewData, sensor_spec: SensorSpec, tmp_path: Path) -> None:
+    untouched = replace(data, height=data.grid.rest, contact=np.zeros_like(data.contact), rgb=data.rest_rgb)
+    write_preview(tmp_path / "a.png", data, sensor_spec, dpi=60)
+    write_preview(tmp_path / "b.png", untouched, sensor_spec, dpi=60)
+    assert np.abs(read_png(tmp_path / "a.png").astype(int) - read_png(tmp_path / "b.png")).max() > 50
+
+
+def test_what_was_not_computed_has_no_panel(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    bare = replace(data, rgb=None, rest_rgb=None, normals=None, object_height=None)
+    assert titles(bare, sensor_spec) == ["(a) object: none", "(b) indentation [mm]", titles(bare, sensor_spec)[2]]
+    assert titles(bare, sensor_spec)[2].startswith("(c) section")
+
+
+def test_difference_is_grey_for_none_and_saturates_at_the_stated_range() -> None:
+    rest = np.full((1, 1, 3), 100, np.uint8)
+    assert (difference_to_rest(rest, rest) == 0.5).all()
+    assert (difference_to_rest(rest + np.uint8(DIFFERENCE_RANGE), rest) == 1.0).all()
+    assert (difference_to_rest(rest - np.uint8(DIFFERENCE_RANGE), rest) == 0.0).all()
+    assert difference_to_rest(rest + np.uint8(16), rest) == pytest.approx(0.5 + 16 / (2 * DIFFERENCE_RANGE))
+
+
+def test_extent_is_the_camera_footprint(sensor_spec: SensorSpec) -> None:
+    camera = replace(sensor_spec.camera, principal_point=(150.0, 125.0), position=(1e-3, -2e-3, -28e-3))
+    left, right, bottom, top = camera_extent_mm(camera)
+    assert right - left == pytest.approx(320 * 0.0634) and bottom - top == pytest.approx(240 * 0.0634)
+    assert left == pytest.approx(1.0 - 150 * 0.0634) and top == pytest.approx(-2.0 - 125 * 0.0634)

@@ -1,0 +1,75 @@
+"""The doctor survives what it examines, and its exit code follows the default job alone."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import raytac.doctor as doctor
+from raytac.cli import main
+from raytac.doctor import Check, Probe, Report, diagnose, run_probe
+
+WORKS = "print('it works')"
+
+
+def probe(name: str, code: str = WORKS, required: bool = True) -> Probe:
+    return Probe(name, code, required, f"mend {name}")
+
+
+def test_an_abort_is_a_finding() -> None:
+    check = run_probe(probe("x", "import os; os.abort()"))
+    assert not check.ok and "SIGABRT" in check.detail and check.fix == "mend x"
+
+
+def test_an_exception_is_told_with_its_message() -> None:
+    check = run_probe(probe("x", "raise ImportError('no module of that kind')"))
+    assert not check.ok and "no module of that kind" in check.detail
+
+
+def test_a_hang_is_a_finding() -> None:
+    check = run_probe(probe("x", "import time; time.sleep(60)"), timeout=0.5)
+    assert not check.ok and "no answer" in check.detail
+
+
+def test_what_works_needs_no_mending() -> None:
+    check = run_probe(probe("x"))
+    assert check.ok and check.detail.startswith("it works") and check.fix == ""
+
+
+def test_nothing_is_started_where_there_is_nothing_to_try() -> None:
+    check = run_probe(Probe("x", "raise SystemExit(3)", False, "mend", lambda: "no such card"))
+    assert not check.ok and check.detail == "no such card"
+
+
+def test_a_broken_llvm_leaves_the_gpu_and_the_other_way_round() -> None:
+    broken = "import os; os.abort()"
+    assert diagnose([probe("mitsuba-cuda"), probe("mitsuba-llvm", broken, False)]).device == "cuda"
+    assert diagnose([probe("mitsuba-cuda", broken, False), probe("mitsuba-llvm")]).device == "cpu"
+    neither = diagnose([probe("mitsuba-cuda", broken, False), probe("mitsuba-llvm", broken, False)])
+    assert (neither.device, neither.exit_code) == ("none", 1)
+    assert "mending one is enough" in neither.to_text()
+
+
+@pytest.mark.parametrize(("required", "code"), [(True, 1), (False, 0)])
+def test_exit_code_is_1_only_if_the_default_job_cannot_run(required: bool, code: int) -> None:
+    checks = (Check("mitsuba-llvm", True, False, "", ""), Check("x", False, required, "gone", "mend x"))
+    report = Report("cpu", checks, {})
+    assert report.exit_code == code
+    assert "mend: mend x" in report.to_text()
+
+
+@pytest.mark.parametrize("abort", [False, True])
+def test_the_command_prints_one_json_object(abort: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    exr = probe("exr", "import os; os.abort()" if abort else WORKS)
+    monkeypatch.setattr("raytac.cli.doctor.diagnose", lambda: diagnose([probe("mitsuba-llvm"), exr]))
+    assert main(["doctor", "--json"]) == int(abort)
+    report = json.loads(capsys.readouterr().out)
+    assert report["ok"] is not abort and report["device"] == "cpu"
+    assert {check["name"]: check["ok"] for check in report["checks"]} == {"mitsuba-llvm": True, "exr": not abort, "ipc": True}
+    assert "numpy" in report["versions"]
+
+
+def test_this_machine_can_do_the_default_job() -> None:
+    report = diagnose([p for p in doctor.PROBES if p.name != "warp"])
+    assert report.ok, report.to_text()
