@@ -38,5 +38,7 @@ class TactileFrame:
     """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
     force: np.ndarray | None = None
     """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
+    failed: np.ndarray | None = None
+    """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
     """Wall time of ``physics``, ``surface`` and ``optics`` for the whole batch [ms]."""

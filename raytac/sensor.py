@@ -12,6 +12,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS, TactileFrame
+from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
@@ -114,7 +115,6 @@ class TactileSensor:
         self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
         self._optics_name = f"{optics}-{integrator}" if isinstance(optics, str) else optics.label
         self._pad: RigidPad | None = None
-        self._scene: PressScene | None = None
 
     @property
     def label(self) -> str:
@@ -150,7 +150,6 @@ class TactileSensor:
         from raytac.physics.rigid import RigidPad
 
         press = scene if isinstance(scene, PressScene) else load_press(scene)
-        self._scene = press
         self._pad = RigidPad(self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed)
         return self._pad
 
@@ -161,12 +160,16 @@ class TactileSensor:
             InputError: a state, and no scene was loaded.
         """
         start = time.perf_counter()
-        surface = state if isinstance(state, GelSurface) else self._surface(state)
+        if isinstance(state, GelSurface):
+            surface, force, failed = state, None, None
+        else:
+            surface, failed = self._surface(state), state.failed
+            force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         height = surface.height if "height" in self.outputs else None
         if not self._optical_outputs:
-            return TactileFrame(surface=surface, height=height, time_ms=time_ms)
+            return TactileFrame(surface=surface, height=height, force=force, failed=failed, time_ms=time_ms)
         images = self.optical_mode.render(surface)
         time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(
@@ -178,6 +181,8 @@ class TactileSensor:
             depth=images.depth,
             height=height,
             contact=images.contact,
+            force=force,
+            failed=failed,
             time_ms=time_ms,
         )
 
@@ -187,15 +192,13 @@ class TactileSensor:
         return self.update(GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan)))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where there is
-        none; None if the surface has no object."""
-        if self._scene is None or surface.pad_from_object is None:
-            return None
-        from raytac.gel.object_height import object_height
-        from raytac.physics.objects import object_parts
+        """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where it is not.
 
-        parts = object_parts(self._scene.object)
-        return object_height(parts, surface.pad_from_object, surface.grid.x, surface.grid.y) if parts else None
+        None if the surface has no object.
+        """
+        if self._pad is None or surface.pad_from_object is None:
+            return None
+        return object_height(self._pad.parts, surface.pad_from_object, surface.grid.x, surface.grid.y)
 
     def _surface(self, state: ContactState) -> GelSurface:
         if self._pad is None:

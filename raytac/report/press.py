@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.io.exr import vector_channels, write_exr
 from raytac.io.folder import result_folder
@@ -33,6 +34,8 @@ def run_press(
         rest = sensor.rest()
         setup_ms = 1e3 * (time.perf_counter() - began)
         frame = sensor.press(scene)
+        if frame.failed is not None and frame.failed[0]:
+            raise RaytacError(f"the press {scene.name!r} did not settle, or its state is not finite: nothing is written")
         if "rgb" in outputs and frame.rgb is not None:
             write_png(folder / "rgb.png", frame.rgb[0])
         channels = exr_channels(frame, outputs)
