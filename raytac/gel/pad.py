@@ -1,0 +1,48 @@
+"""The undeformed pad: its domed rest surface and the regular grid of nodes over it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import PadGrid
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["make_grid", "rest_height"]
+
+
+def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rest surface z [m] at pad-frame positions ``x``, ``y`` [m] of any shapes that broadcast.
+
+    z = −s(x; Rx) − s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
+    carried along one of radius Ry. It is 0 at the pad centre, an exact circle along both axes, agrees with the paraboloid
+    −x²/(2Rx) − y²/(2Ry) to fourth order, and is flat along an axis whose radius is ``inf``.
+    """
+    return -_sagitta(np.asarray(x, float), gelpad.dome_radius[0]) - _sagitta(np.asarray(y, float), gelpad.dome_radius[1])
+
+
+def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
+    """Grid of nodes over the whole pad.
+
+    ``pitch`` [m] is the wanted spacing; along each axis it is adjusted to size / round(size / pitch), so that nodes fall on both
+    edges. Raises ``InputError`` if the pitch is not positive and finite or leaves fewer than two cells along an axis, or if a
+    dome radius is not greater than half the pad.
+    """
+    if not (math.isfinite(pitch) and pitch > 0.0):
+        raise InputError("pitch", value=pitch, rule="must be finite and > 0 [m]")
+    for axis, size, radius in zip("xy", gelpad.size, gelpad.dome_radius, strict=True):
+        if not radius > 0.5 * size:
+            rule = f"must exceed half the pad's size along {axis}, {0.5 * size} m (inf is flat)"
+            raise InputError("gelpad.dome_radius", value=radius, rule=rule)
+        if round(size / pitch) < 2:
+            raise InputError("pitch", value=pitch, rule=f"must leave at least two cells over the pad's {size} m along {axis}")
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
+    return PadGrid(x=x, y=y, rest=rest_height(gelpad, x[None, :], y[:, None]))
+
+
+def _sagitta(u: np.ndarray, radius: float) -> np.ndarray:
+    if math.isinf(radius):
+        return np.zeros_like(u)
+    return u**2 / (radius + np.sqrt(radius**2 - u**2))

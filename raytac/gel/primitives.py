@@ -1,0 +1,193 @@
+"""Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes at once.
+
+Each function takes the shape's size [m], its pose ``pad_from_part`` (4, 4) and node positions ``x`` (1, Nx), ``y`` (Ny, 1) [m],
+and returns the z [m], shape (Ny, Nx), of the lowest point of the solid on each node's vertical line; ``inf`` where the line misses.
+
+A line through a node is (x, y, c_z) + t e_z with c the shape's origin; in the part frame it is o + t d. A convex solid is an
+intersection of slabs and quadrics, each of which the line crosses in one interval of t; the underside is at the start of the
+common interval. This has no seams between faces, unlike testing each face for a hit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+__all__ = ["UNDERSIDES", "bounds", "line_in_part"]
+
+Underside = Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Interval = tuple[np.ndarray, np.ndarray]
+
+
+def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Vertical lines in the part frame: the three coordinates of o, each (Ny, Nx), and the common direction d (3,)."""
+    dx, dy = x - pose[0, 3], y - pose[1, 3]
+    return [pose[0, k] * dx + pose[1, k] * dy for k in range(3)], pose[2, :3]
+
+
+def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Axis-aligned box (lower, upper), each (3,) [m], in the pad frame, that holds the primitive."""
+    rotation, centre = pose[:3, :3], pose[:3, 3]
+    axis = rotation[:, 2]
+    across = np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
+    if kind == "plane":
+        return np.full(3, -np.inf), np.full(3, np.inf)
+    if kind == "sphere":
+        half = np.full(3, size[0])
+    elif kind == "capsule":
+        half = size[0] + size[1] * np.abs(axis)
+    elif kind == "ellipsoid":
+        half = np.sqrt((rotation**2) @ np.square(size))
+    elif kind == "cylinder":
+        half = size[0] * across + size[1] * np.abs(axis)
+    elif kind == "box":
+        half = np.abs(rotation) @ np.asarray(size)
+    elif kind == "torus":
+        half = size[0] * across + size[1]
+    else:  # cone
+        base = centre + size[1] * axis
+        tip_low, tip_high = centre + size[2] * axis - size[2], centre + size[2] * axis + size[2]
+        return np.minimum(tip_low, base - size[0] * across), np.maximum(tip_high, base + size[0] * across)
+    return centre - half, centre + half
+
+
+def _plane(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The half-space behind the plane has an underside only if the plane looks down (n_z < 0)."""
+    normal = pose[:3, 2]
+    if normal[2] >= 0.0:
+        return np.full(np.broadcast_shapes(x.shape, y.shape), np.inf)
+    return pose[2, 3] - (normal[0] * (x - pose[0, 3]) + normal[1] * (y - pose[1, 3])) / normal[2]
+
+
+def _sphere(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return pose[2, 3] - _root(size[0] ** 2 - (x - pose[0, 3]) ** 2 - (y - pose[1, 3]) ** 2)
+
+
+def _ellipsoid(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    o, d = line_in_part(pose, x, y)
+    o, d = [o[k] / size[k] for k in range(3)], d / size
+    return pose[2, 3] + _quadric(d @ d, o[0] * d[0] + o[1] * d[1] + o[2] * d[2], o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - 1.0)[0]
+
+
+def _cylinder(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    o, d = line_in_part(pose, x, y)
+    side = _quadric(d[0] ** 2 + d[1] ** 2, o[0] * d[0] + o[1] * d[1], o[0] ** 2 + o[1] ** 2 - size[0] ** 2)
+    return pose[2, 3] + _common(side, _slab(o[2], d[2], -size[1], size[1]))
+
+
+def _capsule(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    low = _cylinder(size, pose, x, y)
+    for end in (-size[1], size[1]):
+        cap = pose.copy()
+        cap[:3, 3] += end * pose[:3, 2]
+        low = np.minimum(low, _sphere(size, cap, x, y))
+    return low
+
+
+def _box(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    o, d = line_in_part(pose, x, y)
+    return pose[2, 3] + _common(*(_slab(o[k], d[k], -size[k], size[k]) for k in range(3)))
+
+
+def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Sphere at the tip joined tangentially to a conical frustum whose base, ``radius`` wide, lies ``height`` above the tip.
+
+    With ρ the tangent of the half angle the flank is √(x² + y²) = ρ (z − z_a); the tip's centre lies at z_a + r √(1 + ρ²) / ρ
+    and its sphere touches z = 0, so the virtual apex is at z_a = r − r √(1 + ρ²) / ρ.
+    """
+    height, tip = size[1], size[2]
+    rho = _flank(size)
+    apex = tip - tip * np.sqrt(1.0 + rho**2) / rho
+    tangent = tip - tip / np.sqrt(1.0 + rho**2)
+    o, d = line_in_part(pose, x, y)
+    above = o[2] - apex
+    a = d[0] ** 2 + d[1] ** 2 - (rho * d[2]) ** 2
+    a = a if abs(a) > 1e-12 else 1e-12
+    b = o[0] * d[0] + o[1] * d[1] - rho**2 * above * d[2]
+    c = o[0] ** 2 + o[1] ** 2 - (rho * above) ** 2
+    slab = _slab(o[2], d[2], tangent, height)
+    if a > 0.0:
+        frustum = _common(_quadric(a, b, c), slab)
+    else:  # The line is steeper than the flank: inside before the first root (one nappe) and after the second (the other).
+        root = np.sqrt(np.clip(b * b - a * c, 0.0, None))
+        first, last = (-b + root) / a, (-b - root) / a
+        frustum = np.minimum(
+            _common((np.full_like(first, -np.inf), first), slab), _common((last, np.full_like(last, np.inf)), slab)
+        )
+    ball = pose.copy()
+    ball[:3, 3] += tip * pose[:3, 2]
+    return np.minimum(pose[2, 3] + frustum, _sphere((tip,), ball, x, y))
+
+
+def _torus(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Closed form if the axis is vertical; else sphere tracing of the exact distance √((ρ − R)² + z²) − r from below."""
+    major, minor = size
+    if abs(pose[2, 2]) > 1.0 - 1e-14:
+        rho = np.hypot(x - pose[0, 3], y - pose[1, 3])
+        return pose[2, 3] - _root(minor**2 - (rho - major) ** 2)
+    o, d = line_in_part(pose, x, y)
+    reach = major * np.sqrt(d[0] ** 2 + d[1] ** 2) + minor
+    origin = np.stack([np.broadcast_to(v, o[0].shape).ravel() for v in o])
+    t = np.full(origin.shape[1], -reach)
+    low = np.full(origin.shape[1], np.inf)
+    active = np.arange(origin.shape[1])
+    while len(active):
+        p = origin[:, active] + t[active] * d[:, None]
+        gap = np.hypot(np.hypot(p[0], p[1]) - major, p[2]) - minor
+        near = gap < 1e-10
+        low[active[near]] = t[active[near]]
+        t[active] += np.maximum(gap, 1e-9)
+        active = active[~near & (t[active] < reach)]
+    return pose[2, 3] + low.reshape(o[0].shape)
+
+
+def _flank(size: tuple[float, ...]) -> float:
+    """tan of the half angle of the flank: tangent to the tip's sphere and through the base's rim."""
+    radius, height, tip = size
+    return float(np.tan(np.arctan2(radius, height - tip) - np.arcsin(tip / np.hypot(radius, height - tip))))
+
+
+def _root(square: np.ndarray) -> np.ndarray:
+    """√square, −inf where square < 0 (so that z − √ is a miss)."""
+    return np.where(square >= 0.0, np.sqrt(np.maximum(square, 0.0)), -np.inf)
+
+
+def _quadric(a: float, b: np.ndarray, c: np.ndarray) -> Interval:
+    """Interval of t with a t² + 2 b t + c <= 0, a >= 0; (inf, −inf) where empty."""
+    if a < 1e-14:
+        inside = c <= 0.0
+        return np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
+    disc = b * b - a * c
+    root = np.sqrt(np.maximum(disc, 0.0))
+    return np.where(disc >= 0.0, (-b - root) / a, np.inf), np.where(disc >= 0.0, (-b + root) / a, -np.inf)
+
+
+def _slab(o: np.ndarray, d: float, low: float, high: float) -> Interval:
+    """Interval of t with low <= o + t d <= high."""
+    if abs(d) < 1e-14:
+        inside = (o >= low) & (o <= high)
+        return np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
+    first, last = (low - o) / d, (high - o) / d
+    return (first, last) if d > 0.0 else (last, first)
+
+
+def _common(*intervals: Interval) -> np.ndarray:
+    """Start of the intersection of intervals; inf where it is empty."""
+    start, end = intervals[0]
+    for other_start, other_end in intervals[1:]:
+        start, end = np.maximum(start, other_start), np.minimum(end, other_end)
+    return np.where(start <= end, start, np.inf)
+
+
+UNDERSIDES: dict[str, Underside] = {
+    "plane": _plane,
+    "sphere": _sphere,
+    "capsule": _capsule,
+    "ellipsoid": _ellipsoid,
+    "cylinder": _cylinder,
+    "box": _box,
+    "cone": _cone,
+    "torus": _torus,
+}
+"""Function of each primitive kind."""

@@ -1,0 +1,57 @@
+"""The deformed coat surface: the one thing that physics hands to optics, markers and force outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["GelSurface", "PadGrid"]
+
+
+@dataclass(frozen=True)
+class PadGrid:
+    """Nodes of a regular grid over the whole pad, pad frame.
+
+    ``x`` [m], shape (Nx,), ascending from −size_x/2 to size_x/2; ``y`` [m], shape (Ny,), likewise (image down);
+    ``rest`` [m], shape (Ny, Nx): z of the undeformed surface, 0 at the pad centre and <= 0 elsewhere on a dome.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    rest: np.ndarray
+
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """Node spacing along x and y [m]."""
+        return float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rest.shape  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class GelSurface:
+    """Coat surface of B pads on one grid.
+
+    height [m], shape (B, Ny, Nx), float32: z in the pad frame. contact, shape (B, Ny, Nx), bool: where the object touches.
+    contact_centre [m], shape (B, 2): x, y of the pressure-weighted (here: indentation-weighted) contact centroid, NaN without
+    contact.
+    pad_from_object, shape (B, 4, 4): pose of the object, or None when there is no object.
+    """
+
+    grid: PadGrid
+    height: np.ndarray
+    contact: np.ndarray
+    contact_centre: np.ndarray
+    pad_from_object: np.ndarray | None = None
+
+    @property
+    def batch(self) -> int:
+        return self.height.shape[0]
+
+    @property
+    def indentation(self) -> np.ndarray:
+        """Indentation depth rest − height [m], shape (B, Ny, Nx); negative where the gel bulges outwards."""
+        return self.grid.rest[None] - self.height

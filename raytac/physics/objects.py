@@ -1,0 +1,94 @@
+"""From the description of an object to the parts that make it up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from raytac.errors import SpecError
+from raytac.gel.part import Part, mesh_part, primitive
+from raytac.gel.relief import relief_part
+from raytac.physics.coin import coin_elevation
+from raytac.specs.press import ObjectSpec
+
+__all__ = ["OBJECT_KINDS", "object_parts"]
+
+OBJECT_KINDS = ("none", "sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
+
+
+def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
+    """Parts of the object, object frame [m]; empty for ``none``.
+
+    The −z side looks at the pad when the quaternion is the identity. ``sphere``: centre at the origin. ``cylinder``: axis z,
+    centre at the origin (standing; turn it by 90° about y to lie along x). ``edge``: a cube about the origin with one edge down,
+    along x. ``cone``: rounded tip down at the origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying
+    flat. ``pins``: a plate with rows × columns (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0. ``coin``: face
+    down, field at z = 0. ``mesh``: as its file has it.
+    Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind or a missing or impossible length.
+    """
+    if spec.kind not in OBJECT_KINDS:
+        raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=OBJECT_KINDS)
+    if spec.kind == "none":
+        return ()
+    if spec.kind == "sphere":
+        return (primitive("sphere", (_length(spec, "radius"),)),)
+    if spec.kind == "cylinder":
+        return (primitive("cylinder", (_length(spec, "radius"), 0.5 * _length(spec, "length"))),)
+    if spec.kind == "edge":
+        c = math.sqrt(0.5)
+        edge_down = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, c, -c, 0.0], [0.0, c, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        return (primitive("box", (0.5 * _length(spec, "side"),) * 3, edge_down),)
+    if spec.kind == "cone":
+        size = (_length(spec, "radius"), _length(spec, "height"), _length(spec, "tip_radius", zero=True))
+        return (primitive("cone", size),)
+    if spec.kind == "torus":
+        return (primitive("torus", (_length(spec, "major_radius"), _length(spec, "minor_radius"))),)
+    if spec.kind == "pins":
+        return _pins(spec)
+    if spec.kind == "coin":
+        return _coin(spec)
+    from raytac.specs.mesh import load_mesh
+
+    vertices, faces = load_mesh(str(spec.params["path"]), _length(spec, "scale"))
+    return (mesh_part(vertices, faces),)
+
+
+def _pins(spec: ObjectSpec) -> tuple[Part, ...]:
+    rows, columns = _count(spec, "rows"), _count(spec, "columns")
+    pitch, radius, height = (_length(spec, key) for key in ("pitch", "pin_radius", "pin_height"))
+    if max(rows, columns) > 1 and pitch < 2.0 * radius:
+        raise SpecError(f"must be at least a pin's diameter, {2.0 * radius} m", key="object.pitch", value=pitch)
+    plate = (0.5 * columns * pitch, 0.5 * rows * pitch, 0.5 * height)
+    parts = [primitive("box", plate, _shift(0.0, 0.0, 0.5 * height))]
+    for j in range(rows):
+        for i in range(columns):
+            x, y = (i - 0.5 * (columns - 1)) * pitch, (j - 0.5 * (rows - 1)) * pitch
+            parts.append(primitive("cylinder", (radius, 0.5 * height), _shift(x, y, -0.5 * height)))
+    return tuple(parts)
+
+
+def _coin(spec: ObjectSpec) -> tuple[Part, ...]:
+    radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
+    body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
+    return body, relief_part(coin_elevation(radius, relief), radius)
+
+
+def _shift(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def _length(spec: ObjectSpec, key: str, *, zero: bool = False) -> float:
+    value = spec.params.get(key)
+    if not isinstance(value, int | float) or not math.isfinite(value) or value < 0.0 or (value == 0.0 and not zero):
+        raise SpecError(f"must be a length {'>=' if zero else '>'} 0 [m]", key=f"object.{key}", value=value)
+    return float(value)
+
+
+def _count(spec: ObjectSpec, key: str) -> int:
+    value = spec.params.get(key)
+    if not isinstance(value, int) or value < 1:
+        raise SpecError("must be a whole number >= 1", key=f"object.{key}", value=value)
+    return value
