@@ -21,7 +21,8 @@ class ObjectSpec:
     kind: str
     """``none sphere cylinder edge cone torus pins coin mesh``."""
     params: dict[str, float | int | str]
-    """Lengths [m] and counts of the kind; for ``mesh`` also the absolute ``path`` and ``scale``."""
+    """Lengths [m] and counts of the kind, by the key of its TOML file without the unit; for ``mesh`` the absolute ``path`` and
+    ``scale`` [m per file unit]. Object frame of each kind: ``scenes/README.md``."""
     position: Vec3
     """Offset of the object's origin from first touch above the pad centre, pad frame [m]; z is not used (contact sets it)."""
     quaternion: tuple[float, float, float, float]

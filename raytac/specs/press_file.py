@@ -135,8 +135,10 @@ def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
             raise _length_error(table, "tip_radius_mm", f"must be less than {_mm(largest)} mm for this radius and height")
     elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
         raise _length_error(table, "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}")
-    elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] <= 2 * p["pin_radius"]:
-        raise _length_error(table, "pitch_mm", f"pins must stand apart: more than twice pin_radius_mm = {_mm(p['pin_radius'])}")
+    elif kind == "pins" and p["pin_radius"] > p["pin_height"]:
+        raise _length_error(table, "pin_radius_mm", f"a pin ends in half a sphere: at most pin_height_mm = {_mm(p['pin_height'])}")
+    elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] < 2 * p["pin_radius"]:
+        raise _length_error(table, "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}")
     elif kind == "coin" and p["relief_height"] >= p["thickness"]:
         raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
 

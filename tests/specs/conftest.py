@@ -72,23 +72,28 @@ power_w_per_sr = [0.0, 1e-4, 0.0]
 """
 
 
+def quoted(text: str) -> str:
+    """A TOML basic string: JSON's, but for one character that only TOML forbids."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def to_toml(value: Any) -> str:
     """A TOML value; tables are written inline, so that nesting needs no headers."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}" for k, v in value.items()) + "}"
+        return "{" + ", ".join(f"{quoted(k)} = {to_toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(to_toml, value)) + "]"
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return quoted(value)
     if isinstance(value, datetime.datetime | datetime.date | datetime.time):
         return value.isoformat()
     return repr(value)
 
 
 def document(data: Mapping[str, Any]) -> str:
-    return "".join(f"{json.dumps(key, ensure_ascii=False)} = {to_toml(value)}\n" for key, value in data.items())
+    return "".join(f"{quoted(key)} = {to_toml(value)}\n" for key, value in data.items())
 
 
 def changed(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,134 @@
+"""Meshes: the formats agree, and everything that is not a solid of sensible size is refused."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from raytac.assets import asset_root
+from raytac.errors import MeshError
+from raytac.specs import load_mesh
+
+CUBE = trimesh.creation.box(extents=(10.0, 8.0, 6.0))
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".STL"])
+def test_formats_agree(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cube{suffix}"
+    CUBE.export(path, file_type=suffix[1:].lower())
+    vertices, faces = load_mesh(path, 0.001)
+    assert (vertices.shape, vertices.dtype, faces.shape, faces.dtype) == ((8, 3), np.float64, (12, 3), np.int32)
+    np.testing.assert_allclose(vertices.min(axis=0), [-0.005, -0.004, -0.003], rtol=1e-6)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(480e-9, rel=1e-6)
+
+
+def test_the_shipped_gear_is_small_and_solid() -> None:
+    path = asset_root("scenes") / "meshes" / "gear.stl"
+    assert path.stat().st_size < 200_000
+    vertices, faces = load_mesh(path, 0.001)
+    assert len(vertices) - 3 * len(faces) // 2 + len(faces) == 0  # Euler characteristic of a body with one bore
+    np.testing.assert_allclose(np.hypot(vertices[:, 0], vertices[:, 1]).max(), 7e-3, rtol=1e-5)
+
+
+@given(st.floats(1e-5, 0.035))
+@settings(max_examples=20, deadline=None)
+def test_scale_is_metres_per_file_unit(scale: float) -> None:
+    vertices, _ = load_mesh(asset_root("scenes") / "meshes" / "gear.stl", scale)
+    assert np.hypot(vertices[:, 0], vertices[:, 1]).max() == pytest.approx(7 * scale, rel=1e-5)
+
+
+def stl(triangles: np.ndarray) -> bytes:
+    records = b"".join(struct.pack("<12fH", 0, 0, 0, *t.ravel(), 0) for t in triangles)
+    return b"\0" * 80 + struct.pack("<I", len(triangles)) + records
+
+
+def refused(path: Path, content: bytes | str, scale: float = 0.001) -> str:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(MeshError) as caught:
+        load_mesh(path, scale)
+    assert caught.value.file == path
+    return str(caught.value)
+
+
+def test_not_finite(tmp_path: Path) -> None:
+    for bad in (np.nan, np.inf):
+        triangles = np.array(CUBE.triangles)
+        triangles[5, 1, 2] = bad
+        assert "every vertex must be finite" in refused(tmp_path / "bad.stl", stl(triangles))
+    assert "must be finite" in refused(tmp_path / "bad.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
+
+
+def test_not_watertight(tmp_path: Path) -> None:
+    message = refused(tmp_path / "open.stl", stl(CUBE.triangles[1:]))
+    assert "the mesh must be watertight: 3 of 18 edges do not join exactly two faces" in message
+
+
+def test_faces_that_disagree(tmp_path: Path) -> None:
+    triangles = np.array(CUBE.triangles)
+    triangles[3] = triangles[3, ::-1]
+    assert "must all be oriented the same way" in refused(tmp_path / "mixed.stl", stl(triangles))
+
+
+def test_inside_out(tmp_path: Path) -> None:
+    message = refused(tmp_path / "inverted.stl", stl(CUBE.triangles[:, ::-1]))
+    assert "must look outwards: its volume is -480 file units" in message
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("empty.stl", stl(np.zeros((0, 3, 3)))),
+        ("empty.obj", ""),
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
+        (
+            "points.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n",
+        ),
+        ("garbage.stl", b"\x01\x02garbage"),
+        ("garbage.ply", "not a ply"),
+        ("none.stl", b""),
+        ("beyond.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+    ],
+)
+def test_empty_and_unreadable(tmp_path: Path, name: str, content: bytes | str) -> None:
+    message = refused(tmp_path / name, content)
+    assert any(rule in message for rule in ("the mesh is empty", "the mesh file cannot be read", "faces must index")), message
+
+
+def test_missing_and_unknown_format(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"gone\.stl: the mesh file does not exist"):
+        load_mesh(tmp_path / "gone.stl", 0.001)
+    with pytest.raises(MeshError, match=r"cube\.step: suffix = '\.step': unknown mesh format.*choose from: \.stl, \.obj, \.ply"):
+        load_mesh(tmp_path / "cube.step", 0.001)
+
+
+@pytest.mark.parametrize(
+    ("scale", "rule"),
+    [
+        (1.0, "the object is 1e+04 mm long, must be 0.1 to 500 mm"),
+        (1e-6, "the object is 0.01 mm long, must be 0.1 to 500 mm"),
+        (0.0, "must be a finite number of metres per file unit > 0"),
+        (float("nan"), "must be a finite number of metres per file unit > 0"),
+    ],
+)
+def test_a_scale_that_cannot_be_meant(tmp_path: Path, scale: float, rule: str) -> None:
+    message = refused(tmp_path / "cube.stl", stl(CUBE.triangles), scale)
+    assert f"scale = {scale}: {rule}" in message
+
+
+@given(st.binary(max_size=300), st.sampled_from([".stl", ".obj", ".ply"]))
+@settings(max_examples=60, deadline=None)
+def test_random_bytes_are_refused_and_nothing_else_is_raised(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes, suffix: str
+) -> None:
+    path = tmp_path_factory.mktemp("fuzz") / f"x{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(MeshError):
+        load_mesh(path, 0.001)
