@@ -38,7 +38,10 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
         if text not in names:
             raise SpecError("no shipped file of this name, and not a path to a .toml file", key=what, value=text, choices=names)
         return _folder(what) / f"{text}.toml"
-    path = Path(name_or_path).expanduser()
+    try:
+        path = Path(name_or_path).expanduser()
+    except RuntimeError as error:  # "~nobody/x.toml"
+        raise SpecError(f"the path has no meaning here ({error})", key=what, value=text) from error
     candidates = [base / path] if base is not None else [Path.cwd() / path, asset_root(_FOLDERS[what][0]).parent / path]
     for candidate in candidates:
         try:

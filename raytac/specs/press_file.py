@@ -144,7 +144,10 @@ def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
 
 
 def _resolve_mesh(table: Table, values: dict[str, Any]) -> None:
-    path = (table.file.parent / Path(values["path"]).expanduser()).resolve()
+    try:
+        path = (table.file.parent / Path(values["path"]).expanduser()).resolve()
+    except (OSError, RuntimeError) as error:  # "~nobody/x.stl", or a circle of links
+        raise table.error(f"the path has no meaning here ({error})", "path", values["path"]) from error
     try:
         load_mesh(path, values["scale"])
     except MeshError as error:

@@ -105,6 +105,8 @@ def test_empty_and_unreadable(tmp_path: Path, name: str, content: bytes | str) -
 def test_missing_and_unknown_format(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"gone\.stl: the mesh file does not exist"):
         load_mesh(tmp_path / "gone.stl", 0.001)
+    with pytest.raises(MeshError, match="the mesh file does not exist"):
+        load_mesh(tmp_path / f"{'n' * 400}.stl", 0.001)
     with pytest.raises(MeshError, match=r"cube\.step: suffix = '\.step': unknown mesh format.*choose from: \.stl, \.obj, \.ply"):
         load_mesh(tmp_path / "cube.step", 0.001)
 

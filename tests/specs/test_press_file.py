@@ -88,6 +88,8 @@ ERRORS: list[tuple[str, str, Any, str]] = [
     ("mesh", "object.scale_m_per_unit", 0.0, "must be a number in (0, 10] m per file unit"),
     ("mesh", "object.scale_m_per_unit", 1.0, "scale is metres per file unit"),
     ("mesh", "object.path", "nowhere.stl", "the mesh file does not exist"),
+    ("mesh", "object.path", "n" * 70 + ".stl", "the mesh file does not exist"),
+    ("mesh", "object.path", "~nobody-of-this-name/a.stl", "the path has no meaning here"),
     ("mesh", "object.path", "mesh.toml", "unknown mesh format"),
 ]
 

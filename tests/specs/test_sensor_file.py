@@ -245,6 +245,8 @@ def test_unknown_names_list_the_known_ones(make_sensor: MakeSensor, tmp_path: Pa
         load_sensor(make_sensor({"lights": "gelsight_mni"}))
     with pytest.raises(SpecError, match=r"nowhere\.toml: sensor = .*the file does not exist"):
         load_sensor(tmp_path / "nowhere.toml")
+    with pytest.raises(SpecError, match=r"sensor = '~nobody-of-this-name/a.toml': the path has no meaning here"):
+        load_sensor("~nobody-of-this-name/a.toml")
     with pytest.raises(SpecError, match=r"lamp\.toml: lights = 'lamp.toml': the file does not exist"):
         load_sensor(make_sensor({"lights": "lamp.toml"}))
 
