@@ -9,6 +9,7 @@ import pytest
 
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import OpticsImages
 from raytac.specs.sensor import (
     CameraSpec,
     CaseSpec,
@@ -103,6 +104,23 @@ def shade(surface: GelSurface, resolution: tuple[int, int], sensor: SensorSpec) 
         height=surface.height,
         time_ms={"physics": 1.0, "surface": 2.0, "optics": 3.0},
     )
+
+
+class Shader:
+    """An optical mode that needs no renderer; with ``fail`` its second image raises that."""
+
+    label = "shader"
+    device = "cpu"
+
+    def __init__(self, spec: SensorSpec, size: tuple[int, int] = (64, 48), fail: type[BaseException] | None = None) -> None:
+        self.spec, self.size, self.fail, self.rendered = spec, size, fail, 0
+
+    def render(self, surface: GelSurface) -> OpticsImages:
+        self.rendered += 1
+        if self.fail is not None and self.rendered > 1:
+            raise self.fail
+        frame = shade(surface, self.size, self.spec)
+        return OpticsImages(frame.rgb, frame.layers, frame.normals, frame.position, frame.depth)
 
 
 @pytest.fixture(scope="session")

@@ -60,7 +60,9 @@ def test_exit_code_is_1_only_if_the_default_job_cannot_run(required: bool, code:
 
 
 @pytest.mark.parametrize("abort", [False, True])
-def test_the_command_prints_one_json_object(abort: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_one_json_object(
+    abort: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     exr = probe("exr", "import os; os.abort()" if abort else WORKS)
     monkeypatch.setattr("raytac.cli.doctor.diagnose", lambda: diagnose([probe("mitsuba-llvm"), exr]))
     assert main(["doctor", "--json"]) == int(abort)

@@ -104,9 +104,9 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
 def _lay_out(panels: list[Callable[[Axes], None]], data: PreviewData) -> Figure:
     """Place the panels by hand, so that they line up whatever their labels are."""
     left, right, bottom, top = data.extent_mm
-    wide = 1.73
+    wide = 1.70
     high = wide * float(np.clip((bottom - top) / (right - left), 0.5, 1.3))
-    margin, between, above, below, heading = 0.43, 0.70, 0.22, 0.36, 0.24  # inches
+    margin, between, above, below, heading = 0.46, 0.74, 0.22, 0.36, 0.24  # inches
     rows = -(-len(panels) // 3)
     width, total = 7.16, heading + rows * (above + high + below)
     figure = Figure(figsize=(width, total))
@@ -169,7 +169,7 @@ def _indentation_panel(axes: Axes, data: PreviewData) -> None:
     axes.axhline(_section_point(data)[1], color="white", linewidth=0.6, linestyle=(0, (4, 3)))
     bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.025, 0.0, 0.035, 1.0)))
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
-    bar.locator = MaxNLocator(nbins=4)
+    bar.locator = MaxNLocator(nbins=4, steps=[1, 2, 5, 10])
     bar.update_ticks()
 
 
@@ -235,7 +235,7 @@ def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="z [mm]")
     axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
     stretch = abs((data.extent_mm[2] - data.extent_mm[3]) / (high - low))
-    axes.set_title(f"section y = {y_mm + 0.0:.1f} mm (z × {stretch:.1f})", loc="left")
+    axes.set_title(f"section y = {y_mm:.1f} mm (z × {stretch:.1f})".replace("-", "−"), loc="left")
     handles = [
         Patch(facecolor=_GEL, edgecolor=_REST, linewidth=0.6, label="gel"),
         Patch(facecolor=_OBJECT, label="object"),

@@ -1,0 +1,111 @@
+"""A press writes the files that were asked for, and they say the same as the frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.errors import RaytacError
+from raytac.frame import OUTPUTS
+from raytac.io.exr import read_exr
+from raytac.io.metrics import read_metrics
+from raytac.io.png import read_png
+from raytac.report.press import run_press
+from raytac.report.sheet import write_sheet
+from raytac.sensor import TactileSensor
+from raytac.specs import PressScene, SensorSpec, load_press
+from tests.conftest import Shader
+
+SIZE = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PressScene:
+    return load_press("sphere")
+
+
+def sensor_with(spec: SensorSpec, mode: Shader) -> TactileSensor:
+    return TactileSensor(spec, optics=mode, outputs=OUTPUTS, resolution=SIZE, pitch=0.2e-3)
+
+
+def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path) -> None:
+    mode = Shader(sensor_spec, SIZE)
+    sensor = sensor_with(sensor_spec, mode)
+    written = run_press(sensor, scene, tmp_path / "out", outputs=OUTPUTS)
+    names = {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    assert {path.name for path in written} == names == {path.name for path in (tmp_path / "out").iterdir()}
+    assert mode.rendered == 2  # the untouched pad and the press
+
+    channels, header = read_exr(tmp_path / "out" / "frame.exr")
+    lights = {f"led_{name}.{c}" for name in ("red", "green", "blue") for c in "RGB"}
+    assert set(channels) == {"R", "G", "B", "N.X", "N.Y", "N.Z", "P.X", "P.Y", "P.Z", "Z"} | lights
+    np.testing.assert_allclose(channels["G"], sum(channels[f"led_{name}.G"] for name in ("red", "green", "blue")), rtol=1e-6)
+    np.testing.assert_allclose(channels["Z"], channels["P.Z"] - sensor_spec.camera.position[2], atol=1e-8)
+    assert (header["sensor"], header["scene"], header["mode"], header["seed"]) == ("test_sensor", "sphere", "rigid+shader", "0")
+    assert header["unitsDepth"] == "m" and "version:raytac" in header
+
+    rgb = read_png(tmp_path / "out" / "rgb.png")
+    linear = np.stack([channels[c] for c in "RGB"], axis=-1)
+    assert np.abs(rgb - 255 * np.clip(linear, 0, 1) ** (1 / 2.2)).max() <= 0.51
+
+    height = np.load(tmp_path / "out" / "height.npy")
+    assert height.dtype == np.float32 and height.shape == sensor.grid.shape
+    metrics = read_metrics(tmp_path / "out" / "metrics.json")
+    assert metrics["contact.max_indentation_mm"] == pytest.approx(1e3 * float((sensor.grid.rest - height).max()), rel=1e-5)
+    assert float(metrics["contact.force_z_n"]) < 0.0
+    assert {"time.physics_ms", "time.surface_ms", "time.optics_ms", "wall_s", "device"} <= set(metrics)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "files", "channels"),
+    [
+        (("rgb",), {"rgb.png", "frame.exr"}, {"R", "G", "B"}),
+        (("depth",), {"frame.exr"}, {"Z"}),
+        (("height",), {"height.npy"}, set()),
+    ],
+)
+def test_only_what_was_asked_for_is_written(
+    outputs: tuple[str, ...], files: set[str], channels: set[str], sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path
+) -> None:
+    run_press(sensor_with(sensor_spec, Shader(sensor_spec, SIZE)), scene, tmp_path, outputs=outputs)
+    assert {path.name for path in tmp_path.iterdir()} == files | {"preview.png", "metrics.json"}
+    if channels:
+        assert set(read_exr(tmp_path / "frame.exr")[0]) == channels
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_press_leaves_nothing(
+    error: type[BaseException], sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path
+) -> None:
+    with pytest.raises(error):
+        run_press(sensor_with(sensor_spec, Shader(sensor_spec, SIZE, error)), scene, tmp_path / "out", outputs=OUTPUTS)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_environment_writes_nothing(sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path) -> None:
+    class Failing(TactileSensor):
+        def press(self, scene: PressScene):  # type: ignore[override]
+            from dataclasses import replace
+
+            return replace(super().press(scene), failed=np.array([True]))
+
+    sensor = Failing(sensor_spec, optics=Shader(sensor_spec, SIZE), resolution=SIZE, pitch=0.5e-3)
+    with pytest.raises(RaytacError, match=r"'sphere' did not settle"):
+        run_press(sensor, scene, tmp_path / "out", outputs=("rgb",))
+    assert not list(tmp_path.iterdir())
+
+
+def test_sheet_holds_the_pictures_in_order(tmp_path: Path) -> None:
+    from raytac.io.png import write_png
+
+    red, blue = np.zeros((4, 6, 3), np.uint8), np.zeros((5, 3, 3), np.uint8)
+    red[..., 0], blue[..., 2] = 255, 255
+    write_png(tmp_path / "a.png", red)
+    write_png(tmp_path / "b.png", blue)
+    write_sheet([tmp_path / "a.png", tmp_path / "b.png"], tmp_path / "sheet.png", gap=2)
+    sheet = read_png(tmp_path / "sheet.png")
+    assert sheet.shape == (11, 6, 3)
+    assert (sheet[:4] == red).all() and (sheet[6:, :3] == blue).all()
+    assert (sheet[4:6] == 255).all() and (sheet[6:, 3:] == 255).all()

@@ -1,0 +1,80 @@
+"""The command line: errors are one line that names the choices, and nothing is written before they are found."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.cli import main
+from raytac.io.metrics import read_metrics
+
+
+def run(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).parents[1]
+    env = os.environ | {"PYTHONPATH": str(root)}
+    return subprocess.run([sys.executable, "-m", "raytac", *args], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["coin", "--outputs", "rgb,hight"], ["outputs = 'hight'", "did you mean 'height'", "normals"]),
+        (["coin", "--resolution", "320*240"], ["resolution", "WIDTHxHEIGHT"]),
+        (["coin", "--physics", "soft"], ["physics = 'soft'", "rigid"]),
+        (["coin", "--optics", "phong"], ["optics = 'phong'", "raytrace"]),
+        (["coin", "--integrator", "path"], ["integrator = 'path'", "fast, reference"]),
+        (["coin", "--spp", "0"], ["spp = 0"]),
+        (["con"], ["'con'", "did you mean", "coin"]),
+        (["no/such/scene.toml"], ["no/such/scene.toml", "does not exist"]),
+        (["coin", "--sensor", "gelsight_min"], ["gelsight_mini"]),
+    ],
+)
+def test_wrong_input_is_one_line_and_writes_nothing(
+    args: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["press", *args]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.startswith("raytac: error: ") and told.err.count("\n") == 1
+    for word in words:
+        assert word in told.err
+    assert not list(tmp_path.iterdir())
+
+
+BAD = ([], ["press"], ["pres", "coin"], ["press", "coin", "--device", "gpu"], ["press", "coin", "--sed", "1"])
+
+
+@pytest.mark.parametrize("args", BAD)
+def test_unknown_commands_and_options_exit_with_2(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit:
+        main(args)
+    assert exit.value.code == 2
+    assert capsys.readouterr().err
+
+
+def test_a_press_without_images_from_any_folder(tmp_path: Path) -> None:
+    done = run("press", "sphere", "--outputs", "height", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "runs" / "press" / "sphere"
+    assert done.stdout.split() == [f"runs/press/sphere/{name}" for name in ("height.npy", "metrics.json", "preview.png")]
+    assert np.load(out / "height.npy").ndim == 2
+    metrics = read_metrics(out / "metrics.json")
+    assert metrics["mode"] == "rigid" and "time.optics_ms" not in metrics
+
+
+def test_out_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").write_text("mine")
+    assert main(["press", "sphere", "--outputs", "height", "--out", str(tmp_path / "out")]) == 2
+    assert "a file of that name exists" in capsys.readouterr().err
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_the_same_seed_gives_the_same_height(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert main(["press", "sphere", "--outputs", "height", "--seed", "3", "--out", str(tmp_path / name)]) == 0
+    assert (tmp_path / "a" / "height.npy").read_bytes() == (tmp_path / "b" / "height.npy").read_bytes()

@@ -1,0 +1,91 @@
+"""TactileSensor refuses bad names before any work, computes only what is asked, and contact shows."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError
+from raytac.frame import OUTPUTS
+from raytac.sensor import TactileSensor
+from raytac.specs import SensorSpec
+from tests.conftest import Shader, make_surface
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"physics": "rigd"}, r"physics = 'rigd'.*did you mean 'rigid'.*rigid"),
+        ({"optics": "taxm"}, r"optics = 'taxm'.*raytrace"),
+        ({"outputs": ("rgb", "deph")}, r"outputs = 'deph'.*did you mean 'depth'.*rgb, layers"),
+        ({"outputs": "rgb"}, "sequence of names"),
+        ({"integrator": "quick"}, "fast, reference"),
+        ({"device": "gpu"}, "auto, cpu, cuda"),
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"spp": 0}, "spp = 0"),
+        ({"spp": 1.5}, "spp = 1.5"),
+        ({"resolution": (0, 240)}, "resolution = 0"),
+    ],
+)
+def test_bad_names_and_numbers_are_refused_with_the_choices(options: dict, message: str, sensor_spec: SensorSpec) -> None:
+    with pytest.raises(InputError, match=message):
+        TactileSensor(sensor_spec, **options)
+
+
+def test_a_state_needs_a_scene(sensor_spec: SensorSpec) -> None:
+    with pytest.raises(InputError, match=r"load\(\)"):
+        TactileSensor(sensor_spec, outputs=("height",)).update(object())  # type: ignore[arg-type]
+
+
+def test_contact_changes_the_image_and_release_restores_it(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, optics=Shader(sensor_spec), outputs=("rgb",), pitch=0.2e-3)
+    rest = sensor.rest().rgb
+    pressed = sensor.press("sphere")
+    assert rest is not None and pressed.rgb is not None
+    assert np.abs(pressed.rgb.astype(int) - rest).max() > 10
+    pad = sensor.load("sphere")
+    *_, released = pad.run()
+    assert released.kind == "release"
+    np.testing.assert_array_equal(sensor.update(released).rgb, rest)
+
+
+def test_a_surface_is_all_that_a_loop_needs(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, optics=Shader(sensor_spec), outputs=("rgb", "height"))
+    surface = make_surface(batch=3)
+    frame = sensor.update(surface)
+    assert frame.rgb is not None and frame.rgb.shape[0] == 3 and frame.rgb.dtype == np.uint8
+    assert frame.height is surface.height and frame.force is None
+
+
+def test_force_pushes_into_the_pad_and_holds_for_every_environment(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, outputs=("height",), num_envs=2, pitch=0.5e-3)
+    frame = sensor.press("sphere")
+    assert frame.force is not None and frame.force.shape == (2, 3) and frame.failed is not None and not frame.failed.any()
+    assert (frame.force[:, 2] < 0).all()
+    np.testing.assert_array_equal(frame.surface.height[0], frame.surface.height[1])
+
+
+_LAZY = """
+import sys
+import raytac
+heavy = {"mitsuba", "drjit", "mujoco", "matplotlib", "trimesh", "OpenEXR", "PIL", "tyro", "warp", "scipy"}
+assert not heavy & set(sys.modules), ("import raytac", heavy & set(sys.modules))
+sensor = raytac.TactileSensor("gelsight_mini", outputs=("height",), pitch=0.5e-3)
+assert not {"mujoco", "mitsuba"} & set(sys.modules), "a sensor that has done nothing"
+frame = sensor.press("sphere")
+assert frame.height.max() <= 0 and frame.rgb is None
+assert "mujoco" in sys.modules
+assert not {"mitsuba", "drjit", "matplotlib"} & set(sys.modules), "a press without images"
+"""
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed() -> None:
+    done = subprocess.run([sys.executable, "-c", _LAZY], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
+    assert TactileSensor(sensor_spec, outputs=tuple(reversed(OUTPUTS))).outputs == OUTPUTS
