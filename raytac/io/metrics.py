@@ -8,6 +8,7 @@ import math
 import numbers
 import platform
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -35,9 +36,7 @@ def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     if "versions.raytac" not in found:  # a plain checkout that was never installed
-        import raytac
-
-        found["versions.raytac"] = raytac.__version__
+        found["versions.raytac"] = sys.modules["raytac"].__version__
     return found
 
 
