@@ -103,8 +103,8 @@ def hfield_part(size: tuple[float, ...], elevation: np.ndarray, object_from_part
     base = top * [1.0, 1.0, 0.0] - [0.0, 0.0, size[3]]
     index = np.arange(rows * columns).reshape(rows, columns)
     p00, p01, p10, p11 = (a.ravel() for a in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    # MuJoCo's prisms share the diagonal from (column + 1, row) to (column, row + 1).
-    upper = np.concatenate([np.stack([p00, p01, p10], 1), np.stack([p01, p11, p10], 1)])
+    # As in MuJoCo, a cell's two triangles share the diagonal from (column, row) to (column + 1, row + 1).
+    upper = np.concatenate([np.stack([p00, p01, p11], 1), np.stack([p00, p11, p10], 1)])
     ring = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
     after = np.roll(ring, -1)
     n = rows * columns

@@ -1,7 +1,7 @@
 """Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes at once.
 
 Each function takes the shape's size [m], its pose ``pad_from_part`` (4, 4) and node positions ``x`` (1, Nx), ``y`` (Ny, 1) [m],
-and returns the z [m], shape (Ny, Nx), of the lowest point of the solid on each node's vertical line; ``inf`` where the line misses.
+and returns the z [m], shape (Ny, Nx), of the solid's lowest point on each node's vertical line; ``inf`` where the line misses.
 
 A line through a node is (x, y, c_z) + t e_z with c the shape's origin; in the part frame it is o + t d. A convex solid is an
 intersection of slabs and quadrics, each of which the line crosses in one interval of t; the underside is at the start of the
@@ -18,6 +18,8 @@ __all__ = ["UNDERSIDES", "bounds", "line_in_part"]
 
 Underside = Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Interval = tuple[np.ndarray, np.ndarray]
+_TRACE_STEPS = 1000
+"""Steps after which a line that still grazes a torus counts as a miss."""
 
 
 def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
@@ -67,7 +69,9 @@ def _sphere(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndar
 def _ellipsoid(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     o, d = line_in_part(pose, x, y)
     o, d = [o[k] / size[k] for k in range(3)], d / size
-    return pose[2, 3] + _quadric(d @ d, o[0] * d[0] + o[1] * d[1] + o[2] * d[2], o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - 1.0)[0]
+    return (
+        pose[2, 3] + _quadric(float(d @ d), o[0] * d[0] + o[1] * d[1] + o[2] * d[2], o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - 1.0)[0]
+    )
 
 
 def _cylinder(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -99,7 +103,7 @@ def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarra
     height, tip = size[1], size[2]
     rho = _flank(size)
     apex = tip - tip * np.sqrt(1.0 + rho**2) / rho
-    tangent = tip - tip / np.sqrt(1.0 + rho**2)
+    tangent = tip - tip * rho / np.sqrt(1.0 + rho**2)
     o, d = line_in_part(pose, x, y)
     above = o[2] - apex
     a = d[0] ** 2 + d[1] ** 2 - (rho * d[2]) ** 2
@@ -127,18 +131,30 @@ def _torus(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarr
         rho = np.hypot(x - pose[0, 3], y - pose[1, 3])
         return pose[2, 3] - _root(minor**2 - (rho - major) ** 2)
     o, d = line_in_part(pose, x, y)
-    reach = major * np.sqrt(d[0] ** 2 + d[1] ** 2) + minor
-    origin = np.stack([np.broadcast_to(v, o[0].shape).ravel() for v in o])
-    t = np.full(origin.shape[1], -reach)
-    low = np.full(origin.shape[1], np.inf)
-    active = np.arange(origin.shape[1])
-    while len(active):
+    # Solids that hold the torus bound the search: a line that misses either of them misses the torus.
+    ball = _quadric(1.0, o[0] * d[0] + o[1] * d[1] + o[2] * d[2], o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - (major + minor) ** 2)
+    slab = _slab(o[2], float(d[2]), -minor, minor)
+    start, end = np.maximum(ball[0], slab[0]).ravel(), np.minimum(ball[1], slab[1]).ravel()
+    origin = np.stack([v.ravel() for v in o])
+    low = np.full(len(start), np.inf)
+    active = np.flatnonzero(start <= end)
+    t = start.copy()
+    for _ in range(_TRACE_STEPS):
+        if not len(active):
+            break
         p = origin[:, active] + t[active] * d[:, None]
-        gap = np.hypot(np.hypot(p[0], p[1]) - major, p[2]) - minor
-        near = gap < 1e-10
-        low[active[near]] = t[active[near]]
-        t[active] += np.maximum(gap, 1e-9)
-        active = active[~near & (t[active] < reach)]
+        rho = np.hypot(p[0], p[1])
+        tube = np.hypot(rho - major, p[2])
+        gap = tube - minor
+        # Cosine between the line and the inward normal. Near a clear hit Newton's step converges at once (an overshoot comes
+        # back) where the safe step, the distance itself, would creep.
+        toward = -((rho - major) * (p[0] * d[0] + p[1] * d[1]) / np.maximum(rho, 1e-12) + p[2] * d[2]) / tube
+        newton = (gap < 0.05 * minor) & (toward > 0.2)
+        t[active] += np.where(newton, gap / np.maximum(toward, 0.2), np.maximum(gap, 1e-9))
+        near = np.abs(gap) < 1e-11
+        grazed = (gap < 1e-10) & ~newton
+        low[active[near | grazed]] = t[active[near | grazed]]
+        active = active[~(near | grazed) & (t[active] < end[active])]
     return pose[2, 3] + low.reshape(o[0].shape)
 
 

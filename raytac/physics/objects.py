@@ -23,8 +23,8 @@ def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
     The −z side looks at the pad when the quaternion is the identity. ``sphere``: centre at the origin. ``cylinder``: axis z,
     centre at the origin (standing; turn it by 90° about y to lie along x). ``edge``: a cube about the origin with one edge down,
     along x. ``cone``: rounded tip down at the origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying
-    flat. ``pins``: a plate with rows × columns (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0. ``coin``: face
-    down, field at z = 0. ``mesh``: as its file has it.
+    flat. ``pins``: a plate with rows × columns (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0.
+    ``coin``: face down, field at z = 0. ``mesh``: as its file has it.
     Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind or a missing or impossible length.
     """
     if spec.kind not in OBJECT_KINDS:

@@ -1,5 +1,8 @@
 """The press rig in MuJoCo: a carriage that holds the object over a rigid pad with a compliant contact."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -25,7 +28,8 @@ def contact_solref(stiffness: float, mass: float, impedance: float = IMPEDANCE) 
 
     MuJoCo's soft constraint obeys a₁ + d (b v + k r) = (1 − d) a₀ with the direct form b = B / d, k = s / d (for a constant
     impedance, d = dmax), r the penetration and a₀ the acceleration without the contact. At rest, with a force F on a mass m,
-    this is s r = (1 − d) F / m, so the contact is a spring of K = s m / (1 − d), hence s = K (1 − d) / m. B = 2 √s damps it critically.
+    this is s r = (1 − d) F / m, so the contact is a spring of K = s m / (1 − d), hence s = K (1 − d) / m. B = 2 √s damps it
+    critically.
     """
     s = stiffness * (1.0 - impedance) / mass
     return -s, -2.0 * s**0.5

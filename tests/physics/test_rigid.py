@@ -1,0 +1,271 @@
+"""The rigid pad: first touch, load law, MuJoCo's contact, trajectories."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError, SpecError
+from raytac.gel.pad import make_grid, rest_height
+from raytac.physics.first_touch import first_touch_z, gap_at_touch
+from raytac.physics.load_law import LoadLaw, layer_stiffening, reduced_modulus
+from raytac.physics.objects import object_parts
+from raytac.physics.rig import PressRig
+from raytac.physics.rigid import CLEARANCE, ContactState, RigidPad
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.specs.sensor import (
+    CameraSpec,
+    CaseSpec,
+    CoatSpec,
+    GelpadSpec,
+    LightsSpec,
+    MarkerSpec,
+    RefractionSpec,
+    ResponseSpec,
+    SensorSpec,
+)
+
+PAD = GelpadSpec((20e-3, 16e-3), 4e-3, (0.21, 0.135), 2e5, 0.48, 1000.0, 0.8)
+PITCH = 0.15e-3
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+OBJECTS: dict[str, dict[str, float | int | str]] = {
+    "sphere": {"radius": 4e-3},
+    "cylinder": {"radius": 3e-3, "length": 8e-3},
+    "edge": {"side": 6e-3},
+    "cone": {"radius": 4e-3, "height": 5e-3, "tip_radius": 0.4e-3},
+    "torus": {"major_radius": 4e-3, "minor_radius": 1.2e-3},
+    "pins": {"rows": 3, "columns": 4, "pitch": 2.5e-3, "pin_radius": 0.5e-3, "pin_height": 2e-3},
+    "coin": {"radius": 6e-3, "thickness": 1.5e-3, "relief_height": 0.2e-3},
+}
+
+
+def sensor_with(pad: GelpadSpec = PAD) -> SensorSpec:
+    return SensorSpec(
+        name="test",
+        gelpad=pad,
+        coat=CoatSpec((0.5, 0.5, 0.5), 0.0, 0.3),
+        case=CaseSpec((25e-3, 20e-3), -30e-3, 0.2),
+        camera=CameraSpec((320, 240), (6e-5, 6e-5), (0.0, 0.0, -20e-3), (160.0, 120.0)),
+        response=ResponseSpec(1.0, (1.0, 1.0, 1.0), 1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        markers=MarkerSpec(0, 0, (1e-3, 1e-3), (0.0, 0.0), 1e-4, 0.1),
+        refraction=RefractionSpec("none", 1.4, 0.0),
+        lights=LightsSpec(()),
+    )
+
+
+def scene_of(
+    kind: str,
+    *stages: StageSpec,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    quaternion: tuple[float, float, float, float] = IDENTITY,
+) -> PressScene:
+    return PressScene("test", ObjectSpec(kind, OBJECTS.get(kind, {}), position, quaternion, 0.05), stages)
+
+
+def indent(depth: float) -> StageSpec:
+    return StageSpec("indent", depth=depth)
+
+
+def press(scene: PressScene, steps: int = 1, **options: object) -> tuple[RigidPad, list[ContactState]]:
+    pad = RigidPad(sensor_with(), scene, pitch=PITCH, **options)  # type: ignore[arg-type]
+    return pad, list(pad.run(steps))
+
+
+def paraboloid_gap(radius: float) -> tuple[np.ndarray, float]:
+    x = np.linspace(-8e-3, 8e-3, 1601)
+    return (x[None, :] ** 2 + x[:, None] ** 2) / (2.0 * radius), (x[1] - x[0]) ** 2
+
+
+@pytest.mark.parametrize("depth", [0.1e-3, 0.5e-3, 1e-3])
+def test_load_law_is_hertz_on_a_thick_pad(depth: float) -> None:
+    thick = dataclasses.replace(PAD, thickness=0.4)
+    hertz = 4.0 / 3.0 * reduced_modulus(thick) * math.sqrt(4e-3) * depth**1.5
+    assert math.isclose(LoadLaw(*paraboloid_gap(4e-3), thick).force(depth), hertz, rel_tol=0.02)
+    assert LoadLaw(*paraboloid_gap(4e-3), PAD).force(depth) > 1.1 * hertz  # a bonded layer is stiffer
+
+
+@pytest.mark.parametrize("depth", [0.1e-3, 0.3e-3, 0.6e-3, 1e-3])
+def test_load_law_is_the_bonded_layer_solution_for_a_sphere(depth: float) -> None:
+    radius = 4e-3
+    pad = dataclasses.replace(PAD, poisson_ratio=0.4999)
+    gap, cell = paraboloid_gap(radius)
+    chi = math.sqrt(radius * depth) / pad.thickness  # Dimitriadis et al. 2002, the equation for ν = 0.5, bonded
+    series = 1.0 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
+    expected = 16.0 / 9.0 * pad.youngs_modulus * math.sqrt(radius) * depth**1.5 * series
+    assert math.isclose(LoadLaw(gap, cell, pad).force(depth), expected, rel_tol=0.02)
+
+
+def test_load_law_of_a_flat_punch_is_linear_and_inverts() -> None:
+    x = np.linspace(-8e-3, 8e-3, 1601)
+    gap = np.where(np.hypot(x[None, :], x[:, None]) < 1e-3, 0.0, np.inf)
+    law = LoadLaw(gap, (x[1] - x[0]) ** 2, PAD)
+    expected = 2.0 * reduced_modulus(PAD) * 1e-3 * float(layer_stiffening(np.array(1e-3), PAD))
+    for depth in (0.2e-3, 0.5e-3, 1e-3):
+        assert math.isclose(law.force(depth) / depth, expected, rel_tol=0.01)
+        assert math.isclose(law.depth_at(law.force(depth)), depth, rel_tol=1e-9)
+    assert law.force(-1e-3) == 0.0 and law.contact_radius(0.0) == 0.0
+    with pytest.raises(InputError, match="deeper than the pad"):
+        law.depth_at(2.0 * law.greatest)
+
+
+@pytest.mark.parametrize("kind", sorted(OBJECTS))
+def test_force_grows_with_depth(kind: str) -> None:
+    _, states = press(scene_of(kind, indent(1e-3)), steps=8)
+    force = np.array([s.normal_force[0] for s in states])
+    assert force[0] == 0.0 and (np.diff(force) > 0.0).all()
+
+
+def test_mujoco_contact_has_the_stiffness_it_was_given() -> None:
+    rig = PressRig(mass=0.05, stiffest=5e3)
+    rig.place(np.array([0.0, 0.0, 3e-3]), 3e-3)
+    for stiffness in (200.0, 1000.0, 5000.0):
+        force = rig.hold(np.array([0.0, 0.0, -0.4e-3, 0.0]), lambda _, k=stiffness: k)
+        assert math.isclose(force, stiffness * 0.4e-3, rel_tol=1e-6)
+        rig.hold(np.zeros(4), lambda _, k=stiffness: k)
+        assert rig.load(0.0, 0.3, 0.2, lambda _, k=stiffness: k)
+        assert math.isclose(rig.depth, 0.3 / stiffness, rel_tol=1e-3)
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.0, 0.0), (5e-3, -3e-3, 0.0)])
+def test_sphere_touches_the_dome_where_geometry_says(position: tuple[float, float, float]) -> None:
+    scene = scene_of("sphere", position=position)
+    pose = np.eye(4)
+    pose[:2, 3] = position[:2]
+    x, y = (np.linspace(p - 1e-3, p + 1e-3, 801) for p in position[:2])
+    above = -np.sqrt((4e-3) ** 2 - (x[None, :] - position[0]) ** 2 - (y[:, None] - position[1]) ** 2)
+    expected = (rest_height(PAD, x[None, :], y[:, None]) - above).max()
+    for pitch in (0.2e-3, 0.0634e-3):
+        found = first_touch_z(object_parts(scene.object), pose, PAD, make_grid(PAD, pitch))
+        assert math.isclose(found, expected, abs_tol=1e-9)
+
+
+@pytest.mark.parametrize("kind", sorted(OBJECTS))
+def test_first_touch_has_no_overlap_and_no_gap(kind: str) -> None:
+    angle = 0.05
+    scene = scene_of(kind, quaternion=(math.cos(angle), 0.5 * math.sin(angle), 0.2 * math.sin(angle), 0.0))
+    pad = RigidPad(sensor_with(), scene, pitch=PITCH)
+    state = next(pad.run())
+    pose = state.pad_from_object[0].copy()
+    pose[2, 3] -= CLEARANCE
+    gap = gap_at_touch(pad.parts, pose, pad.grid)
+    assert 0.0 <= gap.min() < 20e-6  # a sharp corner may lie between nodes
+    assert not pad.surface_from_pose(pose[None]).contact.any() or gap.min() < 1e-9
+
+
+@pytest.mark.parametrize("kind", sorted(OBJECTS))
+def test_commanded_depth_is_reached_and_release_restores_rest(kind: str) -> None:
+    pad, states = press(scene_of(kind, indent(0.5e-3), StageSpec("release")))
+    assert [s.kind for s in states] == ["start", "indent", "release"]
+    start, pressed, released = states
+    assert abs(pressed.depth[0] - 0.5e-3) < 1e-9
+    travel = start.pad_from_object[0, 2, 3] - CLEARANCE - pressed.pad_from_object[0, 2, 3]
+    assert abs(travel - 0.5e-3) < 1e-6
+    surface = pad.surface(pressed)
+    assert surface.contact.any() and 0.4e-3 < surface.indentation.max() < 0.5e-3 + 1e-7
+    rest = pad.grid.rest.astype(np.float32)
+    for state in (start, released):
+        assert state.normal_force[0] == 0.0 and state.depth[0] < 0.0
+        np.testing.assert_array_equal(pad.surface(state).height[0], rest)
+    assert pad.peak(iter(states)) is pressed
+
+
+@pytest.mark.parametrize(
+    ("kind", "force"), [("sphere", 0.3), ("sphere", 3.0), ("cone", 0.5), ("torus", 2.0), ("pins", 1.0), ("coin", 8.0)]
+)
+def test_commanded_force_is_reached(kind: str, force: float) -> None:
+    _, states = press(scene_of(kind, StageSpec("indent", force=force)))
+    assert math.isclose(states[-1].normal_force[0], force, rel_tol=1e-3)
+    _, by_depth = press(scene_of(kind, indent(float(states[-1].depth[0]))))
+    assert math.isclose(by_depth[-1].normal_force[0], force, rel_tol=1e-3)
+
+
+def test_shear_and_twist_move_the_contact_as_commanded() -> None:
+    shear = StageSpec("shear", shear=(1e-3, -0.5e-3))
+    twist = StageSpec("twist", twist=0.3)
+    scene = scene_of("torus", indent(0.5e-3), shear, twist, position=(1e-3, 0.0, 0.0), quaternion=IDENTITY)
+    pad, states = press(scene)
+    pressed, sheared, twisted = states[1:]
+    np.testing.assert_allclose(
+        sheared.pad_from_object[0, :3, 3] - pressed.pad_from_object[0, :3, 3], (1e-3, -0.5e-3, 0.0), atol=1e-12
+    )
+    c, s = math.cos(0.3), math.sin(0.3)
+    np.testing.assert_allclose(twisted.pad_from_object[0, :3, :3], [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(twisted.pad_from_object[0, :3, 3], sheared.pad_from_object[0, :3, 3], atol=1e-12)
+    moved = pad.surface(sheared).contact_centre - pad.surface(pressed).contact_centre
+    np.testing.assert_allclose(moved[0], (1e-3, -0.5e-3), atol=0.15e-3)  # the dome moves the deepest point a little less
+    assert pressed.shear_force[0].tolist() == [0.0, 0.0] and sheared.shear_force[0, 0] > 0.0 > sheared.shear_force[0, 1]
+    assert sheared.twist_torque[0] == 0.0 < twisted.twist_torque[0]
+
+
+def test_shear_force_sticks_then_slips_at_the_friction_limit() -> None:
+    stages = [StageSpec("shear", shear=(x, 0.0)) for x in (0.01e-3, 0.02e-3, 2e-3, 3e-3)]
+    _, states = press(scene_of("sphere", indent(0.5e-3), *stages))
+    small, twice, slipped, further = (s.shear_force[0, 0] for s in states[2:])
+    assert math.isclose(twice, 2.0 * small, rel_tol=0.02)
+    for state, force in ((states[-2], slipped), (states[-1], further)):
+        assert math.isclose(force, PAD.friction * state.normal_force[0], rel_tol=1e-6)
+
+
+def test_force_is_kept_while_shearing() -> None:
+    stages = (StageSpec("indent", force=1.0), StageSpec("shear", shear=(2e-3, 1e-3)))
+    _, states = press(scene_of("sphere", *stages), steps=2)
+    np.testing.assert_allclose([s.normal_force[0] for s in states[2:]], 1.0, rtol=1e-3)
+
+
+def test_batch_equals_single_bit_for_bit() -> None:
+    offsets = np.array([[0.0, 0.0], [2e-3, -1e-3], [-3e-3, 0.5e-3]])
+    scene = scene_of("torus", StageSpec("indent", force=1.0), indent(0.6e-3), StageSpec("shear", shear=(0.5e-3, 0.0)))
+    pad, states = press(scene, num_envs=3, offsets=offsets)
+    for b in range(3):
+        alone, single = press(scene, offsets=offsets[b : b + 1])
+        for together, one in zip(states, single, strict=True):
+            for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque", "failed"):
+                np.testing.assert_array_equal(getattr(together, name)[b], getattr(one, name)[0])
+        np.testing.assert_array_equal(pad.surface(states[-1]).height[b], alone.surface(single[-1]).height[0])
+
+
+def test_depths_by_environment_and_a_failed_one_leaves_the_others_running() -> None:
+    offsets = np.array([[0.0, 0.0], [np.nan, 0.0], [1e-3, 0.0]])
+    pad, states = press(
+        scene_of("sphere", indent(0.5e-3)), num_envs=3, offsets=offsets, depths=np.array([0.2e-3, 0.3e-3, 0.4e-3])
+    )
+    np.testing.assert_array_equal(states[-1].failed, [False, True, False])
+    np.testing.assert_allclose(states[-1].depth, [0.2e-3, np.nan, 0.4e-3])
+    height = pad.surface(states[-1]).height
+    assert np.isnan(height[1]).all() and np.isfinite(height[[0, 2]]).all()
+
+
+def test_diverging_state_marks_its_environment() -> None:
+    rig = PressRig(0.05, 1e3)
+    rig.place(np.zeros(3), 0.0)
+    assert not rig.load(0.0, math.nan, 0.01, lambda _: 1e3)
+
+
+def test_untouched_pad() -> None:
+    pad, states = press(scene_of("none"))
+    assert len(states) == 1 and pad.peak(states) is states[0]
+    surface = pad.surface(states[0])
+    assert surface.pad_from_object is None
+    np.testing.assert_array_equal(surface.height[0], pad.grid.rest.astype(np.float32))
+
+
+def test_impossible_scenes_are_refused() -> None:
+    with pytest.raises(SpecError, match="thickness"):
+        press(scene_of("sphere", indent(4.1e-3)))
+    with pytest.raises(InputError, match="thickness"):
+        press(scene_of("sphere", indent(1e-3)), depths=np.array([5e-3]))
+    with pytest.raises(InputError, match="deeper than the pad"):
+        press(scene_of("sphere", StageSpec("indent", force=1e5)))
+    with pytest.raises(InputError, match="above a node"):
+        press(scene_of("sphere", indent(1e-3), position=(50e-3, 0.0, 0.0)))
+    with pytest.raises(SpecError, match="exactly one"):
+        press(scene_of("sphere", StageSpec("indent")))
+    with pytest.raises(SpecError, match="sphere"):
+        object_parts(ObjectSpec("ball", {}, (0.0, 0.0, 0.0), IDENTITY, 0.1))
+    with pytest.raises(SpecError, match="radius"):
+        object_parts(ObjectSpec("sphere", {"radius": -1.0}, (0.0, 0.0, 0.0), IDENTITY, 0.1))
+    with pytest.raises(InputError, match="offsets"):
+        press(scene_of("sphere"), num_envs=2, offsets=np.zeros((3, 2)))
