@@ -49,13 +49,14 @@ def test_led_keys() -> None:
 
 def test_object_keys() -> None:
     text = section("Press")
+    others = {"rows": "[1, 50]", "columns": "[1, 50]", "scale_m_per_unit": "(0, 10]", "tip_radius_mm": "[0, 100]"}
     for key, interval in ranged(POSE_SCHEMA):
         assert interval in row(text, key)
     for kind, schema in OBJECT_SCHEMA.items():
         assert re.findall(r"`(\w+)`", row(text, kind).split("|")[2]) == list(schema)
         for key, field in schema.items():
             if isinstance(field, Number | Integer):
-                expected = {"rows": "[1, 50]", "columns": "[1, 50]", "scale_m_per_unit": "(0, 10]"}.get(key, "(0, 100]")
+                expected = others.get(key, "(0, 100]")
                 assert field.interval == expected and f"`{expected}`" in text
 
 
@@ -71,7 +72,9 @@ def test_every_shipped_file_says_where_its_values_come_from() -> None:
     for path in (asset_root("scenes") / "sensors").glob("*.toml"):
         bare = [line for line in lines_with_values(path) if "#" not in line]
         # What is switched off or fully said by the key itself needs no source.
-        assert [line for line in bare if not re.match(r"(lights|rows|columns|model|black_level|vignetting|white_balance) =", line)] == []
+        assert [
+            line for line in bare if not re.match(r"(lights|rows|columns|model|black_level|vignetting|white_balance) =", line)
+        ] == []
     for path in asset_root("lights").glob("*.toml"):
         head = path.read_text("utf-8").split("[[led]]")[0].lower()
         assert "provenance" in head and "fit" in head, path
