@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import struct
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from raytac.assets import asset_root
 from raytac.errors import MeshError
+from raytac.io.metrics import read_metrics
 from raytac.specs import load_mesh
 
 CUBE = trimesh.creation.box(extents=(10.0, 8.0, 6.0))
@@ -134,3 +136,23 @@ def test_random_bytes_are_refused_and_nothing_else_is_raised(
     path.write_bytes(content)
     with pytest.raises(MeshError):
         load_mesh(path, 0.001)
+
+
+def test_the_gear_is_what_its_script_writes(tmp_path: Path) -> None:
+    script = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "make_gear_mesh.py"))
+    script["main"](script["Args"](out=tmp_path))
+    assert read_metrics(tmp_path / "metrics.json")["mesh.volume_mm3"] == pytest.approx(371.782, abs=1e-3)
+    written, shipped = (load_mesh(root / "gear.stl", 0.001) for root in (tmp_path, asset_root("scenes") / "meshes"))
+    np.testing.assert_allclose(written[0], shipped[0], atol=1e-9)
+    np.testing.assert_array_equal(written[1], shipped[1])
+
+
+def test_the_teeth_are_as_thick_on_the_pitch_circle_as_the_gaps() -> None:
+    """The definition of an involute gear without backlash: half a pitch, π m / 2 of arc, is tooth."""
+    script = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "make_gear_mesh.py"))
+    corners = script["outline"](12, 1.0)
+    radius, angle = np.hypot(*corners.T), np.arctan2(corners[:, 1], corners[:, 0])
+    on_pitch = np.isclose(radius, 6.0) & (np.abs(angle) < np.pi / 12)
+    assert np.ptp(angle[on_pitch]) * 6.0 == pytest.approx(np.pi / 2, rel=1e-12)
+    assert radius.max() == pytest.approx(7.0) and radius.min() == pytest.approx(4.75)
+    assert (np.diff(np.unwrap(angle)) > 0).all()  # seen from the axis, every point of the outline is in sight
