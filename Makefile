@@ -23,7 +23,7 @@ clean:
 # The stamps are written last, so an interrupted install is repeated and a finished one is not.
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
-	  echo "raytac needs Python >= 3.11, and '$(PYTHON)' is $$($(PYTHON) --version 2>&1);" \
+	  echo "raytac needs Python >= 3.11, and '$(PYTHON)' is $$($(PYTHON) --version 2>&1 | head -n 1);" \
 	       "name another one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || { \
 	  echo "could not create $(VENV); on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
