@@ -10,7 +10,7 @@ from raytac.errors import InputError
 from raytac.gel.part import Part
 from raytac.gel.primitives import UNDERSIDES, bounds
 from raytac.gel.rasterize import lowest_of_triangles
-from raytac.gel.relief import relief_underside
+from raytac.gel.relief import looks_down, relief_underside
 
 __all__ = ["object_bounds", "object_height"]
 
@@ -62,8 +62,8 @@ def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _lower_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
     """Take the minimum of ``lowest`` (Ny, Nx) and the part's underside, in place, within the part's bounding box."""
     corners: np.ndarray | None = None
-    if part.kind == "mesh":
-        assert part.vertices is not None and part.faces is not None
+    if part.kind == "mesh" or (part.kind == "relief" and not looks_down(part, pose)):
+        assert part.vertices is not None
         placed = part.vertices @ pose[:3, :3].T + pose[:3, 3]
         low, high = placed.min(axis=0), placed.max(axis=0)
     else:

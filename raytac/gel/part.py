@@ -33,7 +33,7 @@ class Part:
     half edges); and two that MuJoCo lacks: ``cone`` (base radius, height, tip radius: apex down, the rounded tip touches z = 0),
     ``torus`` (major radius, minor radius, axis z). ``mesh`` has ``vertices`` [m], (V, 3), and ``faces``, (F, 3). ``relief`` is a
     raised pattern under a plane z = 0: the solid 0 >= z >= −``elevation``(x, y), size (half width), with ``elevation`` [m],
-    (N, N), rows along y, over the square |x|, |y| <= half width; it has no underside where the elevation is 0.
+    (N, N), rows along y, over the square |x|, |y| <= half width, and its triangles; it has no underside where it does not rise.
     """
 
     kind: str

@@ -8,11 +8,11 @@ from raytac.errors import InputError
 from raytac.gel.part import Part
 from raytac.gel.primitives import line_in_part
 
-__all__ = ["relief_part", "relief_underside"]
+__all__ = ["looks_down", "relief_part", "relief_underside"]
 
 _STEPS = 60
 _LIMIT = 0.7
-"""Greatest slope · tan τ that is accepted: the factor by which each step shrinks the error at worst."""
+"""Greatest slope · tan τ for the iteration: the factor by which each step shrinks the error at worst."""
 
 
 def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.ndarray | None = None) -> Part:
@@ -25,27 +25,29 @@ def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.n
     spacing = 2.0 * half_width / (len(data) - 1)
     slope = np.hypot(*np.gradient(data, spacing)).max()
     pose = np.eye(4) if object_from_part is None else np.array(object_from_part, float)
-    return Part("relief", (float(half_width),), pose, elevation=data, max_slope=float(slope))
+    vertices, faces = _facets(data, half_width)
+    return Part("relief", (float(half_width),), pose, vertices, faces, elevation=data, max_slope=float(slope))
+
+
+def looks_down(part: Part, pose: np.ndarray) -> bool:
+    """Whether the relief's face is turned down so far that ``relief_underside`` converges; if not, use its triangles."""
+    tangent = float(np.hypot(pose[2, 0], pose[2, 1]))
+    return bool(pose[2, 2] > 0.0 and tangent * part.max_slope <= _LIMIT * pose[2, 2])
 
 
 def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """z [m] of the relief's underside, shape (Ny, Nx), ``inf`` off the pattern; arguments as in ``raytac.gel.primitives``.
 
     On the line o + t d (part frame) the underside solves p_z + e(p_x, p_y) = 0. Face down the line is vertical in the part frame
-    too and t is read off. Tilted by τ, t ← t − (p_z + e) / d_z is iterated; it converges while slope · tan τ < 1; more tilt
-    than slope · tan τ = 0.7 (at 1 the pattern would hide parts of itself) raises ``InputError``.
+    too and t is read off. Tilted by τ, t ← t − (p_z + e) / d_z is iterated; it converges while slope · tan τ < 1, which
+    ``looks_down`` must have found.
     """
     o, d = line_in_part(pose, x, y)
     half_width = part.size[0]
-    if d[2] <= 0.0:  # face up: the plane behind the pattern is the underside, which the body in front of it owns
-        return np.full(o[0].shape, np.inf)
-    tangent = float(np.hypot(d[0], d[1]) / d[2])
-    if tangent * part.max_slope >= _LIMIT:
-        limit = np.rad2deg(np.arctan(_LIMIT / part.max_slope))
-        raise InputError("tilt of the relief [deg]", value=float(np.rad2deg(np.arctan(tangent))), rule=f"must be < {limit:.1f}")
     t = -o[2] / d[2]
     elevation = np.zeros_like(t)
-    for _ in range(1 if tangent == 0.0 else _STEPS):
+    upright = d[0] == 0.0 and d[1] == 0.0
+    for _ in range(1 if upright else _STEPS):
         elevation = _sample(part, o[0] + t * d[0], o[1] + t * d[1])
         change = -(o[2] + t * d[2] + elevation) / d[2]
         t = t + change
@@ -53,6 +55,19 @@ def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray)
             break
     inside = (np.maximum(np.abs(o[0] + t * d[0]), np.abs(o[1] + t * d[1])) <= half_width) & (elevation > 0.0)
     return np.where(inside, pose[2, 3] + t, np.inf)
+
+
+def _facets(elevation: np.ndarray, half_width: float) -> tuple[np.ndarray, np.ndarray]:
+    """The raised pattern as triangles: vertices (N², 3) [m] and faces (F, 3) of the cells that rise above the plane."""
+    n = len(elevation)
+    line = np.linspace(-half_width, half_width, n)
+    x, y = np.meshgrid(line, line)
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    flat = elevation.ravel()
+    raised = (flat[a] + flat[b] + flat[c] + flat[d]) > 0.0
+    a, b, c, d = (v[raised] for v in (a, b, c, d))
+    return np.stack([x, y, -elevation], axis=-1).reshape(-1, 3), np.concatenate([np.stack([a, d, b], 1), np.stack([a, c, d], 1)])
 
 
 def _sample(part: Part, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ _STIFFEST = 1e4
 """Greatest −solref[0] [1/s²] at this time step: ω Δt = 0.1."""
 _FOOT = 5e-3
 _SETTLED = 1e-4
+_RUNAWAY = 1.0
+"""Distance from the pad [m] at which a carriage counts as lost; before MuJoCo sees a huge number and writes a log file."""
 _PATIENCE = 20_000
 """Steps that a force may take to settle after its ramp."""
 
@@ -108,6 +110,8 @@ class PressRig:
 
         x, y and twist stay where they are. Returns whether the contact's force settled within 1e-4 of ``end``.
         """
+        if not np.isfinite([start, end]).all():
+            return False
         data, held = self.data, self.data.qpos.copy()
         data.qvel[:] = 0.0
         steps = max(round(duration / _TIME_STEP), 1)
@@ -116,7 +120,7 @@ class PressRig:
             self._stiffen(secant)
             mujoco.mj_step(self.model, data)
             data.qpos[[0, 1, 3]] = held[[0, 1, 3]]
-            if not np.isfinite(data.qpos[2]):
+            if not abs(self.depth) < _RUNAWAY:
                 break
             carried = secant(self.depth) * max(self.depth, 0.0)
             rate = abs(float(data.qvel[2])) * secant(self.depth) * 0.01
