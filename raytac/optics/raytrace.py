@@ -1,0 +1,273 @@
+"""``RayTracer``: the ray-traced optical mode. One sensor, one resolution, one scene; batches of surfaces in, images out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import OpticsImages
+from raytac.optics.bounce import BounceField, CaseLight
+from raytac.optics.camera import Pinhole
+from raytac.optics.coat import CoatField, CoatLayout
+from raytac.optics.fast import PixelSample, direct_light, see
+from raytac.optics.lamp import Lamp
+from raytac.optics.reference import ReferenceIntegrator
+from raytac.optics.response import Response
+from raytac.optics.scene import SensorScene
+from raytac.optics.variant import load_mitsuba
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["RayTracer"]
+
+OUTPUTS = ("rgb", "layers", "normals", "depth")
+
+
+@dataclass(frozen=True)
+class FastInputs:
+    """Every device array that a recorded ``fast`` frame reads besides the heights; Dr.Jit wants them named as inputs."""
+
+    rest: Any
+    lamps: list[Lamp]
+    bounce: BounceField | None
+    scale: list[Any]
+
+
+def total(layers: dict[str, np.ndarray]) -> np.ndarray:
+    """The linear image: the sum of its layers."""
+    return np.sum(list(layers.values()), axis=0, dtype=np.float32)
+
+
+class RayTracer:
+    """Ray tracing with Mitsuba 3 and Dr.Jit; fulfils ``raytac.optics.base.OpticalMode``."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        integrator: str = "fast",
+        resolution: tuple[int, int] | None = None,
+        spp: int | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+        seed: int = 0,
+        layers: str = "colour",
+        bounce: bool = True,
+        led_points: int = 1,
+        shadows: bool = True,
+        max_depth: int = -1,
+        flat_field: np.ndarray | None = None,
+        denoise: bool = False,
+        progress: bool = False,
+    ) -> None:
+        """Build what does not depend on the surface's grid.
+
+        Args:
+            sensor: geometry, lights and camera.
+            integrator: ``fast`` (deterministic) or ``reference`` (unbiased path tracing).
+            resolution: (width, height) [px]; None is the sensor's own.
+            spp: samples a pixel. ``reference``: random samples, 256 if None. ``fast``: camera rays a pixel on a regular grid, a square
+                number, 1 if None.
+            outputs: any of ``rgb``, ``layers``, ``normals``, ``depth``.
+            device: ``auto``, ``cpu`` or ``cuda``.
+            seed: of the sampled integrator and of the fit of the case's light.
+            layers: one layer per ``colour`` group of the light file or per ``led``.
+            bounce: inter-reflection in ``fast``.
+            led_points: ``fast`` integrates each LED with this number of points squared.
+            shadows: cast shadows in ``fast``.
+            max_depth: ``reference``: number of reflections, 1 is direct light only, −1 has no limit.
+            flat_field: real image of the untouched sensor, (H, W, 3) uint8 at ``resolution``: the image is then
+                flat_field × rendered / rendered at rest, in linear light.
+            denoise: run the Open Image Denoise filter on the layers of ``reference``.
+            progress: show a progress bar for sampled images.
+
+        Raises:
+            InputError: a value out of its choices.
+            BackendError: Mitsuba cannot run on ``device``.
+        """
+        if integrator not in ("fast", "reference"):
+            raise InputError("integrator", value=integrator, rule="must be a known integrator", choices=("fast", "reference"))
+        if layers not in ("colour", "led"):
+            raise InputError("layers", value=layers, rule="must be a known grouping", choices=("colour", "led"))
+        for name in outputs:
+            if name not in OUTPUTS:
+                raise InputError("outputs", value=name, rule="must be an optical output", choices=OUTPUTS)
+        self.rays = round(np.sqrt(spp or 1))
+        if integrator == "fast" and self.rays**2 != (spp or 1):
+            raise InputError("spp", value=spp, rule="the fast integrator takes a square number of rays a pixel", choices=(1, 4, 9, 16))
+        if led_points < 1:
+            raise InputError("led_points", value=led_points, rule="must be at least 1")
+        self.mi, self.device = load_mitsuba(device)
+        self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
+        self.label = f"raytrace-{integrator}"
+        self.camera = Pinhole.from_spec(sensor.camera, resolution)
+        self.spp = spp or 256
+        self.bounce, self.led_points, self.shadows = bounce, led_points, shadows
+        self.max_depth, self.denoise, self.progress = max_depth, denoise, progress
+        leds = sensor.lights.leds
+        self.layer_names = sensor.lights.layers if layers == "colour" else tuple(led.name for led in leds)
+        self.groups = [self.layer_names.index(led.layer if layers == "colour" else led.name) for led in leds]
+        self.lamps = [Lamp.from_spec(self.mi, led) for led in leds]
+        self.response = Response(sensor.response, self.camera)
+        self._flat_field = None if flat_field is None else self._check_flat_field(flat_field)
+        self._grid: PadGrid | None = None
+
+    def _check_flat_field(self, image: np.ndarray) -> np.ndarray:
+        width, height = self.camera.resolution
+        if image.shape != (height, width, 3) or image.dtype != np.uint8:
+            rule = f"must be a uint8 image of shape ({height}, {width}, 3)"
+            raise InputError("flat_field", value=f"{image.dtype} {image.shape}", rule=rule)
+        return image
+
+    # ---------------------------------------------------------------- per grid
+
+    def _prepare(self, grid: PadGrid) -> None:
+        """Build scene, layout and fields for a pad grid; done at the first frame and kept."""
+        if self._grid is not None:
+            if grid is not self._grid and not (np.array_equal(grid.x, self._grid.x) and np.array_equal(grid.y, self._grid.y)):
+                raise InputError("surface.grid", value=grid.shape, rule=f"one ray tracer renders one grid, {self._grid.shape} here")
+            return
+        self._check_view(grid)
+        mi = self.mi
+        self.layout = CoatLayout.from_grid(grid)
+        self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
+        needs_scene = self.integrator == "reference" or self.bounce
+        self.scene = SensorScene(mi, self.sensor, grid) if needs_scene else None
+        self._bounce = None
+        if self.integrator == "fast" and self.bounce and self.scene is not None:
+            case = CaseLight.fit(self.scene, self.lamps, self.groups, self.seed)
+            self._bounce = BounceField.build(mi, self.layout, case)
+        if self.integrator == "reference" and self.scene is not None:
+            self._reference = ReferenceIntegrator(self.scene, self.camera, max_depth=self.max_depth, progress=self.progress)
+        self._grid = grid
+        if self._flat_field is not None:
+            still = np.zeros((1, *grid.shape), bool)
+            rest = GelSurface(grid, grid.rest[None].astype(np.float32), still, np.full((1, 2), np.nan))
+            self.response.set_flat_field(self._flat_field, total(self.render_layers(rest))[0])
+        self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
+        self._frozen = dr.freeze(self._fast_frame)
+
+    def _check_view(self, grid: PadGrid) -> None:
+        corners = self.camera.slope(np.array([0.0, self.camera.resolution[0]]), np.array([0.0, self.camera.resolution[1]]))
+        for axis, nodes, slope in zip("xy", (grid.x, grid.y), corners, strict=True):
+            seen = self.camera.position["xy".index(axis)] - slope * self.camera.position[2]
+            if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
+                rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
+                raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)
+
+    # ---------------------------------------------------------------- images
+
+    def render(self, surface: GelSurface) -> OpticsImages:
+        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes."""
+        self._prepare(surface.grid)
+        width, height = self.camera.resolution
+        shape = (surface.batch, height, width)
+        if self.integrator == "fast":
+            device = self.render_device(self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel()))
+            linear, u8 = device["layers"], device["rgb"]
+            layers = self._to_numpy_layers(linear, shape) if "layers" in self.outputs else None
+            rgb = np.array(u8).reshape(*shape, 3) if "rgb" in self.outputs else None
+        else:
+            by_layer = self.render_layers(surface)
+            layers = by_layer if "layers" in self.outputs else None
+            rgb = self.response.encode_numpy(total(by_layer)) if "rgb" in self.outputs else None
+        aov = self._geometry(surface, shape) if {"normals", "depth"} & set(self.outputs) else {}
+        return OpticsImages(rgb=rgb, layers=layers, **aov)
+
+    def render_layers(self, surface: GelSurface) -> dict[str, np.ndarray]:
+        """Linear radiance by layer, each (B, H, W, 3) float32, from either integrator."""
+        self._prepare(surface.grid)
+        width, height = self.camera.resolution
+        shape = (surface.batch, height, width)
+        if self.integrator == "fast":
+            heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+            return self._to_numpy_layers(self._linear(heights, FastInputs(self._rest, self.lamps, self._bounce, [])), shape)
+        images = []
+        for b in range(surface.batch):
+            self.scene.set_surface(surface.height[b])
+            images.append(self._reference.render(self.lamps, self.groups, self.spp, self.seed + b))
+        stack = np.stack(images, axis=1)
+        if self.denoise:
+            stack = np.stack([[denoise_oidn(image) for image in layer] for layer in stack])
+        return dict(zip(self.layer_names, stack, strict=True))
+
+    def render_device(self, heights: Any) -> dict[str, Any]:
+        """``fast`` on device arrays: heights (B·Ny·Nx) [m] to ``rgb`` (B·H·W·3, UInt8-valued) and ``layers`` (list of channels).
+
+        Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
+        """
+        rgb, layers = self._frozen(heights, self._inputs)
+        return {"rgb": rgb, "layers": layers}
+
+    def _fast_frame(self, heights: Any, inputs: FastInputs) -> tuple[Any, list[Any]]:
+        channels = self._linear(heights, inputs)
+        groups = range(len(channels) // 3)
+        linear = [sum((channels[3 * g + c] for g in groups), self.mi.Float(0)) for c in range(3)]
+        rgb = self.response.encode(self.mi, linear, inputs.scale) if "rgb" in self.outputs else self.mi.UInt8(0)
+        return rgb, channels if "layers" in self.outputs else []
+
+    def _linear(self, heights: Any, inputs: FastInputs) -> list[Any]:
+        """Radiance of every channel (3·G), each B·H·W, averaged over the rays of a pixel."""
+        mi, layout = self.mi, self.layout
+        envs = dr.width(heights) // (layout.nx * layout.ny)
+        field = CoatField(mi, layout, inputs.rest, heights)
+        grids = inputs.bounce.gather_light(mi, field, self._radiosity(field, inputs), envs) if inputs.bounce else None
+        sums: list[Any] = []
+        for a in range(self.rays):
+            for b in range(self.rays):
+                seen = see(mi, field, self.camera, envs, ((a + 0.5) / self.rays, (b + 0.5) / self.rays))
+                channels = self._shade(field, seen, grids, inputs)
+                sums = [t + c for t, c in zip(sums, channels, strict=True)] if sums else channels
+        return [t / self.rays**2 for t in sums]
+
+    def _shade(self, field: CoatField, seen: PixelSample, grids: list[Any] | None, inputs: FastInputs) -> list[Any]:
+        mi, coat = self.mi, self.sensor.coat
+        diffuse_albedo = [(1 - coat.specular) * r for r in coat.reflectance]
+        out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
+        for lamp, group in zip(inputs.lamps, self.groups, strict=True):
+            diffuse, specular = direct_light(mi, field, coat, seen, lamp, self.led_points, self.shadows)
+            for c in range(3):
+                out[3 * group + c] += lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
+        if grids is not None and inputs.bounce is not None:
+            for k, e in enumerate(inputs.bounce.irradiance(mi, grids, seen)):
+                out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
+        return out
+
+    def _radiosity(self, field: CoatField, inputs: FastInputs) -> Any:
+        """Direct radiosity B of the coat at a sample, a channel each, for the coat's own inter-reflection."""
+        mi, coat = self.mi, self.sensor.coat
+
+        def radiosity(seen: PixelSample) -> list[Any]:
+            out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
+            for lamp, group in zip(inputs.lamps, self.groups, strict=True):
+                diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False)
+                for c in range(3):
+                    out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * coat.reflectance[c] + coat.specular)
+            return out
+
+        return radiosity
+
+    def _to_numpy_layers(self, channels: list[Any], shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
+        stack = np.stack([np.array(c) for c in channels], axis=-1).reshape(*shape, len(self.layer_names), 3)
+        return {name: np.ascontiguousarray(stack[..., g, :]) for g, name in enumerate(self.layer_names)}
+
+    def _geometry(self, surface: GelSurface, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
+        """Normals, positions, camera depth and contact seen through the pixel centres; only what the outputs name."""
+        mi = self.mi
+        field = CoatField(mi, self.layout, self._rest, mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel()))
+        seen = see(mi, field, self.camera, surface.batch)
+        p = np.stack([np.array(c) for c in seen.p], axis=-1).reshape(*shape, 3)
+        grid = surface.grid
+        ix = np.clip(np.rint((p[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)
+        iy = np.clip(np.rint((p[..., 1] - grid.y[0]) / grid.pitch[1]).astype(int), 0, len(grid.y) - 1)
+        aov = {"contact": surface.contact[np.arange(shape[0])[:, None, None], iy, ix]}
+        if "normals" in self.outputs:
+            aov["normals"] = np.stack([np.array(c) for c in seen.n], axis=-1).reshape(*shape, 3)
+            aov["position"] = p
+        if "depth" in self.outputs:
+            aov["depth"] = (p[..., 2] - self.camera.position[2]).astype(np.float32)
+        return aov

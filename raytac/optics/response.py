@@ -1,0 +1,56 @@
+"""The camera's response: from linear radiance to the 8-bit image, and a real image as flat field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.optics.camera import Pinhole
+from raytac.specs.sensor import ResponseSpec
+
+__all__ = ["Response"]
+
+
+class Response:
+    """u8 = round(255 · clip(gain · white balance · exposure · vignette · L + black)^(1/γ)), one formula for device and host."""
+
+    def __init__(self, spec: ResponseSpec, camera: Pinhole) -> None:
+        self.spec = spec
+        width, height = camera.resolution
+        u, v = np.meshgrid(np.arange(width) + 0.5 - camera.principal[0], np.arange(height) + 0.5 - camera.principal[1])
+        r2 = (u**2 + v**2) / ((width**2 + height**2) / 4)
+        a1, a2, a3 = spec.vignetting
+        vignette = 1 + r2 * (a1 + r2 * (a2 + r2 * a3))
+        self.scale = (spec.exposure * vignette[..., None] * np.asarray(spec.white_balance)).astype(np.float32)
+        """Linear gain per pixel and channel, (H, W, 3); a flat field multiplies it."""
+        self.black = np.asarray(spec.black_level, dtype=np.float32)
+
+    def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
+        """From now on turn the radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8), in linear light."""
+        target = (background.astype(np.float32) / 255) ** self.spec.gamma - self.black
+        self.scale = (target / np.maximum(at_rest, 1e-9)).astype(np.float32)
+
+    def encode(self, mi: Any, linear: list[Any], scale: list[Any]) -> Any:
+        """8-bit values, interleaved RGB (N·3), of three device arrays of B·H·W radiances; ``scale`` as ``device_scale`` gives it."""
+        n = dr.width(linear[0])
+        i = dr.arange(mi.UInt32, n)
+        pixel = i % dr.width(scale[0])
+        out = []
+        for c in range(3):
+            value = linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c])
+            out.append(dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) * 255 + 0.5)
+        packed = dr.empty(mi.UInt8, 3 * n)
+        for c, value in enumerate(out):
+            dr.scatter(packed, mi.UInt8(value), 3 * i + c)
+        return packed
+
+    def device_scale(self, mi: Any) -> list[Any]:
+        """``scale`` as three device arrays of H·W."""
+        return [mi.Float(np.ascontiguousarray(self.scale[..., c]).ravel()) for c in range(3)]
+
+    def encode_numpy(self, linear: np.ndarray) -> np.ndarray:
+        """8-bit image (…, H, W, 3) of linear radiance of that shape."""
+        value = linear * self.scale + self.black
+        return (np.clip(value, 0, 1) ** (1 / self.spec.gamma) * 255 + 0.5).astype(np.uint8)
