@@ -27,7 +27,7 @@ PHYSICS = ("rigid",)
 """Names that ``physics=`` accepts."""
 OPTICS = ("raytrace",)
 """Names that ``optics=`` accepts."""
-INTEGRATORS = ("fast", "reference")
+INTEGRATORS = ("fast", "reference", "path")
 """Names that ``integrator=`` accepts."""
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""

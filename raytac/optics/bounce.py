@@ -34,9 +34,9 @@ SAMPLES = 1 << 18
 """Paths that the fit of the case's light uses."""
 DEGREE = 3
 """Polynomial degree over the pad."""
-PATCH = 0.3e-3
+PATCH = 0.4e-3
 """Pitch of the coarse grid [m]."""
-REACH = 9
+REACH = 7
 """Radius of the neighbourhood that lights a patch [patches]."""
 TILT = 1.2
 """Largest tangent of a normal's tilt in the fit."""

@@ -16,7 +16,7 @@ from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.lamp import Lamp
-from raytac.optics.reference import ReferenceIntegrator
+from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.response import Response
 from raytac.optics.scene import SensorScene
 from raytac.optics.variant import load_mitsuba
@@ -24,6 +24,7 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["RayTracer"]
 
+INTEGRATORS = ("fast", "reference", "path")
 OUTPUTS = ("rgb", "layers", "normals", "depth")
 
 
@@ -68,9 +69,9 @@ class RayTracer:
 
         Args:
             sensor: geometry, lights and camera.
-            integrator: ``fast`` (deterministic) or ``reference`` (unbiased path tracing).
+            integrator: ``fast`` (deterministic), ``reference`` (unbiased path tracing of our own) or ``path`` (Mitsuba's, to compare).
             resolution: (width, height) [px]; None is the sensor's own.
-            spp: samples a pixel. ``reference``: random samples, 256 if None. ``fast``: camera rays a pixel on a regular grid, a square
+            spp: samples a pixel. ``reference`` and ``path``: random samples, 256 if None. ``fast``: camera rays a pixel on a regular grid, a square
                 number, 1 if None.
             outputs: any of ``rgb``, ``layers``, ``normals``, ``depth``.
             device: ``auto``, ``cpu`` or ``cuda``.
@@ -79,18 +80,18 @@ class RayTracer:
             bounce: inter-reflection in ``fast``.
             led_points: ``fast`` integrates each LED with this number of points squared.
             shadows: cast shadows in ``fast``.
-            max_depth: ``reference``: number of reflections, 1 is direct light only, −1 has no limit.
+            max_depth: sampled integrators: number of reflections, 1 is direct light only, −1 has no limit.
             flat_field: real image of the untouched sensor, (H, W, 3) uint8 at ``resolution``: the image is then
                 flat_field × rendered / rendered at rest, in linear light.
-            denoise: run the Open Image Denoise filter on the layers of ``reference``.
+            denoise: run the Open Image Denoise filter on the layers of the sampled integrators.
             progress: show a progress bar for sampled images.
 
         Raises:
             InputError: a value out of its choices.
             BackendError: Mitsuba cannot run on ``device``.
         """
-        if integrator not in ("fast", "reference"):
-            raise InputError("integrator", value=integrator, rule="must be a known integrator", choices=("fast", "reference"))
+        if integrator not in INTEGRATORS:
+            raise InputError("integrator", value=integrator, rule="must be a known integrator", choices=INTEGRATORS)
         if layers not in ("colour", "led"):
             raise InputError("layers", value=layers, rule="must be a known grouping", choices=("colour", "led"))
         for name in outputs:
@@ -135,14 +136,15 @@ class RayTracer:
         mi = self.mi
         self.layout = CoatLayout.from_grid(grid)
         self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
-        needs_scene = self.integrator == "reference" or self.bounce
+        needs_scene = self.integrator != "fast" or self.bounce
         self.scene = SensorScene(mi, self.sensor, grid) if needs_scene else None
         self._bounce = None
         if self.integrator == "fast" and self.bounce and self.scene is not None:
             case = CaseLight.fit(self.scene, self.lamps, self.groups, self.seed)
             self._bounce = BounceField.build(mi, self.layout, case)
-        if self.integrator == "reference" and self.scene is not None:
-            self._reference = ReferenceIntegrator(self.scene, self.camera, max_depth=self.max_depth, progress=self.progress)
+        if self.integrator != "fast" and self.scene is not None:
+            kind = ReferenceIntegrator if self.integrator == "reference" else StockPathIntegrator
+            self._sampled = kind(self.scene, self.camera, max_depth=self.max_depth, progress=self.progress)
         self._grid = grid
         if self._flat_field is not None:
             still = np.zeros((1, *grid.shape), bool)
@@ -189,7 +191,7 @@ class RayTracer:
         images = []
         for b in range(surface.batch):
             self.scene.set_surface(surface.height[b])
-            images.append(self._reference.render(self.lamps, self.groups, self.spp, self.seed + b))
+            images.append(self._sampled.render(self.lamps, self.groups, self.spp, self.seed + b))
         stack = np.stack(images, axis=1)
         if self.denoise:
             stack = np.stack([[denoise_oidn(image) for image in layer] for layer in stack])

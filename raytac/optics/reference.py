@@ -9,6 +9,7 @@ out that Mitsuba's own ``path`` has from choosing one LED at random; both conver
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,7 @@ from raytac.optics.camera import Pinhole
 from raytac.optics.lamp import Lamp, LampTable
 from raytac.optics.scene import SensorScene
 
-__all__ = ["ReferenceIntegrator", "trace"]
+__all__ = ["ReferenceIntegrator", "StockPathIntegrator", "trace"]
 
 LAUNCH = 1 << 22
 """Most paths in one kernel launch; keeps memory flat and the progress bar alive."""
@@ -30,39 +31,72 @@ class ReferenceIntegrator:
 
     def __init__(self, scene: SensorScene, camera: Pinhole, *, max_depth: int = -1, progress: bool = False) -> None:
         """``max_depth`` counts reflections: 1 is direct light only, −1 has no limit."""
-        mi = scene.mi
         self.scene, self.camera, self.max_depth, self.progress = scene, camera, max_depth, progress
-        self.sampler = mi.load_dict({"type": "independent"})
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
         """Mean radiance (G, H, W, 3), float32; ``groups`` gives for each lamp the layer in 0 … G−1 that it lights.
 
         Samples are uniform in each pixel's square (box filter); ``spp`` samples a pixel, ``seed`` fixes them.
         """
-        mi = self.scene.mi
-        width, height = self.camera.resolution
-        per_launch = max(1, min(spp, LAUNCH // (width * height)))
-        layers = max(groups) + 1
-        total = np.zeros((layers * 3, height * width))
-        done = 0
-        with tqdm(total=spp, unit="spp", desc="reference", disable=None if self.progress else True, leave=False) as bar:
-            while done < spp:
-                count = min(per_launch, spp - done)
-                n = width * height * count
-                sampler = self.sampler.clone()
-                sampler.seed((seed * 0x9E3779B1 + done * 0x85EBCA6B) & 0xFFFFFFFF, n)
-                pixel = dr.arange(mi.UInt32, n) // count
-                jitter = sampler.next_2d()
-                tx, ty = self.camera.slope(mi.Float(pixel % width) + jitter.x, mi.Float(pixel // width) + jitter.y)
-                ray = mi.Ray3f(mi.Point3f(*self.camera.position), dr.normalize(mi.Vector3f(tx, ty, 1)))
-                radiance = trace(mi, self.scene, sampler, ray, lamps, groups, self.max_depth)
-                sums = [dr.block_sum(c, count) for c in radiance]
-                dr.eval(sums)
-                total += np.stack([np.array(c) for c in sums])
-                done += count
-                bar.update(count)
-        image = (total / spp).reshape(layers, 3, height, width)
-        return np.ascontiguousarray(image.transpose(0, 2, 3, 1), dtype=np.float32)
+
+        def radiance(sampler: Any, ray: Any) -> list[Any]:
+            return trace(self.scene.mi, self.scene, sampler, ray, lamps, groups, self.max_depth)
+
+        return accumulate(self.scene.mi, self.camera, radiance, spp, seed, self.progress)
+
+
+class StockPathIntegrator:
+    """Mitsuba's own ``path`` over the same scene: an independent check of ``reference``, and the peer to measure speed against."""
+
+    def __init__(self, scene: SensorScene, camera: Pinhole, *, max_depth: int = -1, progress: bool = False) -> None:
+        """``max_depth`` as in ``ReferenceIntegrator`` (Mitsuba itself counts the camera's edge too)."""
+        self.scene, self.camera, self.progress = scene, camera, progress
+        depth = -1 if max_depth < 0 else max_depth + 1
+        self.integrator = scene.mi.load_dict({"type": "path", "max_depth": depth})
+
+    def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
+        """As ``ReferenceIntegrator.render``; one run a layer, with the other layers' LEDs dark."""
+        names = [led.name for led in self.scene.sensor.lights.leds]
+        layers = []
+
+        def radiance(sampler: Any, ray: Any) -> list[Any]:
+            colour, valid, _ = self.integrator.sample(self.scene.scene, sampler, self.scene.mi.RayDifferential3f(ray))
+            return [dr.select(valid, c, 0) for c in colour]
+
+        for group in range(max(groups) + 1):
+            self.scene.set_layers([name for name, g in zip(names, groups, strict=True) if g == group])
+            layers.append(accumulate(self.scene.mi, self.camera, radiance, spp, seed, self.progress)[0])
+        return np.stack(layers)
+
+
+def accumulate(
+    mi: Any, camera: Pinhole, radiance: Callable[[Any, Any], list[Any]], spp: int, seed: int, progress: bool
+) -> np.ndarray:
+    """Mean of ``radiance(sampler, ray)`` (3·G channels) over ``spp`` rays uniform in each pixel's square; (G, H, W, 3), float32."""
+    width, height = camera.resolution
+    per_launch = max(1, min(spp, LAUNCH // (width * height)))
+    template = mi.load_dict({"type": "independent"})
+    total: np.ndarray | None = None
+    done = 0
+    with tqdm(total=spp, unit="spp", desc="path tracing", disable=None if progress else True, leave=False) as bar:
+        while done < spp:
+            count = min(per_launch, spp - done)
+            n = width * height * count
+            sampler = template.clone()
+            sampler.seed((seed * 0x9E3779B1 + done * 0x85EBCA6B) & 0xFFFFFFFF, n)
+            pixel = dr.arange(mi.UInt32, n) // count
+            jitter = sampler.next_2d()
+            tx, ty = camera.slope(mi.Float(pixel % width) + jitter.x, mi.Float(pixel // width) + jitter.y)
+            ray = mi.Ray3f(mi.Point3f(*camera.position), dr.normalize(mi.Vector3f(tx, ty, 1)))
+            sums = [dr.block_sum(c, count) for c in radiance(sampler, ray)]
+            dr.eval(sums)
+            launch = np.stack([np.array(c) for c in sums]).astype(np.float64)
+            total = launch if total is None else total + launch
+            done += count
+            bar.update(count)
+    assert total is not None
+    image = (total / spp).reshape(-1, 3, height, width)
+    return np.ascontiguousarray(image.transpose(0, 2, 3, 1), dtype=np.float32)
 
 
 def trace(

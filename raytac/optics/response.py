@@ -41,10 +41,9 @@ class Response:
         for c in range(3):
             value = linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c])
             out.append(dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) * 255 + 0.5)
-        packed = dr.empty(mi.UInt8, 3 * n)
-        for c, value in enumerate(out):
-            dr.scatter(packed, mi.UInt8(value), 3 * i + c)
-        return packed
+        # One kernel for the whole image; the interleaving one would otherwise trace it once a channel.
+        dr.eval(out)
+        return mi.UInt8(dr.ravel(mi.Color3f(*out)))
 
     def device_scale(self, mi: Any) -> list[Any]:
         """``scale`` as three device arrays of H·W."""
