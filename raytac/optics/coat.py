@@ -170,7 +170,8 @@ class CoatField:
             clearance = self.z(env, p.x + s * ux, p.y + s * uy) - (p.z - s * rise)
             return s + step, dr.minimum(least, clearance / s)
 
-        _, least = dr.while_loop((mi.Float(step), dr.full(mi.Float, 1, dr.width(p.x))), inside, walk, label="shadow ray")
+        # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
+        _, least = dr.while_loop((mi.Float(step), mi.Float(tan_half)), inside, walk, label="shadow ray")
         return dr.clip(0.5 + 0.5 * least / tan_half, 0, 1)
 
     def _rest(self, x: Any, y: Any) -> Any:
