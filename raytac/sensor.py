@@ -31,8 +31,8 @@ INTEGRATORS = ("fast", "reference", "path")
 """Names that ``integrator=`` accepts."""
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""
-DEFAULT_PITCH = 0.1e-3
-"""Spacing of the pad's grid [m]."""
+COARSEST_PITCH = 0.1e-3
+"""Spacing of the pad's grid where the image does not ask for a finer one [m]."""
 
 
 class TactileSensor:
@@ -67,7 +67,7 @@ class TactileSensor:
         device: str = "auto",
         seed: int = 0,
         num_envs: int = 1,
-        pitch: float = DEFAULT_PITCH,
+        pitch: float | None = None,
         optics_options: dict[str, Any] | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
@@ -84,7 +84,7 @@ class TactileSensor:
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of every random number.
             num_envs: number of environments B that a press simulates.
-            pitch: spacing of the pad's grid [m].
+            pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
             optics_options: further keyword arguments of the optical mode.
 
         Raises:
@@ -109,12 +109,17 @@ class TactileSensor:
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
         self.resolution = (resolution[0], resolution[1]) if resolution is not None else self.spec.camera.resolution
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
-        self.grid = make_grid(self.spec.gelpad, pitch)
-        self._pitch = pitch
+        self._pitch = self._pixel_pitch() if pitch is None else pitch
+        self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._optics_options = dict(optics_options or {})
         self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
         self._optics_name = f"{optics}-{integrator}" if isinstance(optics, str) else optics.label
         self._pad: RigidPad | None = None
+
+    def _pixel_pitch(self) -> float:
+        camera = self.spec.camera
+        pixels = (p * n / m for p, n, m in zip(camera.pixel_pitch, camera.resolution, self.resolution, strict=True))
+        return min(COARSEST_PITCH, *pixels)
 
     @property
     def label(self) -> str:
