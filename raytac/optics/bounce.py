@@ -25,8 +25,8 @@ import numpy as np
 from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.fast import PixelSample
 from raytac.optics.lamp import Lamp
-from raytac.optics.reference import trace
-from raytac.optics.scene import SensorScene
+from raytac.optics.reference import OFFSET, connect, trace
+from raytac.optics.scene import UNIT, SensorScene
 
 __all__ = ["BounceField", "CaseLight"]
 
@@ -57,8 +57,8 @@ class CaseLight:
     def fit(cls, scene: SensorScene, lamps: list[Lamp], groups: list[int], seed: int = 0, samples: int = SAMPLES) -> CaseLight:
         """Path-trace from random points of the coat at rest into its hemisphere and fit by least squares.
 
-        Directions are cosine-distributed about random normals, so a path's π L estimates E; paths that meet the coat itself count as
-        dark here, because ``BounceField`` brings that light.
+        Directions are cosine-distributed about random normals, so a path's π L estimates E; directions into the pad's plane count as
+        dark here, because ``BounceField`` brings the coat's own light.
         """
         mi, grid = scene.mi, scene.grid
         sampler = mi.load_dict({"type": "independent"})
@@ -69,16 +69,20 @@ class CaseLight:
         disk = mi.warp.square_to_uniform_disk(tilt) * TILT
         n = dr.normalize(mi.Vector3f(disk.x, disk.y, -1))
         d = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(square))
-        z = scene.height_at(u * half[0], v * half[1])
-        ray = mi.Ray3f(mi.Point3f(u * half[0], v * half[1], z - 2e-5), d)
-        open_side = d.z < 0
-        radiance = trace(mi, scene, sampler, ray, lamps, groups, -1)
+        x, y = UNIT * u * half[0], UNIT * v * half[1]
+        p = mi.Point3f(x, y, scene.height_at(x, y) - 20 * OFFSET)
+        incoming = trace(mi, scene, sampler, mi.Ray3f(p, d), lamps, groups, -1, seen=False)
+        irradiance = [dr.select(d.z < 0, r * dr.pi, 0) for r in incoming]
+        for lamp, group in zip(lamps, groups, strict=True):
+            w, arriving = connect(mi, scene, sampler, p, n, lamp, True)
+            for c in range(3):
+                irradiance[3 * group + c] += arriving[c] * dr.dot(w, n)
         basis = [m * c for m in _monomials(u, v) for c in (mi.Float(1), n.x, n.y, n.z)]
         design = np.stack([np.array(b + dr.zeros(mi.Float, samples)) for b in basis], axis=1).astype(np.float64)
-        target = np.stack([np.array(dr.select(open_side, r, 0)) for r in radiance], axis=1) * np.pi
+        target = np.stack([np.array(e) for e in irradiance], axis=1)
         solution, *_ = np.linalg.lstsq(design, target, rcond=None)
         terms = len(basis) // 4
-        return cls(solution.T.reshape(len(radiance), terms, 4).astype(np.float32), half)
+        return cls(solution.T.reshape(len(irradiance), terms, 4).astype(np.float32), half)
 
     def on(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(e, v_x, v_y, v_z) of E(n) = e + n · v at the places x, y [m], shape (channels, N, 4), float32."""

@@ -40,7 +40,7 @@ class Pinhole:
             resolution=(width, height),
         )
 
-    def slope(self, u, v):  # noqa: ANN001, ANN201 - NumPy or Dr.Jit arrays alike
+    def slope(self, u, v):
         """(dx/dz, dy/dz) of the ray through pixel (u, v)."""
         return (u - self.principal[0]) / self.focal[0], (v - self.principal[1]) / self.focal[1]
 

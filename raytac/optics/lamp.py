@@ -36,15 +36,16 @@ class Lamp:
     power: Any
 
     @classmethod
-    def from_spec(cls, mi: Any, led: LedSpec) -> Lamp:
+    def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
+        """The LED in a world of ``unit`` length units per metre; its power grows with unit², so that I / r² stays."""
         u, v = led_edges(led)
         lamp = cls(
-            centre=mi.Point3f(*led.position),
+            centre=mi.Point3f([unit * c for c in led.position]),
             axis=mi.Vector3f(*led.axis),
-            half_u=mi.Vector3f((0.5 * led.size[0] * u).tolist()),
-            half_v=mi.Vector3f((0.5 * led.size[1] * v).tolist()),
+            half_u=mi.Vector3f((0.5 * unit * led.size[0] * u).tolist()),
+            half_v=mi.Vector3f((0.5 * unit * led.size[1] * v).tolist()),
             lobe=mi.Float(led.lobe),
-            power=mi.Color3f(*led.power),
+            power=mi.Color3f([unit**2 * p for p in led.power]),
         )
         # Opaque values keep one kernel for every LED file and let a fit change them without recompiling.
         dr.make_opaque(lamp.centre, lamp.axis, lamp.half_u, lamp.half_v, lamp.lobe, lamp.power)
@@ -88,14 +89,16 @@ class LampTable:
         )
         return cls(table, mi.UInt32(np.asarray(groups, dtype=np.uint32)))
 
-    def pick(self, mi: Any, index: Any, active: Any = True) -> tuple[Lamp, Any]:
-        t = self.lamps
+    def pick(self, mi: Any, u: Any) -> tuple[Lamp, Any]:
+        """One LED chosen uniformly by ``u`` in [0, 1), and its group."""
+        t, count = self.lamps, dr.width(self.group)
+        index = dr.minimum(mi.UInt32(u * count), count - 1)
         lamp = Lamp(
-            centre=dr.gather(mi.Point3f, t.centre, index, active),
-            axis=dr.gather(mi.Vector3f, t.axis, index, active),
-            half_u=dr.gather(mi.Vector3f, t.half_u, index, active),
-            half_v=dr.gather(mi.Vector3f, t.half_v, index, active),
-            lobe=dr.gather(mi.Float, t.lobe, index, active),
-            power=dr.gather(mi.Color3f, t.power, index, active),
+            centre=dr.gather(mi.Point3f, t.centre, index),
+            axis=dr.gather(mi.Vector3f, t.axis, index),
+            half_u=dr.gather(mi.Vector3f, t.half_u, index),
+            half_v=dr.gather(mi.Vector3f, t.half_v, index),
+            lobe=dr.gather(mi.Float, t.lobe, index),
+            power=dr.gather(mi.Color3f, t.power, index),
         )
-        return lamp, dr.gather(mi.UInt32, self.group, index, active)
+        return lamp, dr.gather(mi.UInt32, self.group, index)

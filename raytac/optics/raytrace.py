@@ -14,11 +14,12 @@ from raytac.optics.base import OpticsImages
 from raytac.optics.bounce import BounceField, CaseLight
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField, CoatLayout
+from raytac.optics.denoise import make_denoiser
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.lamp import Lamp
 from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.response import Response
-from raytac.optics.scene import SensorScene
+from raytac.optics.scene import UNIT, SensorScene
 from raytac.optics.variant import load_mitsuba
 from raytac.specs.sensor import SensorSpec
 
@@ -100,19 +101,23 @@ class RayTracer:
         self.rays = round(np.sqrt(spp or 1))
         if integrator == "fast" and self.rays**2 != (spp or 1):
             raise InputError("spp", value=spp, rule="the fast integrator takes a square number of rays a pixel", choices=(1, 4, 9, 16))
+        if integrator == "fast" and denoise:
+            raise InputError("denoise", value=denoise, rule="the fast integrator has no noise", choices=(False,))
         if led_points < 1:
             raise InputError("led_points", value=led_points, rule="must be at least 1")
         self.mi, self.device = load_mitsuba(device)
         self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
-        self.label = f"raytrace-{integrator}"
+        self.label = f"raytrace-{integrator}" + ("-denoised" if denoise else "")
         self.camera = Pinhole.from_spec(sensor.camera, resolution)
         self.spp = spp or 256
         self.bounce, self.led_points, self.shadows = bounce, led_points, shadows
-        self.max_depth, self.denoise, self.progress = max_depth, denoise, progress
+        self.max_depth, self.progress = max_depth, progress
+        self._denoiser = make_denoiser(self.mi, self.device, self.camera.resolution) if denoise else None
         leds = sensor.lights.leds
         self.layer_names = sensor.lights.layers if layers == "colour" else tuple(led.name for led in leds)
         self.groups = [self.layer_names.index(led.layer if layers == "colour" else led.name) for led in leds]
         self.lamps = [Lamp.from_spec(self.mi, led) for led in leds]
+        self._scene_lamps = [Lamp.from_spec(self.mi, led, UNIT) for led in leds]
         self.response = Response(sensor.response, self.camera)
         self._flat_field = None if flat_field is None else self._check_flat_field(flat_field)
         self._grid: PadGrid | None = None
@@ -140,7 +145,7 @@ class RayTracer:
         self.scene = SensorScene(mi, self.sensor, grid) if needs_scene else None
         self._bounce = None
         if self.integrator == "fast" and self.bounce and self.scene is not None:
-            case = CaseLight.fit(self.scene, self.lamps, self.groups, self.seed)
+            case = CaseLight.fit(self.scene, self._scene_lamps, self.groups, self.seed)
             self._bounce = BounceField.build(mi, self.layout, case)
         if self.integrator != "fast" and self.scene is not None:
             kind = ReferenceIntegrator if self.integrator == "reference" else StockPathIntegrator
@@ -151,7 +156,8 @@ class RayTracer:
             rest = GelSurface(grid, grid.rest[None].astype(np.float32), still, np.full((1, 2), np.nan))
             self.response.set_flat_field(self._flat_field, total(self.render_layers(rest))[0])
         self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
-        self._frozen = dr.freeze(self._fast_frame)
+        # One recording a batch size: a recording replays at other sizes only by scaling its launches, which is not what a new B means.
+        self._frozen: dict[int, Any] = {}
 
     def _check_view(self, grid: PadGrid) -> None:
         corners = self.camera.slope(np.array([0.0, self.camera.resolution[0]]), np.array([0.0, self.camera.resolution[1]]))
@@ -191,10 +197,10 @@ class RayTracer:
         images = []
         for b in range(surface.batch):
             self.scene.set_surface(surface.height[b])
-            images.append(self._sampled.render(self.lamps, self.groups, self.spp, self.seed + b))
+            images.append(self._sampled.render(self._scene_lamps, self.groups, self.spp, self.seed + b))
         stack = np.stack(images, axis=1)
-        if self.denoise:
-            stack = np.stack([[denoise_oidn(image) for image in layer] for layer in stack])
+        if self._denoiser is not None:
+            stack = np.stack([[self._denoiser(image) for image in layer] for layer in stack])
         return dict(zip(self.layer_names, stack, strict=True))
 
     def render_device(self, heights: Any) -> dict[str, Any]:
@@ -202,7 +208,10 @@ class RayTracer:
 
         Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
-        rgb, layers = self._frozen(heights, self._inputs)
+        width = dr.width(heights)
+        if width not in self._frozen:
+            self._frozen[width] = dr.freeze(self._fast_frame)
+        rgb, layers = self._frozen[width](heights, self._inputs)
         return {"rgb": rgb, "layers": layers}
 
     def _fast_frame(self, heights: Any, inputs: FastInputs) -> tuple[Any, list[Any]]:

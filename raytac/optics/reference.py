@@ -1,10 +1,13 @@
 """The ``reference`` integrator: unbiased path tracing over the sensor's Mitsuba scene, one radiance layer per LED colour.
 
-At the first vertex of a path each LED is sampled once, uniformly over its rectangle (next-event estimation, area form of the rendering
-equation, Kajiya 1986; Shirley, Wang and Zimmerman 1996), at later ones one LED; the path goes on by sampling the coat's or the wall's
-reflectance and ends by Russian roulette on its throughput. LEDs are found by these shadow rays alone, so a path that runs into one ends there unlit: with
-the light never counted twice, no multiple importance sampling is needed. Sampling every LED at the first vertex takes the colour noise
-out that Mitsuba's own ``path`` has from choosing one LED at random; both converge to one image (a test checks it).
+Paths start at the camera. At the coat point that it sees each LED is sampled once, uniformly over its rectangle (next-event estimation,
+area form of the rendering equation, Kajiya 1986; Shirley, Wang and Zimmerman 1996). Light that comes over the case is found from the
+LED instead: one ray leaves it by its lobe, and the point of the case that it meets is joined to the path (a light subpath of one edge, as
+in bidirectional path tracing, Lafortune and Willems 1993). The two never count one light path twice: a vertex on the coat is lit
+straight, a vertex on the case only by joining. The path goes on by sampling the reflectance of coat or case and ends by Russian roulette.
+
+Against Mitsuba's own ``path``, which picks one LED at random and meets bright spots on near walls by chance, this takes most of the
+noise away; both converge to one image (a test checks it).
 """
 
 from __future__ import annotations
@@ -18,10 +21,12 @@ from tqdm import tqdm
 
 from raytac.optics.camera import Pinhole
 from raytac.optics.lamp import Lamp, LampTable
-from raytac.optics.scene import SensorScene
+from raytac.optics.scene import UNIT, SensorScene
 
-__all__ = ["ReferenceIntegrator", "StockPathIntegrator", "trace"]
+__all__ = ["ReferenceIntegrator", "StockPathIntegrator", "connect", "trace"]
 
+OFFSET = 1e-3
+"""Start of a ray off a surface [scene units]."""
 LAUNCH = 1 << 22
 """Most paths in one kernel launch; keeps memory flat and the progress bar alive."""
 
@@ -87,7 +92,7 @@ def accumulate(
             pixel = dr.arange(mi.UInt32, n) // count
             jitter = sampler.next_2d()
             tx, ty = camera.slope(mi.Float(pixel % width) + jitter.x, mi.Float(pixel // width) + jitter.y)
-            ray = mi.Ray3f(mi.Point3f(*camera.position), dr.normalize(mi.Vector3f(tx, ty, 1)))
+            ray = mi.Ray3f(mi.Point3f([UNIT * c for c in camera.position]), dr.normalize(mi.Vector3f(tx, ty, 1)))
             sums = [dr.block_sum(c, count) for c in radiance(sampler, ray)]
             dr.eval(sums)
             launch = np.stack([np.array(c) for c in sums]).astype(np.float64)
@@ -100,29 +105,31 @@ def accumulate(
 
 
 def trace(
-    mi: Any, scene: SensorScene, sampler: Any, ray: Any, lamps: list[Lamp], groups: list[int], max_depth: int, direct: bool = True
+    mi: Any, scene: SensorScene, sampler: Any, ray: Any, lamps: list[Lamp], groups: list[int], max_depth: int, seen: bool = True
 ) -> list[Any]:
-    """Radiance along ``ray`` [B·3 layers]: a list of 3 · G Floats, R, G, B of each group in turn.
+    """Radiance along ``ray``: a list of 3 · G Floats, R, G, B of each group in turn.
 
-    The first vertex is lit by every LED; later ones by one LED chosen uniformly, since they carry a few per cent of the light.
-    ``direct=False`` leaves the first vertex's own light out.
+    ``seen=False`` treats the first vertex like a later one, for light that arrives at the ray's origin from the case or the coat: the
+    case's own direct light is then left to ``connect`` at the origin.
     """
     n = dr.width(ray.o)
     layers = max(groups) + 1
     table = LampTable.of(mi, lamps, groups)
 
-    def lit_by(si: Any, lamp: Lamp, sampler: Any, beta: Any, active: Any) -> Any:
-        """beta · f · I cos θ / r² for one point of ``lamp``, 0 in its shadow."""
-        light = lamp.sample(sampler.next_2d(active))
-        d = light - si.p
-        r2 = dr.squared_norm(d)
-        w = d * dr.rsqrt(r2)
-        wo = si.to_local(w)
-        facing = active & (dr.dot(w, lamp.axis) < 0) & (dr.dot(w, si.n) > 0) & (wo.z > 0)
-        facing &= ~scene.scene.ray_test(si.spawn_ray_to(light), facing)
-        return beta * scene.reflect(si, wo) * lamp.power * dr.select(facing, lamp.lobe_gain(-w) / r2, 0)
+    def add(radiance: list[Any], gain: Any, group: Any) -> list[Any]:
+        return [r + dr.select(group == k // 3, gain[k % 3], 0) for k, r in enumerate(radiance)]
 
-    def scatter(si: Any, sampler: Any, beta: Any, active: Any) -> tuple[Any, Any, Any]:
+    def vertex(sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any) -> list[Any]:
+        """Light at a vertex from one random LED: straight if it lies on the coat, and over one point of the case."""
+        lamp, group = table.pick(mi, sampler.next_1d(active))
+        weight = beta * len(lamps)
+        straight = lit_by(mi, scene, sampler, si, lamp, weight, active & scene.on_coat(si))
+        radiance = add(radiance, straight, group)
+        lamp, group = table.pick(mi, sampler.next_1d(active))
+        w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active & deeper)
+        return add(radiance, weight * scene.reflect(si, si.to_local(w)) * arriving, group)
+
+    def scatter(sampler: Any, si: Any, beta: Any, active: Any) -> tuple[Any, Any, Any]:
         wo, weight = scene.sample_reflection(si, sampler.next_1d(active), sampler.next_2d(active))
         beta = beta * weight
         d = si.to_world(wo)
@@ -130,19 +137,21 @@ def trace(
         active = active & (dr.dot(d, si.n) > 0) & (wo.z > 0) & (sampler.next_1d(active) < survive)
         return si.spawn_ray(d), beta / dr.select(active, survive, 1), active
 
-    si = scene.scene.ray_intersect(ray)
-    active = si.is_valid()
-    beta = mi.Color3f(1)
-    radiance = [mi.Float(0) for _ in range(3 * layers)]
-    if direct:
+    radiance = [dr.zeros(mi.Float, n) for _ in range(3 * layers)]
+    beta, active, depth = dr.full(mi.Color3f, 1, n), dr.full(mi.Bool, True, n), 0
+    if seen:
+        # The camera's vertex is on the coat and carries most of the light: every LED lights it.
+        si = scene.scene.ray_intersect(ray)
+        active = si.is_valid()
         for lamp, group in zip(lamps, groups, strict=True):
-            gain = lit_by(si, lamp, sampler, beta, active)
-            for c in range(3):
-                radiance[3 * group + c] += gain[c]
-    radiance = [r + dr.zeros(mi.Float, n) for r in radiance]
-    if max_depth == 1:
-        return radiance
-    ray, beta, active = scatter(si, sampler, beta, active)
+            radiance = add(radiance, lit_by(mi, scene, sampler, si, lamp, beta, active), mi.UInt32(group))
+        if max_depth == 1:
+            return radiance
+        lamp, group = table.pick(mi, sampler.next_1d(active))
+        w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active)
+        radiance = add(radiance, scene.reflect(si, si.to_local(w)) * arriving * len(lamps), group)
+        ray, beta, active = scatter(sampler, si, beta, active)
+        depth = 1
 
     def alive(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> Any:
         return active
@@ -150,16 +159,49 @@ def trace(
     def bounce(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> tuple[Any, ...]:
         si = scene.scene.ray_intersect(ray, active)
         active = active & si.is_valid()
-        index = dr.minimum(mi.UInt32(sampler.next_1d(active) * len(lamps)), len(lamps) - 1)
-        lamp, group = table.pick(mi, index, active)
-        gain = lit_by(si, lamp, sampler, beta, active) * len(lamps)
-        radiance = [r + dr.select(group == k // 3, gain[k % 3], 0) for k, r in enumerate(radiance)]
         depth = depth + 1
-        if max_depth > 0:
-            active &= depth < max_depth
-        ray, beta, active = scatter(si, sampler, beta, active)
+        deeper = mi.Bool(True) if max_depth < 0 else depth < max_depth
+        radiance = vertex(sampler, si, beta, radiance, deeper, active)
+        ray, beta, active = scatter(sampler, si, beta, active & deeper)
         return sampler, ray, beta, radiance, depth, active
 
     # The sampler is part of the state: its random numbers must differ from turn to turn.
-    state = (sampler, ray, beta + dr.zeros(mi.Color3f, n), radiance, mi.UInt32(1) + dr.zeros(mi.UInt32, n), active)
+    state = (sampler, ray, beta, radiance, dr.full(mi.UInt32, depth, n), active)
     return dr.while_loop(state, alive, bounce, label="path")[3]
+
+
+def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta: Any, active: Any) -> Any:
+    """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for one random point of ``lamp``, 0 in its shadow; f includes the cosine."""
+    light = lamp.sample(sampler.next_2d(active))
+    d = light - si.p
+    r2 = dr.squared_norm(d)
+    w = d * dr.rsqrt(r2)
+    wo = si.to_local(w)
+    facing = active & (dr.dot(w, lamp.axis) < 0) & (dr.dot(w, si.n) > 0) & (wo.z > 0)
+    facing &= ~scene.scene.ray_test(si.spawn_ray_to(light), facing)
+    return beta * scene.reflect(si, wo) * lamp.power * dr.select(facing, lamp.lobe_gain(-w) / r2, 0)
+
+
+def connect(mi: Any, scene: SensorScene, sampler: Any, p: Any, n: Any, lamp: Lamp, active: Any) -> tuple[Any, Any]:
+    """Light of ``lamp`` that reaches ``p`` over one random point y of the case: its direction and its strength (RGB).
+
+    A ray leaves the LED by its own lobe (pdf (n + 1) / 2π cosⁿ θ, so it carries the flux Φ = 2π I / (n + 1)) and meets the case at y,
+    which is joined to p: the strength is Φ · ρ / π · cos θ_y · V / r², to be multiplied by the receiver's cosine and reflectance. Bright
+    spots that LEDs cast on a near wall are found from the LED, where a path from the camera would hit them by chance.
+    """
+    start = lamp.sample(sampler.next_2d(active))
+    square = sampler.next_2d(active)
+    cos_theta = dr.power(dr.maximum(square.x, 1e-9), 1 / (lamp.lobe + 1))
+    sin_theta = dr.safe_sqrt(1 - cos_theta * cos_theta)
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * square.y)
+    out = mi.Frame3f(lamp.axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
+    y = scene.scene.ray_intersect(mi.Ray3f(start + OFFSET * lamp.axis, out), active)
+    albedo = scene.case_albedo(y)
+    d = p - y.p
+    r2 = dr.maximum(dr.squared_norm(d), 1e-12)
+    w = -d * dr.rsqrt(r2)
+    cos_y = -dr.dot(w, y.n)
+    joined = active & y.is_valid() & (albedo > 0) & (y.wi.z > 0) & (cos_y > 0) & (dr.dot(w, n) > 0)
+    joined &= ~scene.scene.ray_test(y.spawn_ray_to(p + OFFSET * n), joined)
+    flux = lamp.power * (2 * dr.pi / (lamp.lobe + 1))
+    return w, flux * dr.select(joined, albedo / dr.pi * cos_y / r2, 0)

@@ -16,7 +16,11 @@ from raytac.optics import led as led_plugin
 from raytac.optics.lamp import led_edges
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
 
-__all__ = ["SensorScene", "coat_bsdf", "grid_faces"]
+UNIT = 1e3
+"""Scene units per metre. Mitsuba starts secondary rays 9e-5 scene units off a surface (``offset_p``): in metres that is 0.09 mm, more
+than a pixel on the pad, so the scene is built in millimetres."""
+
+__all__ = ["UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
 
 
 def coat_bsdf(coat: CoatSpec) -> dict[str, Any]:
@@ -49,7 +53,7 @@ class SensorScene:
         self.mi, self.dr, self.sensor, self.grid = mi, drjit, sensor, grid
         ny, nx = grid.shape
         x, y = np.meshgrid(grid.x, grid.y)
-        self._xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+        self._xy = (UNIT * np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
         scene: dict[str, Any] = {"type": "scene", "coat": self._coat_mesh(grid_faces(nx, ny))}
         scene.update(self._case())
         for index, spec in enumerate(sensor.lights.leds):
@@ -70,8 +74,8 @@ class SensorScene:
         props["bsdf"] = mi.load_dict(coat_bsdf(self.sensor.coat))
         mesh = mi.Mesh("coat", len(self._xy), len(faces), has_vertex_normals=True, props=props)
         params = mi.traverse(mesh)
-        vertices = np.concatenate([self._xy, self.grid.rest.reshape(-1, 1)], axis=1)
-        params["vertex_positions"] = mi.Float(vertices.ravel().astype(np.float32))
+        vertices = self._vertices(self.grid.rest)
+        params["vertex_positions"] = mi.Float(vertices)
         params["faces"] = mi.UInt32(faces.ravel())
         params.update()
         return mesh
@@ -80,7 +84,7 @@ class SensorScene:
         """Four walls from the gel plane down to the floor, and the floor; inner sides diffuse."""
         T = self.mi.ScalarTransform4f
         case = self.sensor.case
-        hx, hy, depth = case.size[0] / 2, case.size[1] / 2, -case.floor_z
+        hx, hy, depth = UNIT * case.size[0] / 2, UNIT * case.size[1] / 2, -UNIT * case.floor_z
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [case.reflectance] * 3}}
 
         def plate(origin: Sequence[float], normal: Sequence[float], half: Sequence[float], up: Sequence[float]) -> dict[str, Any]:
@@ -101,8 +105,8 @@ class SensorScene:
         T = self.mi.ScalarTransform4f
         u, v = led_edges(led)
         to_world = np.eye(4)
-        to_world[:3, 0], to_world[:3, 1] = 0.5 * led.size[0] * u, 0.5 * led.size[1] * v
-        to_world[:3, 2], to_world[:3, 3] = led.axis, led.position
+        to_world[:3, 0], to_world[:3, 1] = 0.5 * UNIT * led.size[0] * u, 0.5 * UNIT * led.size[1] * v
+        to_world[:3, 2], to_world[:3, 3] = led.axis, UNIT * np.asarray(led.position)
         area = led.size[0] * led.size[1]
         return {
             "type": "rectangle",
@@ -111,16 +115,19 @@ class SensorScene:
             "emitter": {"type": led_plugin.PLUGIN, "radiance": [p / area for p in led.power], "lobe": led.lobe},
         }
 
+    def _vertices(self, height: np.ndarray) -> np.ndarray:
+        z = UNIT * np.asarray(height, dtype=np.float32).reshape(-1, 1)
+        return np.concatenate([self._xy, z], axis=1).ravel().astype(np.float32)
+
     def set_surface(self, height: np.ndarray) -> None:
         """Move the coat's nodes to ``height`` (Ny, Nx) [m]; Mitsuba rebuilds its normals and acceleration structure."""
-        vertices = np.concatenate([self._xy, np.asarray(height, dtype=np.float32).reshape(-1, 1)], axis=1)
-        self.params["coat.vertex_positions"] = self.mi.Float(vertices.ravel())
+        self.params["coat.vertex_positions"] = self.mi.Float(self._vertices(height))
         self.params.update()
 
     def height_at(self, x: Any, y: Any) -> Any:
-        """Height [m] of the coat mesh as it stands under device points x, y [m]: a ray straight down from the camera's side."""
+        """z of the coat mesh as it stands at device points x, y, in scene units: a ray from the camera's side along +z."""
         mi = self.mi
-        below = -self.sensor.gelpad.thickness
+        below = -UNIT * self.sensor.gelpad.thickness
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(x, y, below), mi.Vector3f(0, 0, 1)))
         return self.dr.select(hit.is_valid(), below + hit.t, 0)
 
@@ -139,7 +146,7 @@ class SensorScene:
         """
         mi, dr = self.mi, self.dr
         coat = self._coat_bsdf.eval(self._context, si, wo)
-        wall = mi.Color3f(self._wall_albedo(si) / dr.pi * dr.maximum(wo.z, 0))
+        wall = mi.Color3f(self.case_albedo(si) / dr.pi * dr.maximum(wo.z, 0))
         return dr.select(si.shape == self._coat, coat, dr.select(si.wi.z > 0, wall, 0))
 
     def sample_reflection(self, si: Any, choice: Any, square: Any) -> tuple[Any, Any]:
@@ -147,12 +154,16 @@ class SensorScene:
         mi, dr = self.mi, self.dr
         sample, weight = self._coat_bsdf.sample(self._context, si, choice, square)
         cosine = mi.warp.square_to_cosine_hemisphere(square)
-        wall = mi.Color3f(dr.select(si.wi.z > 0, self._wall_albedo(si), 0))
+        wall = mi.Color3f(dr.select(si.wi.z > 0, self.case_albedo(si), 0))
         on_coat = si.shape == self._coat
         return dr.select(on_coat, sample.wo, cosine), dr.select(on_coat, weight, wall)
 
-    def _wall_albedo(self, si: Any) -> Any:
+    def on_coat(self, si: Any) -> Any:
+        return si.shape == self._coat
+
+    def case_albedo(self, si: Any) -> Any:
+        """Albedo of wall or floor at ``si``; 0 on the coat and on LEDs."""
         albedo = self.mi.Float(self.sensor.case.reflectance)
-        for led in self._leds:
-            albedo = self.dr.select(si.shape == led, 0, albedo)
+        for other in (self._coat, *self._leds):
+            albedo = self.dr.select(si.shape == other, 0, albedo)
         return albedo
