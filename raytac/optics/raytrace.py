@@ -41,7 +41,7 @@ class FastInputs:
 
 def total(layers: dict[str, np.ndarray]) -> np.ndarray:
     """The linear image: the sum of its layers."""
-    return np.sum(list(layers.values()), axis=0, dtype=np.float32)
+    return np.asarray(np.sum(np.stack(list(layers.values())), axis=0, dtype=np.float32))
 
 
 class RayTracer:
@@ -156,8 +156,8 @@ class RayTracer:
             rest = GelSurface(grid, grid.rest[None].astype(np.float32), still, np.full((1, 2), np.nan))
             self.response.set_flat_field(self._flat_field, total(self.render_layers(rest))[0])
         self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
-        # One recording a batch size: a recording replays at other sizes only by scaling its launches, which is not what a new B means.
-        self._frozen: dict[int, Any] = {}
+        # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
+        self._frozen: dict[tuple[str, int], Any] = {}
 
     def _check_view(self, grid: PadGrid) -> None:
         corners = self.camera.slope(np.array([0.0, self.camera.resolution[0]]), np.array([0.0, self.camera.resolution[1]]))
@@ -175,7 +175,7 @@ class RayTracer:
         width, height = self.camera.resolution
         shape = (surface.batch, height, width)
         if self.integrator == "fast":
-            device = self.render_device(self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel()))
+            device = self.render_device(self._upload(surface))
             linear, u8 = device["layers"], device["rgb"]
             layers = self._to_numpy_layers(linear, shape) if "layers" in self.outputs else None
             rgb = np.array(u8).reshape(*shape, 3) if "rgb" in self.outputs else None
@@ -192,8 +192,7 @@ class RayTracer:
         width, height = self.camera.resolution
         shape = (surface.batch, height, width)
         if self.integrator == "fast":
-            heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
-            return self._to_numpy_layers(self._linear(heights, FastInputs(self._rest, self.lamps, self._bounce, [])), shape)
+            return self._to_numpy_layers(self._linear(self._upload(surface), FastInputs(self._rest, self.lamps, self._bounce, [])), shape)
         images = []
         for b in range(surface.batch):
             self.scene.set_surface(surface.height[b])
@@ -208,11 +207,15 @@ class RayTracer:
 
         Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
-        width = dr.width(heights)
-        if width not in self._frozen:
-            self._frozen[width] = dr.freeze(self._fast_frame)
-        rgb, layers = self._frozen[width](heights, self._inputs)
+        rgb, layers = self._recorded(self._fast_frame, heights)
         return {"rgb": rgb, "layers": layers}
+
+    def _recorded(self, function: Any, heights: Any) -> Any:
+        """Call ``function(heights, inputs)``, recorded once for each number of environments and replayed afterwards."""
+        key = function.__name__, dr.width(heights)
+        if key not in self._frozen:
+            self._frozen[key] = dr.freeze(function)
+        return self._frozen[key](heights, self._inputs)
 
     def _fast_frame(self, heights: Any, inputs: FastInputs) -> tuple[Any, list[Any]]:
         channels = self._linear(heights, inputs)
@@ -266,19 +269,26 @@ class RayTracer:
         stack = np.stack([np.array(c) for c in channels], axis=-1).reshape(*shape, len(self.layer_names), 3)
         return {name: np.ascontiguousarray(stack[..., g, :]) for g, name in enumerate(self.layer_names)}
 
+    def _seen(self, heights: Any, inputs: FastInputs) -> tuple[Any, Any]:
+        """Point and normal of the coat through every pixel's centre."""
+        field = CoatField(self.mi, self.layout, inputs.rest, heights)
+        seen = see(self.mi, field, self.camera, dr.width(heights) // (self.layout.nx * self.layout.ny))
+        return seen.p, seen.n
+
+    def _upload(self, surface: GelSurface) -> Any:
+        return self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+
     def _geometry(self, surface: GelSurface, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
         """Normals, positions, camera depth and contact seen through the pixel centres; only what the outputs name."""
-        mi = self.mi
-        field = CoatField(mi, self.layout, self._rest, mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel()))
-        seen = see(mi, field, self.camera, surface.batch)
-        p = np.stack([np.array(c) for c in seen.p], axis=-1).reshape(*shape, 3)
+        seen_p, seen_n = self._recorded(self._seen, self._upload(surface))
+        p = np.array(seen_p).T.reshape(*shape, 3)
         grid = surface.grid
         ix = np.clip(np.rint((p[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)
         iy = np.clip(np.rint((p[..., 1] - grid.y[0]) / grid.pitch[1]).astype(int), 0, len(grid.y) - 1)
         aov = {"contact": surface.contact[np.arange(shape[0])[:, None, None], iy, ix]}
         if "normals" in self.outputs:
-            aov["normals"] = np.stack([np.array(c) for c in seen.n], axis=-1).reshape(*shape, 3)
-            aov["position"] = p
+            aov["normals"] = np.ascontiguousarray(np.array(seen_n).T.reshape(*shape, 3))
+            aov["position"] = np.ascontiguousarray(p)
         if "depth" in self.outputs:
             aov["depth"] = (p[..., 2] - self.camera.position[2]).astype(np.float32)
         return aov
