@@ -1,8 +1,8 @@
 """The coat surface on the device: packed nodes, bilinear look-up, camera hits and shadow rays on a height field.
 
-The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is a
-height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after a
-few cells. Rebuilding a bounding volume hierarchy each frame costs more than all of its rays (docs/optics.md has the measurement).
+The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
+a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
+a few cells. Rebuilding a bounding volume hierarchy each frame costs more than all of its rays (docs/optics.md has the measurement).
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class CoatField:
         nodes = pack_nodes(mi, layout, height)
         self.nodes = dr.ravel(nodes)
         dr.eval(self.nodes)
-        self.lowest, self.highest, self.deepest = bounds_map(mi, layout, rest, height)
+        self.lowest, self.highest, self.deepest, self.deepest_far = bounds_map(mi, layout, rest, height)
         self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
-        dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
+        dr.eval(self.lowest, self.highest, self.deepest, self.deepest_far, self.pad_deepest)
 
     def _cell(self, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         mi, g = self.mi, self.layout
@@ -142,11 +142,12 @@ class CoatField:
     def visibility(self, env: Any, p: Any, light: Any, tan_half: Any, active: Any) -> Any:
         """Share of an emitter at ``light`` that point ``p`` of the surface sees past the surface itself, in [0, 1].
 
-        Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen from
-        ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for a
-        rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: the rest surface of a pad is convex
-        towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the light
-        and only indentation deeper than that, bounded by the tile, can block it.
+        Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
+        from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
+        a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: the rest surface of a pad is convex
+        towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the
+        light, and only indentation deeper than that can block it. Three bounds on the deepest are known: within one tile of p,
+        within three, and on the whole pad.
         """
         mi, g = self.mi, self.layout
         d = light - p
@@ -155,11 +156,15 @@ class CoatField:
         rest_p, rest_l = self._rest(p.x, p.y), self._rest(light.x, light.y)
         depth_p = dr.maximum(rest_p - p.z, 0)
         gain = (rest_l - light.z - depth_p) / reach - tan_half
-        local = dr.gather(mi.Float, self.deepest, self.tile(env, p.x, p.y), active)
-        end = dr.select(gain > 0, (local - depth_p) / gain, TILE * 3)
-        # Beyond the 3×3 tiles behind `local`, the deepest indentation of the whole pad is the bound.
+        tile = self.tile(env, p.x, p.y)
+        near, far = dr.gather(mi.Float, self.deepest, tile, active), dr.gather(mi.Float, self.deepest_far, tile, active)
         overall = dr.gather(mi.Float, self.pad_deepest, env, active)
-        end = dr.select(end > TILE, dr.select(gain > 0, (overall - depth_p) / gain, reach), end)
+        end = (near - depth_p) / gain
+        edge = min(g.tile_x * g.dx, g.tile_y * g.dy)
+        for bound, valid_to in ((far, edge), (overall, 3 * edge)):
+            reached = (bound - depth_p) / gain
+            end = dr.select(reached > valid_to, reached, end)
+        end = dr.select(gain > 0, end, reach)
         end = dr.minimum(end, reach)
         step = min(g.dx, g.dy)
 
@@ -193,8 +198,10 @@ def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
     return mi.Vector4f(height, zx * inv, zy * inv, -inv)
 
 
-def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any]:
-    """Per tile, over itself and its 8 neighbours: lowest z, highest z, deepest indentation; each (B·tiles_y·tiles_x) [m]."""
+def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any, Any]:
+    """Per tile, over itself and its 8 neighbours: lowest z, highest z, deepest indentation; then the deepest over three tiles each
+    way. Each (B·tiles_y·tiles_x) [m].
+    """
     envs = dr.width(height) // (g.nx * g.ny)
     rows = dr.arange(mi.UInt32, envs * g.ny * g.tiles_x)
     tx, row = rows % g.tiles_x, rows // g.tiles_x
@@ -224,4 +231,11 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
             lo3 = dr.minimum(lo3, dr.gather(mi.Float, lo2, i))
             hi3 = dr.maximum(hi3, dr.gather(mi.Float, hi2, i))
             deep3 = dr.maximum(deep3, dr.gather(mi.Float, deep2, i))
-    return lo3, hi3, deep3
+    dr.eval(deep3)
+    deep7 = deep3
+    for sx in (-2, 0, 2):
+        for sy in (-2, 0, 2):
+            nx = mi.UInt32(dr.clip(mi.Int32(tx) + sx, 0, g.tiles_x - 1))
+            ny = mi.UInt32(dr.clip(mi.Int32(ty) + sy, 0, g.tiles_y - 1))
+            deep7 = dr.maximum(deep7, dr.gather(mi.Float, deep3, (env * g.tiles_y + ny) * g.tiles_x + nx))
+    return lo3, hi3, deep3, deep7
