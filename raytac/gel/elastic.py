@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.gaussian import GaussianBlur
 from raytac.gel.surface import GelSurface, PadGrid
 
-__all__ = ["CONTACT_SCALE", "FINAL_SIGMA", "PYRAMID_SIGMAS", "ElasticSurround"]
+__all__ = ["CONTACT_RULES", "CONTACT_SCALE", "FINAL_SIGMA", "PYRAMID_SIGMAS", "ElasticSurround"]
 
 _TAXIM_PIXEL = 0.0295e-3
 PYRAMID_SIGMAS = tuple(s * _TAXIM_PIXEL for s in (30.5, 15.5, 8.0, 3.5, 2.0, 1.1))
 """Standard deviations of Taxim's pyramid [m]: OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""
 FINAL_SIGMA = 1.1 * _TAXIM_PIXEL
 """Standard deviation of the last smoothing [m]."""
+CONTACT_RULES = ("unilateral", "threshold")
 CONTACT_SCALE = 0.4
 """Share of the deepest overlap from which a node counts as in full contact."""
 _FINEST = 0.2
@@ -21,13 +23,20 @@ _FINEST = 0.2
 
 
 class ElasticSurround:
-    """From the overlap of object and resting gel to the deformed surface (Si & Yuan, RA-L 2022, section III).
+    """From the overlap of object and resting gel to the deformed surface (after Si & Yuan, RA-L 2022, section III).
 
-    With u = rest − underside of the object (its overlap with the gel at rest), u⁺ = max(u, 0) and the full contact
-    C = {u > 0.4 max u}: start from w = u⁺; for every width of the pyramid, wide to narrow, w ← Gaussian(w), then w = u⁺ on C;
-    last, one narrow Gaussian everywhere. The surface is rest − w. Taxim does this to absolute heights in pixels; here it is done
-    to the displacement w and with widths in metres, so that the dome is not smoothed, an untouched pad is exactly at rest, and
-    the result does not depend on the grid. Borders are mirrored. Arrays are float32.
+    With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every width
+    of the pyramid, wide to narrow, w ← Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface
+    is rest − w. How the contact is re-imposed is the ``contact_rule``:
+
+    - ``"unilateral"`` (default): w ← max(w, u⁺). The gel never reaches into the object and leaves it where the Gaussians hold it deeper;
+      the contact is where w = u. Everything stays continuous.
+    - ``"threshold"``: Taxim's own, w = u⁺ on the full contact C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief,
+      tears the surface along the border of C on steep walls (dots in the image) and lets the gel reach into the object outside C.
+
+    Taxim does this to absolute heights in pixels; here it is done to the displacement w and with widths in metres, so that the dome is
+    not smoothed, an untouched pad is exactly at rest, and the result does not depend on the grid. Borders are mirrored. Arrays are
+    float32.
     """
 
     def __init__(
@@ -36,10 +45,18 @@ class ElasticSurround:
         *,
         sigmas: tuple[float, ...] = PYRAMID_SIGMAS,
         final_sigma: float = FINAL_SIGMA,
+        contact_rule: str = "unilateral",
         contact_scale: float = CONTACT_SCALE,
     ) -> None:
-        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0 for none; ``contact_scale`` in [0, 1)."""
+        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0 for none; ``contact_scale`` in [0, 1) of the threshold rule.
+
+        Raises:
+            InputError: an unknown contact rule.
+        """
+        if contact_rule not in CONTACT_RULES:
+            raise InputError("contact_rule", value=contact_rule, rule="must be a known rule", choices=CONTACT_RULES)
         self.grid = grid
+        self.contact_rule = contact_rule
         self.contact_scale = contact_scale
         finest = _FINEST * min(grid.pitch)
         self._pyramid = [GaussianBlur(grid.shape, grid.pitch, s) for s in sigmas if s > finest]
@@ -65,18 +82,24 @@ class ElasticSurround:
             elif deepest <= 0.0:
                 height[b] = rest
             else:
-                contact[b] = overlap > self.contact_scale * deepest
-                np.subtract(rest, self._displacement(overlap, contact[b]), out=height[b])
+                displacement, contact[b] = self._displacement(overlap, deepest)
+                np.subtract(rest, displacement, out=height[b])
                 centre[b] = self._centroid(overlap, contact[b])
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
-    def _displacement(self, overlap: np.ndarray, contact: np.ndarray) -> np.ndarray:
+    def _displacement(self, overlap: np.ndarray, deepest: float) -> tuple[np.ndarray, np.ndarray]:
+        """w [m] and the contact, both (Ny, Nx)."""
         pressed = np.maximum(overlap, 0.0)
+        full = overlap > self.contact_scale * deepest
         moved = pressed
         for blur in self._pyramid:
             moved = blur(moved)
-            np.copyto(moved, pressed, where=contact)
-        return moved if self._final is None else self._final(moved)
+            if self.contact_rule == "unilateral":
+                np.maximum(moved, pressed, out=moved)
+            else:
+                np.copyto(moved, pressed, where=full)
+        contact = (overlap > 0.0) & (moved <= pressed) if self.contact_rule == "unilateral" else full
+        return (moved if self._final is None else self._final(moved)), contact
 
     def _centroid(self, overlap: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
         """Overlap-weighted centre (x, y) [m] of the contact."""

@@ -20,12 +20,18 @@ PAD = GelpadSpec((16e-3, 12e-3), 4e-3, (0.21, 0.135), 2e5, 0.48, 1000.0, 0.8)
 
 
 def press_sphere(
-    pitch: float, *, radius: float = 4e-3, depth: float = 0.6e-3, at: tuple[float, float] = (0.0, 0.0)
+    pitch: float,
+    *,
+    radius: float = 4e-3,
+    depth: float = 0.6e-3,
+    at: tuple[float, float] = (0.0, 0.0),
+    rule: str = "unilateral",
 ) -> GelSurface:
     grid = make_grid(PAD, pitch)
     pose = np.eye(4)[None].copy()
     pose[0, :3, 3] = *at, radius - depth
-    return ElasticSurround(grid).surface(object_height([primitive("sphere", (radius,))], pose, grid.x, grid.y), pose)
+    surround = ElasticSurround(grid, contact_rule=rule)
+    return surround.surface(object_height([primitive("sphere", (radius,))], pose, grid.x, grid.y), pose)
 
 
 def test_grid_covers_the_pad_and_follows_the_dome() -> None:
@@ -81,15 +87,37 @@ def test_no_contact_is_exactly_rest() -> None:
     assert np.array_equal(press_sphere(0.2e-3, depth=-1e-6).height[0], grid.rest.astype(np.float32))
 
 
-def test_contact_follows_the_object_and_the_surround_is_smooth() -> None:
+def test_gel_never_reaches_into_the_object() -> None:
     radius, depth = 4e-3, 0.6e-3
-    surface = press_sphere(0.1e-3, radius=radius, depth=depth)
+    grid = make_grid(PAD, 0.1e-3)
+    sphere = radius - depth - np.sqrt(np.maximum(radius**2 - grid.x[None, :] ** 2 - grid.y[:, None] ** 2, 0.0))
+    sphere = np.where(np.hypot(grid.x[None, :], grid.y[:, None]) < radius, sphere, np.inf)
+    surface = ElasticSurround(grid, final_sigma=0.0).surface(sphere[None])
+    gap = sphere - surface.height[0].astype(float)
+    contact = surface.contact[0]
+    assert gap.min() > -1e-9, f"the gel reaches {-gap.min():.2e} m into the sphere"
+    assert np.abs(gap[contact]).max() < 1e-9 and gap[~contact & np.isfinite(gap)].min() > 0
+    area = contact.sum() * grid.pitch[0] * grid.pitch[1]
+    overlap_area = math.pi * (radius**2 - (radius - depth) ** 2)
+    # Hertz's contact has half the area of the overlap with the resting surface; the Gaussians' is between the two.
+    assert 0.5 * overlap_area < area < overlap_area
+    assert np.abs(np.diff(surface.height[0].astype(float), axis=1)).max() < 0.1e-3  # no step anywhere: slope below 1
+
+
+def test_unknown_contact_rule_is_refused() -> None:
+    with pytest.raises(InputError, match="unilateral"):
+        ElasticSurround(make_grid(PAD, 0.5e-3), contact_rule="hard")
+
+
+def test_threshold_rule_follows_the_object_and_the_surround_is_smooth() -> None:
+    radius, depth = 4e-3, 0.6e-3
+    surface = press_sphere(0.1e-3, radius=radius, depth=depth, rule="threshold")
     grid, found = surface.grid, surface.height[0]
     sphere = radius - depth - np.sqrt(np.maximum(radius**2 - grid.x[None, :] ** 2 - grid.y[:, None] ** 2, 0.0))
     overlap = grid.rest - sphere
     expected = (overlap > CONTACT_SCALE * overlap.max()) & (np.hypot(grid.x[None, :], grid.y[:, None]) < radius)
     np.testing.assert_array_equal(surface.contact[0], expected)
-    unsmoothed = ElasticSurround(grid, final_sigma=0.0).surface(sphere[None].astype(float))
+    unsmoothed = ElasticSurround(grid, final_sigma=0.0, contact_rule="threshold").surface(sphere[None].astype(float))
     np.testing.assert_allclose(unsmoothed.height[0][expected], sphere[expected], atol=1e-9)
     deep = overlap > 0.55 * overlap.max()
     # The last smoothing lifts a paraboloid of curvature 1/R by σ²/R.
