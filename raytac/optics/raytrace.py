@@ -18,6 +18,7 @@ from raytac.optics.denoise import make_denoiser
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.lamp import Lamp
 from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
+from raytac.optics.refraction import Slab
 from raytac.optics.response import Response
 from raytac.optics.scene import UNIT, SensorScene
 from raytac.optics.variant import load_mitsuba
@@ -72,8 +73,8 @@ class RayTracer:
             sensor: geometry, lights and camera.
             integrator: ``fast`` (deterministic), ``reference`` (unbiased path tracing of our own) or ``path`` (Mitsuba's, to compare).
             resolution: (width, height) [px]; None is the sensor's own.
-            spp: samples a pixel. ``reference`` and ``path``: random samples, 256 if None. ``fast``: camera rays a pixel on a regular grid, a square
-                number, 1 if None.
+            spp: samples a pixel. ``reference`` and ``path``: random samples, 256 if None. ``fast``: camera rays a pixel on a regular grid,
+                a square number, 1 if None.
             outputs: any of ``rgb``, ``layers``, ``normals``, ``depth``.
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of the sampled integrator and of the fit of the case's light.
@@ -108,7 +109,10 @@ class RayTracer:
         self.mi, self.device = load_mitsuba(device)
         self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
         self.label = f"raytrace-{integrator}" + ("-denoised" if denoise else "")
-        self.camera = Pinhole.from_spec(sensor.camera, resolution)
+        self.slab = Slab.from_spec(sensor)
+        if self.slab is not None:
+            self.slab.check(sensor)
+        self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
         self.spp = spp or 256
         self.bounce, self.led_points, self.shadows = bounce, led_points, shadows
         self.max_depth, self.progress = max_depth, progress
@@ -160,9 +164,12 @@ class RayTracer:
         self._frozen: dict[tuple[str, int], Any] = {}
 
     def _check_view(self, grid: PadGrid) -> None:
-        corners = self.camera.slope(np.array([0.0, self.camera.resolution[0]]), np.array([0.0, self.camera.resolution[1]]))
-        for axis, nodes, slope in zip("xy", (grid.x, grid.y), corners, strict=True):
-            seen = self.camera.position["xy".index(axis)] - slope * self.camera.position[2]
+        # The pad's edge is nearest where a side of the image is closest to the axis, also behind a slab, which bends steep rays more.
+        width, height = self.camera.resolution
+        cx, cy = self.camera.principal
+        views = self.camera.ray(np.array([0.0, width]), cy), self.camera.ray(cx, np.array([0.0, height]))
+        for k, (axis, nodes, (origin, slope)) in enumerate(zip("xy", (grid.x, grid.y), views, strict=True)):
+            seen = origin[k] - slope[k] * origin[2]
             if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
                 rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
                 raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)
@@ -243,13 +250,13 @@ class RayTracer:
         diffuse_albedo = [(1 - coat.specular) * r for r in coat.reflectance]
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
         for lamp, group in zip(inputs.lamps, self.groups, strict=True):
-            diffuse, specular = direct_light(mi, field, coat, seen, lamp, self.led_points, self.shadows)
+            diffuse, specular = direct_light(mi, field, coat, seen, lamp, self.led_points, self.shadows, slab=self.slab)
             for c in range(3):
                 out[3 * group + c] += lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
         if grids is not None and inputs.bounce is not None:
             for k, e in enumerate(inputs.bounce.irradiance(mi, grids, seen)):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
-        return out
+        return out if seen.exit is None else [o * seen.exit for o in out]
 
     def _radiosity(self, field: CoatField, inputs: FastInputs) -> Any:
         """Direct radiosity B of the coat at a sample, a channel each, for the coat's own inter-reflection."""
@@ -258,7 +265,7 @@ class RayTracer:
         def radiosity(seen: PixelSample) -> list[Any]:
             out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
             for lamp, group in zip(inputs.lamps, self.groups, strict=True):
-                diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False)
+                diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False, slab=self.slab)
                 for c in range(3):
                     out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * coat.reflectance[c] + coat.specular)
             return out

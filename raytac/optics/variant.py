@@ -21,13 +21,12 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
         BackendError: no LLVM library (CPU), no CUDA device, or a process that already uses the other variant.
     """
     name = resolve_device(device)
-    if name == "cpu":
-        if llvm_library() is None:
-            raise BackendError(
-                "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
-                "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
-                "`raytac doctor` tells what was tried"
-            )
+    if name == "cpu" and llvm_library() is None:
+        raise BackendError(
+            "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
+            "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
+            "`raytac doctor` tells what was tried"
+        )
     import mitsuba as mi
 
     variant = VARIANTS[name]

@@ -1,0 +1,49 @@
+"""A sensor and a press mirrored at x = 0 (or y = 0) give the mirrored image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.optics.raytrace import total
+from raytac.specs.sensor import LightsSpec, SensorSpec, Vec3
+from tests.optics.conftest import Build
+from tests.optics.images import assert_images_agree, errors
+from tests.optics.scenes import ball, grid_of, like_a_mini, surface
+
+
+def mirrored(spec: SensorSpec, axis: int) -> SensorSpec:
+    def flip(v: Vec3) -> Vec3:
+        return tuple(-c if i == axis else c for i, c in enumerate(v))  # type: ignore[return-value]
+
+    leds = tuple(replace(led, position=flip(led.position), axis=flip(led.axis)) for led in spec.lights.leds)
+    return replace(spec, lights=LightsSpec(leds))
+
+
+@pytest.mark.parametrize("axis", [0, 1], ids=["x", "y"])
+def test_fast_is_symmetric(tracer: Build, tmp_path: Path, axis: int) -> None:
+    # Black walls: the light of the case is fitted to random paths, which are not symmetric.
+    spec = like_a_mini()
+    spec = replace(spec, case=replace(spec.case, reflectance=0.0))
+    grid = grid_of(spec)
+    height, _ = ball(grid)
+    image = total(tracer(spec, led_points=2).render_layers(surface(grid, height)))[0]
+    other = total(tracer(mirrored(spec, axis), led_points=2).render_layers(surface(grid, np.flip(height, 1 - axis))))[0]
+    assert_images_agree(np.flip(other, 1 - axis), image, tmp_path, mean=1e-5, maximum=2e-3)
+    assert errors(other, image)[0] > 0.05  # the press and the lights are off centre
+
+
+def test_reference_is_symmetric_within_its_noise(tracer: Build) -> None:
+    spec = like_a_mini()
+    grid = grid_of(spec)
+    height, _ = ball(grid)
+    options = {"integrator": "reference", "resolution": (40, 30)}
+    image = total(tracer(spec, spp=64, **options).render_layers(surface(grid, height)))[0]
+    again = total(tracer(spec, spp=64, seed=7, **options).render_layers(surface(grid, height)))[0]
+    other = total(tracer(mirrored(spec, 0), spp=64, **options).render_layers(surface(grid, np.flip(height, 1))))[0][:, ::-1]
+    noise, difference = errors(again, image)[0], errors(other, image)[0]
+    assert difference < 1.2 * noise, (difference, noise)
+    assert other.mean() == pytest.approx(image.mean(), rel=2e-3)
