@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from raytac.specs.sensor import CameraSpec
+
+if TYPE_CHECKING:
+    # The ray tracer's side of the slab needs Dr.Jit; a camera without one does not.
+    from raytac.optics.refraction import Slab
 
 __all__ = ["Pinhole"]
 
@@ -23,34 +28,59 @@ class Pinhole:
     focal: tuple[float, float]
     principal: tuple[float, float]
     resolution: tuple[int, int]
+    slab: Slab | None = None
+    """Gel and plate that bend its rays, in metres; None where light goes straight."""
 
     @classmethod
-    def from_spec(cls, spec: CameraSpec, resolution: tuple[int, int] | None = None) -> Pinhole:
+    def from_spec(cls, spec: CameraSpec, resolution: tuple[int, int] | None = None, slab: Slab | None = None) -> Pinhole:
         """Scale the native camera to ``resolution`` (width, height) [px]; the field of view stays that of the native image.
 
-        With the pinhole a distance d below the gel plane, a pixel of pitch p there is the angle p / d: f = d / p.
+        With the pinhole a distance d below the gel plane, a pixel of pitch p there is the angle p / d: f = d / p. The pitch is what
+        a ruler on the gel plane shows, so behind a slab d is the apparent distance: that in air plus the slab's thickness over n.
+        This holds about the optical axis; farther out the plane z = 0 appears distorted (docs/refraction.md).
         """
         width, height = spec.resolution if resolution is None else resolution
         sx, sy = width / spec.resolution[0], height / spec.resolution[1]
         distance = -spec.position[2]
+        if slab is not None:
+            distance = (slab.z - spec.position[2]) - slab.z / slab.ior
         return cls(
             position=spec.position,
             focal=(sx * distance / spec.pixel_pitch[0], sy * distance / spec.pixel_pitch[1]),
             principal=(sx * spec.principal_point[0], sy * spec.principal_point[1]),
             resolution=(width, height),
+            slab=slab,
         )
 
     def slope(self, u, v):
-        """(dx/dz, dy/dz) of the ray through pixel (u, v)."""
+        """(dx/dz, dy/dz) of the ray through pixel (u, v) as it leaves the pinhole."""
         return (u - self.principal[0]) / self.focal[0], (v - self.principal[1]) / self.focal[1]
 
+    def ray(self, u: Any, v: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any]]:
+        """(origin [m], slopes) of the ray through pixel (u, v) where it meets the coat: from the slab's face on if there is one."""
+        tx, ty = self.slope(u, v)
+        if self.slab is None:
+            return self.position, (tx, ty)
+        x, y, z = self.position
+        air = self.slab.z - z
+        return (x + air * tx, y + air * ty, self.slab.z), self.slab.bend(tx, ty)
+
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (…, 2) of pad-frame points (…, 3) [m]."""
+        """Pixels (…, 2) of pad-frame points (…, 3) [m]; with a slab, of points in it."""
         d = np.asarray(points, dtype=np.float64) - np.asarray(self.position)
-        return d[..., :2] / d[..., 2:] * np.asarray(self.focal) + np.asarray(self.principal)
+        if self.slab is None:
+            slope = d[..., :2] / d[..., 2:]
+        else:
+            air = self.slab.z - self.position[2]
+            rho = np.linalg.norm(d[..., :2], axis=-1, keepdims=True)
+            slope = d[..., :2] * (self.slab.meet(rho, air, d[..., 2:] - air) / np.maximum(rho, 1e-12))
+        return slope * np.asarray(self.focal) + np.asarray(self.principal)
 
     def pixel_centres_on_plane(self, z: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """x (W,) and y (H,) [m] where the pixel centres meet the plane at height ``z`` [m]."""
-        tx, ty = self.slope(np.arange(self.resolution[0]) + 0.5, np.arange(self.resolution[1]) + 0.5)
-        depth = z - self.position[2]
-        return self.position[0] + tx * depth, self.position[1] + ty * depth
+        """x (W,) and y (H,) [m] where the pixel centres meet the plane at height ``z`` [m].
+
+        With a slab these are the places along the row and the column of the principal point.
+        """
+        (ox, _, oz), (tx, _) = self.ray(np.arange(self.resolution[0]) + 0.5, self.principal[1])
+        (_, oy, _), (_, ty) = self.ray(self.principal[0], np.arange(self.resolution[1]) + 0.5)
+        return ox + tx * (z - oz), oy + ty * (z - oz)

@@ -103,8 +103,8 @@ class CoatField:
         ty = dr.minimum(mi.UInt32(dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)) // g.tile_y, g.tiles_y - 1)
         return (env * g.tiles_y + ty) * g.tiles_x + tx
 
-    def camera_hit(self, env: Any, origin: tuple[float, float, float], tx: Any, ty: Any) -> Any:
-        """First meeting of the camera ray origin + s (tx, ty, 1) with the surface; returns the point.
+    def camera_hit(self, env: Any, origin: tuple[Any, Any, Any], tx: Any, ty: Any) -> Any:
+        """First meeting of the camera ray origin + s (tx, ty, 1) with the surface; returns the point. The origin may differ by pixel.
 
         The tile's bounds bracket the hit; the bracket is walked in steps of one cell until the ray is behind the surface, then
         refined by the secant rule (bilinear patches are nearly linear along so short a way).

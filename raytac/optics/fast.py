@@ -19,6 +19,7 @@ import drjit as dr
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField
 from raytac.optics.lamp import Lamp
+from raytac.optics.refraction import Slab
 from raytac.specs.sensor import CoatSpec
 
 __all__ = ["PixelSample", "direct_light", "see"]
@@ -32,6 +33,8 @@ class PixelSample:
     p: Any
     n: Any
     wo: Any
+    exit: Any = None
+    """Radiance that leaves the slab per radiance at p, T / n²; None without a slab."""
 
 
 def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[float, float] = (0.5, 0.5)) -> PixelSample:
@@ -40,36 +43,56 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
     i = dr.arange(mi.UInt32, envs * width * height)
     env = i // (width * height)
     pixel = i - env * (width * height)
-    tx, ty = camera.slope(mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1])
-    p = field.camera_hit(env, camera.position, tx, ty)
+    u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
+    origin, (tx, ty) = camera.ray(u, v)
+    p = field.camera_hit(env, origin, tx, ty)
     z, n = field.z_and_normal(env, p.x, p.y)
-    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)))
+    exit = None
+    if camera.slab is not None:
+        ax, ay = camera.slope(u, v)
+        exit = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
+    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), exit)
 
 
 def direct_light(
-    mi: Any, field: CoatField, coat: CoatSpec, seen: PixelSample, lamp: Lamp, points: int, shadows: bool, specular: bool = True
+    mi: Any,
+    field: CoatField,
+    coat: CoatSpec,
+    seen: PixelSample,
+    lamp: Lamp,
+    points: int,
+    shadows: bool,
+    specular: bool = True,
+    slab: Slab | None = None,
 ) -> tuple[Any, Any]:
     """(diffuse, specular) transport of one LED to every pixel for unit power: multiply by power and reflectance to get radiance.
 
-    ``points`` × ``points`` quadrature nodes (midpoint rule) over the LED's rectangle, one shadow ray each.
+    ``points`` × ``points`` quadrature nodes (midpoint rule) over the LED's rectangle, one shadow ray each; through the face of
+    ``slab`` if there is one. Radiance is that at the coat.
     """
     diffuse, mirror = mi.Float(0), mi.Float(0)
     for a in range(points):
         for b in range(points):
             light = lamp.sample(mi.Point2f((a + 0.5) / points, (b + 0.5) / points))
-            d = light - seen.p
-            r2 = dr.squared_norm(d)
-            inv_r = dr.rsqrt(r2)
-            w = d * inv_r
+            # An LED's extent e across the ray, seen from p, is the tangent e · turn / flat of elevation.
+            if slab is None:
+                d = light - seen.p
+                r2 = dr.squared_norm(d)
+                w = d * dr.rsqrt(r2)
+                out, target, spread = -w, light, r2
+                turn, flat = dr.sqrt(r2), dr.maximum(dr.squared_norm(d.xy), 1e-12)
+            else:
+                link, turn = slab.connect(mi, seen.p, light)
+                w, out, target, spread = link.w, link.out, link.via, 1 / link.gain
+                flat = dr.maximum(dr.squared_norm(w.xy), 1e-6)
             cos_p = dr.dot(seen.n, w)
-            lobe = lamp.lobe_gain(-w)
+            lobe = lamp.lobe_gain(out)
             lit = (lobe > 0) & (cos_p > 0)
-            gain = dr.select(lit, lobe * cos_p / r2, 0) / points**2
+            gain = dr.select(lit, lobe * cos_p / spread, 0) / points**2
             if shadows:
-                reach2 = dr.maximum(dr.squared_norm(d.xy), 1e-12)
-                up = mi.Vector3f(-w.x * w.z, -w.y * w.z, 1 - w.z * w.z) * dr.rsqrt(dr.maximum(1 - w.z * w.z, 1e-12))
-                tan_half = dr.maximum(lamp.extent(up) / points * dr.sqrt(r2) / reach2, 1e-4)
-                gain *= field.visibility(seen.env, seen.p, light, tan_half, lit)
+                up = mi.Vector3f(-out.x * out.z, -out.y * out.z, 1 - out.z * out.z) * dr.rsqrt(dr.maximum(1 - out.z * out.z, 1e-12))
+                tan_half = dr.maximum(lamp.extent(up) / points * turn / flat, 1e-4)
+                gain *= field.visibility(seen.env, seen.p, target, tan_half, lit)
             diffuse += gain
             if specular and coat.specular > 0:
                 mirror += gain * ggx(mi, coat.roughness, seen.n, w, seen.wo)

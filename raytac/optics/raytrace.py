@@ -164,7 +164,7 @@ class RayTracer:
         self._frozen: dict[tuple[str, int], Any] = {}
 
     def _check_view(self, grid: PadGrid) -> None:
-        # The pad's edge is nearest where a side of the image is closest to the axis, also behind a slab, which bends steep rays more.
+        # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
         width, height = self.camera.resolution
         cx, cy = self.camera.principal
         views = self.camera.ray(np.array([0.0, width]), cy), self.camera.ray(cx, np.array([0.0, height]))

@@ -13,7 +13,8 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid
 from raytac.optics import led as led_plugin
-from raytac.optics.lamp import led_edges
+from raytac.optics.lamp import Lamp, led_edges
+from raytac.optics.refraction import Slab
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
 
 UNIT = 1e3
@@ -46,8 +47,12 @@ def grid_faces(nx: int, ny: int) -> np.ndarray:
 class SensorScene:
     """One sensor's geometry and lights in Mitsuba; ``set_surface`` and ``set_layers`` are all that changes."""
 
-    def __init__(self, mi: Any, sensor: SensorSpec, grid: PadGrid) -> None:
-        """``grid`` gives the nodes of the coat mesh [m]; the mesh starts at rest."""
+    def __init__(self, mi: Any, sensor: SensorSpec, grid: PadGrid, *, glass: bool = False) -> None:
+        """``grid`` gives the nodes of the coat mesh [m]; the mesh starts at rest.
+
+        ``glass`` puts the slab's face into the scene as a dielectric rectangle over the case's cross-section, for Mitsuba's own
+        integrators; ours take it as a plane, ``slab``, in formulas.
+        """
         import drjit
 
         self.mi, self.dr, self.sensor, self.grid = mi, drjit, sensor, grid
@@ -55,7 +60,10 @@ class SensorScene:
         x, y = np.meshgrid(grid.x, grid.y)
         self._xy = (UNIT * np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
         scene: dict[str, Any] = {"type": "scene", "coat": self._coat_mesh(grid_faces(nx, ny))}
+        self.slab = Slab.from_spec(sensor, UNIT)
         scene.update(self._case())
+        if glass and self.slab is not None:
+            scene["glass"] = self._glass(self.slab)
         for index, spec in enumerate(sensor.lights.leds):
             scene[f"led_{index}"] = self._led(spec)
         # Without this, Mitsuba merges equal LEDs into one emitter and then finds it attached to two shapes.
@@ -100,6 +108,14 @@ class SensorScene:
             "wall_bottom": plate((0, hy, z), (0, -1, 0), (hx, depth / 2), (0, 0, 1)),
             "floor": plate((0, 0, -depth), (0, 0, 1), (hx, hy), (0, 1, 0)),
         }
+
+    def _glass(self, slab: Slab) -> dict[str, Any]:
+        """The slab's face; its normal points to the air, −z, so that the gel is the interior."""
+        T = self.mi.ScalarTransform4f
+        hx, hy = (UNIT * s / 2 for s in self.sensor.case.size)
+        frame = T().look_at(origin=[0, 0, slab.z], target=[0, 0, slab.z - 1], up=[0, 1, 0])
+        bsdf = {"type": "dielectric", "int_ior": slab.ior, "ext_ior": 1.0}
+        return {"type": "rectangle", "to_world": frame @ T().scale([hx, hy, 1]), "bsdf": bsdf}
 
     def _led(self, led: LedSpec) -> dict[str, Any]:
         T = self.mi.ScalarTransform4f
@@ -157,6 +173,13 @@ class SensorScene:
         wall = mi.Color3f(dr.select(si.wi.z > 0, self.case_albedo(si), 0))
         on_coat = si.shape == self._coat
         return dr.select(on_coat, sample.wo, cosine), dr.select(on_coat, weight, wall)
+
+    def led_radiance(self, si: Any, index: int, lamp: Lamp) -> Any:
+        """Radiance (RGB) that LED ``index``, given as ``lamp`` in scene units, sends back along the ray that hit ``si``; 0 elsewhere."""
+        area = 4 * self.dr.norm(lamp.half_u) * self.dr.norm(lamp.half_v)
+        front = (si.shape == self._leds[index]) & (si.wi.z > 0)
+        lobe = self.dr.power(self.dr.maximum(si.wi.z, 1e-6), lamp.lobe - 1)
+        return lamp.power * self.dr.select(front, lobe / area, 0)
 
     def on_coat(self, si: Any) -> Any:
         return si.shape == self._coat
