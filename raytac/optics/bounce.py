@@ -78,6 +78,8 @@ class CaseLight:
             for c in range(3):
                 irradiance[3 * group + c] += arriving[c] * dr.dot(w, n)
         basis = [m * c for m in _monomials(u, v) for c in (mi.Float(1), n.x, n.y, n.z)]
+        # All in one kernel: each conversion below would otherwise evaluate its own channel, and with it trace every path again.
+        dr.eval(irradiance, basis)
         design = np.stack([np.array(b + dr.zeros(mi.Float, samples)) for b in basis], axis=1).astype(np.float64)
         target = np.stack([np.array(e) for e in irradiance], axis=1)
         solution, *_ = np.linalg.lstsq(design, target, rcond=None)
