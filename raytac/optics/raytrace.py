@@ -146,7 +146,7 @@ class RayTracer:
         self.layout = CoatLayout.from_grid(grid)
         self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
         needs_scene = self.integrator != "fast" or self.bounce
-        self.scene = SensorScene(mi, self.sensor, grid) if needs_scene else None
+        self.scene = SensorScene(mi, self.sensor, grid, glass=self.integrator == "path") if needs_scene else None
         self._bounce = None
         if self.integrator == "fast" and self.bounce and self.scene is not None:
             case = CaseLight.fit(self.scene, self._scene_lamps, self.groups, self.seed)

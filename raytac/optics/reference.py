@@ -6,6 +6,10 @@ LED instead: one ray leaves it by its lobe, and the point of the case that it me
 in bidirectional path tracing, Lafortune and Willems 1993). The two never count one light path twice: a vertex on the coat is lit
 straight, a vertex on the case only by joining. The path goes on by sampling the reflectance of coat or case and ends by Russian roulette.
 
+With refraction, gel and plate are a plane that rays cross in formulas (``advance``): each stretch is mirrored with the probability of
+Fresnel's reflectance, else refracted, and both ways of lighting a vertex go through ``Slab.link``. A join does not know the plane's mirror
+image, so a case vertex that the path reached over a mirroring is lit straight, and from the mirror image of the LED as well.
+
 Against Mitsuba's own ``path``, which picks one LED at random and meets bright spots on near walls by chance, this takes most of the
 noise away; both converge to one image (a test checks it).
 """
@@ -21,12 +25,15 @@ from tqdm import tqdm
 
 from raytac.optics.camera import Pinhole
 from raytac.optics.lamp import Lamp, LampTable
+from raytac.optics.refraction import Link
 from raytac.optics.scene import UNIT, SensorScene
 
 __all__ = ["ReferenceIntegrator", "StockPathIntegrator", "connect", "trace"]
 
 OFFSET = 1e-3
 """Start of a ray off a surface [scene units]."""
+GHOST = 0.1
+"""Share of camera paths that go on with what the slab's face mirrors."""
 LAUNCH = 1 << 22
 """Most paths in one kernel launch; keeps memory flat and the progress bar alive."""
 
@@ -35,7 +42,7 @@ class ReferenceIntegrator:
     """Path tracer for one sensor scene and camera; ``render`` returns the layers of the scene as it stands."""
 
     def __init__(self, scene: SensorScene, camera: Pinhole, *, max_depth: int = -1, progress: bool = False) -> None:
-        """``max_depth`` counts reflections: 1 is direct light only, −1 has no limit."""
+        """``max_depth`` counts reflections by coat or case, not by the slab's face: 1 is direct light only, −1 has no limit."""
         self.scene, self.camera, self.max_depth, self.progress = scene, camera, max_depth, progress
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
@@ -93,7 +100,10 @@ def accumulate(
             jitter = sampler.next_2d()
             tx, ty = camera.slope(mi.Float(pixel % width) + jitter.x, mi.Float(pixel // width) + jitter.y)
             ray = mi.Ray3f(mi.Point3f([UNIT * c for c in camera.position]), dr.normalize(mi.Vector3f(tx, ty, 1)))
-            sums = [dr.block_sum(c, count) for c in radiance(sampler, ray)]
+            channels = radiance(sampler, ray)
+            # All in one kernel: each sum would otherwise evaluate its own channel, and with it trace every path again.
+            dr.eval(channels)
+            sums = [dr.block_sum(c, count) for c in channels]
             dr.eval(sums)
             launch = np.stack([np.array(c) for c in sums]).astype(np.float64)
             total = launch if total is None else total + launch
@@ -119,12 +129,16 @@ def trace(
     def add(radiance: list[Any], gain: Any, group: Any) -> list[Any]:
         return [r + dr.select(group == k // 3, gain[k % 3], 0) for k, r in enumerate(radiance)]
 
-    def vertex(sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any) -> list[Any]:
-        """Light at a vertex from one random LED: straight if it lies on the coat, and over one point of the case."""
+    def vertex(sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any, mirrored: Any = None) -> list[Any]:
+        """Light at a vertex from one random LED: straight if it lies on the coat or was ``mirrored``, and over one point of the case."""
         lamp, group = table.pick(mi, sampler.next_1d(active))
         weight = beta * len(lamps)
-        straight = lit_by(mi, scene, sampler, si, lamp, weight, active & scene.on_coat(si))
+        direct = scene.on_coat(si) if mirrored is None else scene.on_coat(si) | mirrored
+        straight = lit_by(mi, scene, sampler, si, lamp, weight, active & direct)
         radiance = add(radiance, straight, group)
+        if mirrored is not None:
+            image = lit_by(mi, scene, sampler, si, lamp, weight, active & mirrored & ~scene.slab.inside(si.p), mirror=True)
+            radiance = add(radiance, image, group)
         lamp, group = table.pick(mi, sampler.next_1d(active))
         w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active & deeper)
         return add(radiance, weight * scene.reflect(si, si.to_local(w)) * arriving, group)
@@ -134,6 +148,9 @@ def trace(
         beta = beta * weight
         d = si.to_world(wo)
         survive = dr.minimum(dr.max(beta), 0.95)
+        if scene.slab is not None:
+            # In the gel a path of the camera carries 1 / n² without being worth less.
+            survive = dr.minimum(dr.max(beta) * dr.select(scene.slab.inside(si.p), scene.slab.ior**2, 1), 0.95)
         active = active & (dr.dot(d, si.n) > 0) & (wo.z > 0) & (sampler.next_1d(active) < survive)
         return si.spawn_ray(d), beta / dr.select(active, survive, 1), active
 
@@ -141,27 +158,48 @@ def trace(
     beta, active, depth = dr.full(mi.Color3f, 1, n), dr.full(mi.Bool, True, n), 0
     if seen:
         # The camera's vertex is on the coat and carries most of the light: every LED lights it.
-        si = scene.scene.ray_intersect(ray)
+        first = ray
+        if scene.slab is not None:
+            first, inner, mirror = enter(mi, scene, ray)
+            beta = beta * inner
+        si = scene.scene.ray_intersect(first)
         active = si.is_valid()
         for lamp, group in zip(lamps, groups, strict=True):
             radiance = add(radiance, lit_by(mi, scene, sampler, si, lamp, beta, active), mi.UInt32(group))
-        if max_depth == 1:
+        if max_depth == 1 and scene.slab is None:
             return radiance
-        lamp, group = table.pick(mi, sampler.next_1d(active))
-        w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active)
-        radiance = add(radiance, scene.reflect(si, si.to_local(w)) * arriving * len(lamps), group)
+        if max_depth != 1:
+            lamp, group = table.pick(mi, sampler.next_1d(active))
+            w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active)
+            radiance = add(radiance, beta * scene.reflect(si, si.to_local(w)) * arriving * len(lamps), group)
         ray, beta, active = scatter(sampler, si, beta, active)
+        if scene.slab is not None:
+            # A few paths follow the image of case and LEDs in the slab's face instead.
+            ghost = sampler.next_1d() < GHOST
+            gray, share = mirror
+            gsi = scene.scene.ray_intersect(gray, ghost)
+            gactive, gbeta = ghost & gsi.is_valid(), mi.Color3f(share / GHOST)
+            for k, (lamp, group) in enumerate(zip(lamps, groups, strict=True)):
+                radiance = add(radiance, dr.select(gactive, gbeta * scene.led_radiance(gsi, k, lamp), 0), mi.UInt32(group))
+            radiance = vertex(sampler, gsi, gbeta, radiance, mi.Bool(max_depth != 1), gactive, mi.Bool(True))
+            if max_depth == 1:
+                return radiance
+            gray, gbeta, gactive = scatter(sampler, gsi, gbeta, gactive)
+            ray = mi.Ray3f(dr.select(ghost, gray.o, ray.o), dr.select(ghost, gray.d, ray.d))
+            beta, active = dr.select(ghost, gbeta, beta / (1 - GHOST)), dr.select(ghost, gactive, active)
         depth = 1
 
     def alive(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> Any:
         return active
 
     def bounce(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> tuple[Any, ...]:
-        si = scene.scene.ray_intersect(ray, active)
+        si, scale, mirrored = advance(mi, scene, sampler, ray, active)
+        if scale is not None:
+            beta = beta * scale
         active = active & si.is_valid()
         depth = depth + 1
         deeper = mi.Bool(True) if max_depth < 0 else depth < max_depth
-        radiance = vertex(sampler, si, beta, radiance, deeper, active)
+        radiance = vertex(sampler, si, beta, radiance, deeper, active, mirrored)
         ray, beta, active = scatter(sampler, si, beta, active & deeper)
         return sampler, ray, beta, radiance, depth, active
 
@@ -170,16 +208,68 @@ def trace(
     return dr.while_loop(state, alive, bounce, label="path")[3]
 
 
-def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta: Any, active: Any) -> Any:
-    """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for one random point of ``lamp``, 0 in its shadow; f includes the cosine."""
+def enter(mi: Any, scene: SensorScene, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:
+    """Split a camera ray in air at the slab's face: (ray in the gel, its weight T / n², (mirrored ray, its weight 1 − T))."""
+    slab = scene.slab
+    o = ray.o + ray.d * ((slab.z - ray.o.z) / ray.d.z)
+    o.z = mi.Float(slab.z)
+    d, loss = slab.refract(mi, ray.d)
+    return mi.Ray3f(o, d), (1 - loss) / slab.ior**2, (mi.Ray3f(o, mi.Vector3f(ray.d.x, ray.d.y, -ray.d.z)), loss)
+
+
+def advance(mi: Any, scene: SensorScene, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, Any]:
+    """What ``ray`` meets, over the slab's face if that comes first: (interaction, factor on radiance, whether it was mirrored).
+
+    The factor is n² for a path that leaves the gel and 1 / n² for one that enters; light carried from an LED needs none. Both last values
+    are None without a slab. The face is flat, so that a stretch meets it once at most.
+    """
+    si = scene.scene.ray_intersect(ray, active)
+    slab = scene.slab
+    if slab is None:
+        return si, None, None
+    at = (slab.z - ray.o.z) / ray.d.z
+    meets = active & (at > 0) & (at < dr.select(si.is_valid(), si.t, dr.inf))
+    o = ray.o + ray.d * at
+    o.z = mi.Float(slab.z)
+    d, loss = slab.refract(mi, ray.d)
+    mirrored = meets & (sampler.next_1d(active) < loss)
+    d = dr.select(mirrored, mi.Vector3f(ray.d.x, ray.d.y, -ray.d.z), d)
+    beyond = scene.scene.ray_intersect(mi.Ray3f(o, d), meets)
+    eta2 = slab.ior**2
+    factor = dr.select(meets & ~mirrored, dr.select(ray.d.z < 0, eta2, 1 / eta2), 1)
+    return dr.select(meets, beyond, si), factor, mirrored
+
+
+def hidden(mi: Any, scene: SensorScene, start: Any, end: Any, link: Link, active: Any) -> Any:
+    """Whether something stands on either leg of ``link`` between the interaction ``start`` and the point ``end``."""
+    active = mi.Bool(active)
+    blocked = scene.scene.ray_test(start.spawn_ray_to(dr.select(link.bent, link.via, end)), active)
+    leg = end - link.via
+    length = dr.norm(leg)
+    second = mi.Ray3f(link.via, leg / dr.maximum(length, 1e-9))
+    second.maxt = length * (1 - 1e-4)
+    return blocked | scene.scene.ray_test(second, active & link.bent & ~blocked)
+
+
+def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta: Any, active: Any, mirror: bool = False) -> Any:
+    """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for one random point of ``lamp``, 0 in its shadow; f includes the cosine.
+
+    With a slab 1 / r² becomes the link's gain, refracted where si is in the gel; ``mirror`` takes the LED's image in the slab's face.
+    """
     light = lamp.sample(sampler.next_2d(active))
-    d = light - si.p
-    r2 = dr.squared_norm(d)
-    w = d * dr.rsqrt(r2)
-    wo = si.to_local(w)
-    facing = active & (dr.dot(w, lamp.axis) < 0) & (dr.dot(w, si.n) > 0) & (wo.z > 0)
-    facing &= ~scene.scene.ray_test(si.spawn_ray_to(light), facing)
-    return beta * scene.reflect(si, wo) * lamp.power * dr.select(facing, lamp.lobe_gain(-w) / r2, 0)
+    if scene.slab is None:
+        d = light - si.p
+        r2 = dr.squared_norm(d)
+        w = d * dr.rsqrt(r2)
+        wo = si.to_local(w)
+        facing = active & (dr.dot(w, lamp.axis) < 0) & (dr.dot(w, si.n) > 0) & (wo.z > 0)
+        facing &= ~scene.scene.ray_test(si.spawn_ray_to(light), facing)
+        return beta * scene.reflect(si, wo) * lamp.power * dr.select(facing, lamp.lobe_gain(-w) / r2, 0)
+    link = scene.slab.mirror(mi, si.p, light) if mirror else scene.slab.link(mi, si.p, light)
+    wo = si.to_local(link.w)
+    facing = active & (dr.dot(link.out, lamp.axis) > 0) & (dr.dot(link.w, si.n) > 0) & (wo.z > 0)
+    facing &= ~hidden(mi, scene, si, light, link, facing)
+    return beta * scene.reflect(si, wo) * lamp.power * dr.select(facing, lamp.lobe_gain(link.out) * link.gain, 0)
 
 
 def connect(mi: Any, scene: SensorScene, sampler: Any, p: Any, n: Any, lamp: Lamp, active: Any) -> tuple[Any, Any]:
@@ -195,13 +285,19 @@ def connect(mi: Any, scene: SensorScene, sampler: Any, p: Any, n: Any, lamp: Lam
     sin_theta = dr.safe_sqrt(1 - cos_theta * cos_theta)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * square.y)
     out = mi.Frame3f(lamp.axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
-    y = scene.scene.ray_intersect(mi.Ray3f(start + OFFSET * lamp.axis, out), active)
+    y, _, _ = advance(mi, scene, sampler, mi.Ray3f(start + OFFSET * lamp.axis, out), active)
     albedo = scene.case_albedo(y)
-    d = p - y.p
-    r2 = dr.maximum(dr.squared_norm(d), 1e-12)
-    w = -d * dr.rsqrt(r2)
-    cos_y = -dr.dot(w, y.n)
-    joined = active & y.is_valid() & (albedo > 0) & (y.wi.z > 0) & (cos_y > 0) & (dr.dot(w, n) > 0)
-    joined &= ~scene.scene.ray_test(y.spawn_ray_to(p + OFFSET * n), joined)
     flux = lamp.power * (2 * dr.pi / (lamp.lobe + 1))
-    return w, flux * dr.select(joined, albedo / dr.pi * cos_y / r2, 0)
+    if scene.slab is None:
+        d = p - y.p
+        r2 = dr.maximum(dr.squared_norm(d), 1e-12)
+        w = -d * dr.rsqrt(r2)
+        cos_y = -dr.dot(w, y.n)
+        joined = active & y.is_valid() & (albedo > 0) & (y.wi.z > 0) & (cos_y > 0) & (dr.dot(w, n) > 0)
+        joined &= ~scene.scene.ray_test(y.spawn_ray_to(p + OFFSET * n), joined)
+        return w, flux * dr.select(joined, albedo / dr.pi * cos_y / r2, 0)
+    link = scene.slab.link(mi, p, y.p)
+    cos_y = dr.dot(link.out, y.n)
+    joined = active & y.is_valid() & (albedo > 0) & (y.wi.z > 0) & (cos_y > 0) & (dr.dot(link.w, n) > 0)
+    joined &= ~hidden(mi, scene, y, p + OFFSET * n, link, joined)
+    return link.w, flux * dr.select(joined, albedo / dr.pi * cos_y * link.gain, 0)
