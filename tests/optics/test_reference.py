@@ -1,0 +1,107 @@
+"""The path tracer is unbiased: its error is noise that falls as 1/√spp, and Mitsuba's own ``path`` converges to the same image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raytac.gel.surface import GelSurface
+from raytac.optics import reference
+from raytac.optics.raytrace import RayTracer, total
+from raytac.specs.sensor import SensorSpec
+from tests.optics.conftest import Build
+from tests.optics.scenes import ball, grid_of, like_a_mini, surface
+
+TINY = (32, 24)
+
+
+@pytest.fixture(scope="module")
+def spec() -> SensorSpec:
+    return like_a_mini()
+
+
+@pytest.fixture(scope="module")
+def pressed(spec: SensorSpec) -> GelSurface:
+    grid = grid_of(spec)
+    return surface(grid, ball(grid)[0])
+
+
+def image(
+    tracer: Build, spec: SensorSpec, pressed: GelSurface, spp: int, seed: int = 0, integrator: str = "reference"
+) -> np.ndarray:
+    return total(tracer(spec, integrator=integrator, resolution=TINY, spp=spp, seed=seed).render_layers(pressed))[0].astype(float)
+
+
+def noise(a: np.ndarray, b: np.ndarray) -> float:
+    """Standard deviation of either of two independent images."""
+    return float(np.sqrt(np.mean((a - b) ** 2) / 2))
+
+
+def test_error_falls_as_one_over_root_spp(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
+    counts = [4, 8, 16, 32, 64]
+    error = [noise(*(image(tracer, spec, pressed, spp, seed) for seed in (0, 1))) for spp in counts]
+    slope = np.polyfit(np.log(counts), np.log(error), 1)[0]
+    assert -0.6 < slope < -0.4, f"slope {slope:.3f} of {error}"
+    # And against an image with many more samples, so that the error is not only self-consistent.
+    best = image(tracer, spec, pressed, 1024, seed=2)
+    against = [float(np.sqrt(np.mean((image(tracer, spec, pressed, spp) - best) ** 2))) for spp in (4, 64)]
+    assert against[0] / against[1] == pytest.approx(4.0, rel=0.2), against
+
+
+def test_one_launch_or_many_is_one_estimate(
+    tracer: Build, spec: SensorSpec, pressed: GelSurface, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = [image(tracer, spec, pressed, 64, seed) for seed in (0, 1)]
+    monkeypatch.setattr(reference, "LAUNCH", 8 * TINY[0] * TINY[1])
+    split = [image(tracer, spec, pressed, 64, seed) for seed in (0, 1)]
+    assert (whole[0] != split[0]).any()
+    sigma = noise(*whole)
+    # Launches that shared random numbers would have the noise of fewer samples.
+    assert noise(*split) == pytest.approx(sigma, rel=0.15)
+    assert noise(whole[0], split[0]) == pytest.approx(sigma, rel=0.15)
+    assert abs(np.mean(whole) - np.mean(split)) < 5 * sigma / np.sqrt(whole[0].size)
+
+
+def test_seeds_reproduce_and_differ(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
+    first = image(tracer, spec, pressed, 16)
+    np.testing.assert_array_equal(image(tracer, spec, pressed, 16), first)
+    built_anew = RayTracer(spec, integrator="reference", resolution=TINY, spp=16, device="cpu")
+    # Another scene object is another kernel, which may round its last bit otherwise.
+    np.testing.assert_allclose(total(built_anew.render_layers(pressed))[0], first, rtol=1e-6)
+    other, third = (image(tracer, spec, pressed, 16, seed) for seed in (1, 2))
+    assert (other != first).mean() > 0.99
+    # Neighbouring seeds light the environments of a batch: their noise must have nothing in common.
+    best = image(tracer, spec, pressed, 1024, seed=9)
+    rho = np.corrcoef((first - best)[..., 1].ravel(), (other - best)[..., 1].ravel())[0, 1]
+    assert abs(rho) < 5 / np.sqrt(TINY[0] * TINY[1]), rho
+    assert noise(first, third) > 0
+
+
+def test_mitsuba_path_converges_to_the_same_image(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
+    def layers(integrator: str, spp: int, seed: int) -> np.ndarray:
+        mode = tracer(spec, integrator=integrator, resolution=TINY, spp=spp, seed=seed)
+        return np.stack([layer[0] for layer in mode.render_layers(pressed).values()]).astype(float)
+
+    ours = np.stack([layers("reference", 256, seed) for seed in (0, 1)])
+    theirs = np.stack([layers("path", 256, seed) for seed in (0, 1)])
+    for name, k in zip(("red", "green", "blue"), range(3), strict=True):
+        a, b = ours[:, k], theirs[:, k]
+        mean = a.mean()
+        # Blocks of 8 × 8 pixels average the noise; what would be left is a difference between the two.
+        blocks_a, blocks_b = (v.reshape(2, 3, 8, 4, 8, 3).mean(axis=(2, 4)) for v in (a, b))
+        sigma = np.hypot(noise(*blocks_a), noise(*blocks_b)) / np.sqrt(2)
+        worst = np.abs(blocks_a.mean(0) - blocks_b.mean(0)).max()
+        assert worst < 6 * sigma + 1e-4 * mean, f"{name}: {worst / mean:.3%} with a noise of {sigma / mean:.3%}"
+        assert b.mean() == pytest.approx(mean, rel=5e-3), name
+
+
+def test_more_reflections_only_add_light(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
+    means = {
+        depth: float(
+            total(tracer(spec, integrator="reference", resolution=TINY, spp=64, max_depth=depth).render_layers(pressed)).mean()
+        )
+        for depth in (1, 2, 3, -1)
+    }
+    assert means[1] < means[2] < means[3] < means[-1] * 1.001, means
+    # Each further reflection loses at least the darker of coat and wall.
+    assert means[3] - means[2] < 0.6 * (means[2] - means[1]), means
