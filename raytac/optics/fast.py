@@ -90,7 +90,9 @@ def direct_light(
             lit = (lobe > 0) & (cos_p > 0)
             gain = dr.select(lit, lobe * cos_p / spread, 0) / points**2
             if shadows:
-                up = mi.Vector3f(-out.x * out.z, -out.y * out.z, 1 - out.z * out.z) * dr.rsqrt(dr.maximum(1 - out.z * out.z, 1e-12))
+                up = mi.Vector3f(-out.x * out.z, -out.y * out.z, 1 - out.z * out.z) * dr.rsqrt(
+                    dr.maximum(1 - out.z * out.z, 1e-12)
+                )
                 tan_half = dr.maximum(lamp.extent(up) / points * turn / flat, 1e-4)
                 gain *= field.visibility(seen.env, seen.p, target, tan_half, lit)
             diffuse += gain

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from raytac.optics.camera import Pinhole
 from raytac.optics.lamp import Lamp, LampTable
-from raytac.optics.refraction import Link
+from raytac.optics.refraction import Link, Slab
 from raytac.optics.scene import UNIT, SensorScene
 
 __all__ = ["ReferenceIntegrator", "StockPathIntegrator", "connect", "trace"]
@@ -129,14 +129,16 @@ def trace(
     def add(radiance: list[Any], gain: Any, group: Any) -> list[Any]:
         return [r + dr.select(group == k // 3, gain[k % 3], 0) for k, r in enumerate(radiance)]
 
-    def vertex(sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any, mirrored: Any = None) -> list[Any]:
+    def vertex(
+        sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any, mirrored: Any = None
+    ) -> list[Any]:
         """Light at a vertex from one random LED: straight if it lies on the coat or was ``mirrored``, and over one point of the case."""
         lamp, group = table.pick(mi, sampler.next_1d(active))
         weight = beta * len(lamps)
         direct = scene.on_coat(si) if mirrored is None else scene.on_coat(si) | mirrored
         straight = lit_by(mi, scene, sampler, si, lamp, weight, active & direct)
         radiance = add(radiance, straight, group)
-        if mirrored is not None:
+        if mirrored is not None and scene.slab is not None:
             image = lit_by(mi, scene, sampler, si, lamp, weight, active & mirrored & ~scene.slab.inside(si.p), mirror=True)
             radiance = add(radiance, image, group)
         lamp, group = table.pick(mi, sampler.next_1d(active))
@@ -160,7 +162,7 @@ def trace(
         # The camera's vertex is on the coat and carries most of the light: every LED lights it.
         first = ray
         if scene.slab is not None:
-            first, inner, mirror = enter(mi, scene, ray)
+            first, inner, mirror = enter(mi, scene.slab, ray)
             beta = beta * inner
         si = scene.scene.ray_intersect(first)
         active = si.is_valid()
@@ -208,9 +210,8 @@ def trace(
     return dr.while_loop(state, alive, bounce, label="path")[3]
 
 
-def enter(mi: Any, scene: SensorScene, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:
+def enter(mi: Any, slab: Slab, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:
     """Split a camera ray in air at the slab's face: (ray in the gel, its weight T / n², (mirrored ray, its weight 1 − T))."""
-    slab = scene.slab
     o = ray.o + ray.d * ((slab.z - ray.o.z) / ray.d.z)
     o.z = mi.Float(slab.z)
     d, loss = slab.refract(mi, ray.d)
@@ -281,7 +282,7 @@ def connect(mi: Any, scene: SensorScene, sampler: Any, p: Any, n: Any, lamp: Lam
     """
     start = lamp.sample(sampler.next_2d(active))
     square = sampler.next_2d(active)
-    cos_theta = dr.power(dr.maximum(square.x, 1e-9), 1 / (lamp.lobe + 1))
+    cos_theta: Any = dr.power(dr.maximum(square.x, 1e-9), 1 / (lamp.lobe + 1))
     sin_theta = dr.safe_sqrt(1 - cos_theta * cos_theta)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * square.y)
     out = mi.Frame3f(lamp.axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
