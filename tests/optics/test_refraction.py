@@ -272,7 +272,7 @@ def test_error_of_the_bounce_model_behind_the_slab(tracer: Build) -> None:
     assert reference is not None and fast is not None and without is not None
     assert 60 < reference.mean() < 200
     assert psnr_db(fast, reference) > 36
-    # Light kept inside by total reflection is a large part: leaving it out must show.
+    # All light but the direct: case, coat to coat, and what the slab's face throws back. Leaving it out must show.
     assert psnr_db(without, reference) < 30
 
 
