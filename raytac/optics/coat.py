@@ -68,9 +68,9 @@ class CoatField:
         nodes = pack_nodes(mi, layout, height)
         self.nodes = dr.ravel(nodes)
         dr.eval(self.nodes)
-        self.lowest, self.highest, self.deepest, self.deepest_far = bounds_map(mi, layout, rest, height)
+        self.lowest, self.highest, self.deepest = bounds_map(mi, layout, rest, height)
         self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
-        dr.eval(self.lowest, self.highest, self.deepest, self.deepest_far, self.pad_deepest)
+        dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
 
     def _cell(self, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         mi, g = self.mi, self.layout
@@ -146,34 +146,30 @@ class CoatField:
         from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
         a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: the rest surface of a pad is convex
         towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the
-        light, and only indentation deeper than that can block it. Three bounds on the deepest are known: within one tile of p,
-        within three, and on the whole pad.
+        light, and only indentation deeper than that can block it. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
+        rule that out, the walk skips a whole tile; where the deepest point of the pad does, it ends.
         """
         mi, g = self.mi, self.layout
         d = light - p
         reach = dr.sqrt(d.x * d.x + d.y * d.y)
         ux, uy, rise = d.x / reach, d.y / reach, -d.z / reach
-        rest_p, rest_l = self._rest(p.x, p.y), self._rest(light.x, light.y)
-        depth_p = dr.maximum(rest_p - p.z, 0)
-        gain = (rest_l - light.z - depth_p) / reach - tan_half
-        tile = self.tile(env, p.x, p.y)
-        near, far = dr.gather(mi.Float, self.deepest, tile, active), dr.gather(mi.Float, self.deepest_far, tile, active)
+        # Clearance of the ray's lower edge above the resting surface: at least above_p + gain · s, which the coat must exceed to block.
+        above_p = self._rest(p.x, p.y) - p.z
+        gain = (self._rest(light.x, light.y) - light.z - above_p) / reach - tan_half
         overall = dr.gather(mi.Float, self.pad_deepest, env, active)
-        end = (near - depth_p) / gain
-        edge = min(g.tile_x * g.dx, g.tile_y * g.dy)
-        for bound, valid_to in ((far, edge), (overall, 3 * edge)):
-            reached = (bound - depth_p) / gain
-            end = dr.select(reached > valid_to, reached, end)
-        end = dr.select(gain > 0, end, reach)
-        end = dr.minimum(end, reach)
-        step = min(g.dx, g.dy)
+        end = dr.minimum(dr.select(gain > 0, (overall - above_p) / gain, reach), reach)
+        step, edge = min(g.dx, g.dy), min(g.tile_x * g.dx, g.tile_y * g.dy)
 
         def inside(s: Any, least: Any) -> Any:
             return active & (s < end) & (least > -tan_half)
 
         def walk(s: Any, least: Any) -> tuple[Any, Any]:
-            clearance = self.z(env, p.x + s * ux, p.y + s * uy) - (p.z - s * rise)
-            return s + step, dr.minimum(least, clearance / s)
+            x, y = p.x + s * ux, p.y + s * uy
+            bound = dr.gather(mi.Float, self.deepest, self.tile(env, x, y))
+            free = above_p + dr.minimum(gain * s, gain * (s + edge)) > bound
+            clearance = self.z(env, x, y, ~free) - (p.z - s * rise)
+            least = dr.select(free, least, dr.minimum(least, clearance / s))
+            return s + dr.select(free, edge, step), least
 
         # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
         _, least = dr.while_loop((mi.Float(step), mi.Float(tan_half)), inside, walk, label="shadow ray")
@@ -198,10 +194,8 @@ def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
     return mi.Vector4f(height, zx * inv, zy * inv, -inv)
 
 
-def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any, Any]:
-    """Per tile, over itself and its 8 neighbours: lowest z, highest z, deepest indentation; then the deepest over three tiles each
-    way. Each (B·tiles_y·tiles_x) [m].
-    """
+def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any]:
+    """Per tile, over itself and its 8 neighbours: lowest z, highest z, deepest indentation; each (B·tiles_y·tiles_x) [m]."""
     envs = dr.width(height) // (g.nx * g.ny)
     rows = dr.arange(mi.UInt32, envs * g.ny * g.tiles_x)
     tx, row = rows % g.tiles_x, rows // g.tiles_x
@@ -231,11 +225,4 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
             lo3 = dr.minimum(lo3, dr.gather(mi.Float, lo2, i))
             hi3 = dr.maximum(hi3, dr.gather(mi.Float, hi2, i))
             deep3 = dr.maximum(deep3, dr.gather(mi.Float, deep2, i))
-    dr.eval(deep3)
-    deep7 = deep3
-    for sx in (-2, 0, 2):
-        for sy in (-2, 0, 2):
-            nx = mi.UInt32(dr.clip(mi.Int32(tx) + sx, 0, g.tiles_x - 1))
-            ny = mi.UInt32(dr.clip(mi.Int32(ty) + sy, 0, g.tiles_y - 1))
-            deep7 = dr.maximum(deep7, dr.gather(mi.Float, deep3, (env * g.tiles_y + ny) * g.tiles_x + nx))
-    return lo3, hi3, deep3, deep7
+    return lo3, hi3, deep3
