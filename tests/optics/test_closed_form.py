@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def irradiance(lamp: LedSpec, p: np.ndarray, nodes: int) -> np.ndarray:
     return e
 
 
-PLACES = {
+PLACES: dict[str, dict[str, Any]] = {
     "over_the_pad": {"position": (4e-3, -3e-3, -9e-3), "aim": (0.0, 0.0, 0.0)},
     "beside_the_pad": {"position": (-13e-3, 2e-3, -7e-3), "aim": (1e-3, 0.0, -2e-3)},
     # The axis misses the pad: only the skirt of the lobe lights it, and a part of the pad is behind the LED.
@@ -79,7 +80,7 @@ def test_sampled_integrators_equal_it_within_their_noise(tracer: Build, tmp_path
     assert image.mean() == pytest.approx(expected.mean(), rel=5e-4)
 
 
-LARGE = {"size": (6e-3, 4e-3), "position": (-11.5e-3, -2e-3, -5e-3), "aim": (0.0, 0.0, 0.0)}
+LARGE: dict[str, Any] = {"size": (6e-3, 4e-3), "position": (-11.5e-3, -2e-3, -5e-3), "aim": (0.0, 0.0, 0.0)}
 """An LED larger than its distance from the nearest point in view, and itself out of view."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from tests.optics.images import assert_images_agree
 from tests.optics.scenes import at_rest, ball, grid_of, led, like_a_mini, plateau, sensor, surface
 from tests.optics.test_closed_form import radiance
 
-BALL = {"radius": 4e-3, "depth": 0.8e-3, "centre": (1.5e-3, -1e-3)}
+BALL: dict[str, Any] = {"radius": 4e-3, "depth": 0.8e-3, "centre": (1.5e-3, -1e-3)}
 OUTPUTS = ("normals", "depth")
 PIXEL = 0.3e-3
 """A little more than a pixel at the tests' resolution [m]."""

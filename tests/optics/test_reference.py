@@ -43,9 +43,10 @@ def test_error_falls_as_one_over_root_spp(tracer: Build, spec: SensorSpec, press
     slope = np.polyfit(np.log(counts), np.log(error), 1)[0]
     assert -0.6 < slope < -0.4, f"slope {slope:.3f} of {error}"
     # And against an image with many more samples, so that the error is not only self-consistent.
-    best = image(tracer, spec, pressed, 1024, seed=2)
+    best = image(tracer, spec, pressed, 512, seed=2)
     against = [float(np.sqrt(np.mean((image(tracer, spec, pressed, spp) - best) ** 2))) for spp in (4, 64)]
-    assert against[0] / against[1] == pytest.approx(4.0, rel=0.2), against
+    # The best image's own noise is a third of that at 64 samples, which makes 4 a little less.
+    assert 3.2 < against[0] / against[1] < 4.4, against
 
 
 def test_one_launch_or_many_is_one_estimate(
@@ -64,14 +65,14 @@ def test_one_launch_or_many_is_one_estimate(
 
 def test_seeds_reproduce_and_differ(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
     first = image(tracer, spec, pressed, 16)
-    np.testing.assert_array_equal(image(tracer, spec, pressed, 16), first)
+    # Mitsuba rebuilds mesh and tree for every surface with several threads, which may move the last bit of a few pixels.
+    np.testing.assert_allclose(image(tracer, spec, pressed, 16), first, rtol=1e-6)
     built_anew = RayTracer(spec, integrator="reference", resolution=TINY, spp=16, device="cpu")
-    # Another scene object is another kernel, which may round its last bit otherwise.
     np.testing.assert_allclose(total(built_anew.render_layers(pressed))[0], first, rtol=1e-6)
     other, third = (image(tracer, spec, pressed, 16, seed) for seed in (1, 2))
     assert (other != first).mean() > 0.99
     # Neighbouring seeds light the environments of a batch: their noise must have nothing in common.
-    best = image(tracer, spec, pressed, 1024, seed=9)
+    best = image(tracer, spec, pressed, 512, seed=2)
     rho = np.corrcoef((first - best)[..., 1].ravel(), (other - best)[..., 1].ravel())[0, 1]
     assert abs(rho) < 5 / np.sqrt(TINY[0] * TINY[1]), rho
     assert noise(first, third) > 0

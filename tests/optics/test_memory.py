@@ -1,0 +1,62 @@
+"""A loop of many frames holds its memory flat."""
+
+from __future__ import annotations
+
+import gc
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.optics.conftest import Build
+from tests.optics.scenes import ball, grid_of, like_a_mini, surface
+
+STATM = Path("/proc/self/statm")
+needs_proc = pytest.mark.skipif(not STATM.exists(), reason="resident memory is read from /proc")
+
+
+def resident_mb() -> float:
+    gc.collect()
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def growth_mb(tracer: Build, updates: int, warm_up: int = 40, **options: Any) -> float:
+    """Growth of the resident memory over ``updates`` frames of ever new surfaces, after a warm-up."""
+    spec = like_a_mini()
+    grid = grid_of(spec)
+    mode = tracer(spec, **options)
+    base = ball(grid)[0]
+
+    def frame(k: int) -> np.ndarray:
+        height = grid.rest + (base - grid.rest) * (0.2 + 0.8 * (k % 97) / 97)
+        image = mode.render(surface(grid, height)).rgb
+        assert image is not None
+        return image
+
+    for k in range(warm_up):
+        frame(k)
+    before = resident_mb()
+    images = {frame(k).tobytes() for k in range(warm_up, warm_up + updates)}
+    assert len(images) >= min(updates, 97)  # the frames did differ
+    return resident_mb() - before - sum(map(len, images)) / 1e6
+
+
+@needs_proc
+def test_300_fast_updates_hold_memory_flat(tracer: Build) -> None:
+    assert growth_mb(tracer, 300, outputs=("rgb", "layers", "normals", "depth")) < 20
+
+
+@needs_proc
+def test_60_reference_updates_hold_memory_flat(tracer: Build) -> None:
+    assert growth_mb(tracer, 60, warm_up=15, integrator="reference", spp=1, resolution=(32, 24)) < 20
+
+
+@needs_proc
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", [{}, {"integrator": "reference", "spp": 1, "resolution": (32, 24)}], ids=["fast", "reference"]
+)
+def test_2000_updates_hold_memory_flat(tracer: Build, options: dict) -> None:
+    assert growth_mb(tracer, 2000, **options) < 20

@@ -1,0 +1,103 @@
+"""The camera's response: the stated formula, one result on device and host, and a real background as flat field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from raytac.optics.raytrace import total
+from raytac.optics.response import Response
+from raytac.optics.variant import load_mitsuba
+from raytac.specs.sensor import ResponseSpec, SensorSpec
+from tests.optics.conftest import Build
+from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, surface
+
+CURVE = ResponseSpec(
+    exposure=3.0,
+    white_balance=(1.1, 0.9, 0.8),
+    gamma=1.8,
+    black_level=(0.01, 0.02, 0.0),
+    vignetting=(-0.3, 0.1, -0.05),
+)
+
+
+def linear_image(shape: tuple[int, ...] = (60, 80, 3)) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 0.45, shape).astype(np.float32)
+
+
+def test_the_formula(tracer: Build) -> None:
+    camera = replace(tracer(like_a_mini()).camera, principal=(35.0, 33.0))
+    image = linear_image()
+    encoded = Response(CURVE, camera).encode_numpy(image)
+    for row, column in ((0, 0), (33, 35), (59, 79), (10, 60)):
+        r = np.hypot(column + 0.5 - 35.0, row + 0.5 - 33.0) / (0.5 * np.hypot(80, 60))
+        vignette = 1 - 0.3 * r**2 + 0.1 * r**4 - 0.05 * r**6
+        for c in range(3):
+            value = CURVE.white_balance[c] * CURVE.exposure * vignette * image[row, column, c] + CURVE.black_level[c]
+            expected = 255 * min(max(value, 0), 1) ** (1 / 1.8)
+            assert abs(float(encoded[row, column, c]) - expected) <= 0.51, (row, column, c)
+    assert (encoded == 255).any()  # clipped, not wrapped around
+    assert Response(CURVE, camera).encode_numpy(-image).max() <= 255 * 0.02 ** (1 / 1.8) + 1
+
+
+def test_device_and_host_encode_alike(tracer: Build) -> None:
+    mi, _ = load_mitsuba("cpu")
+    response = Response(CURVE, tracer(like_a_mini()).camera)
+    batch = linear_image((2, 60, 80, 3))
+    channels = [mi.Float(np.ascontiguousarray(batch[..., c]).ravel()) for c in range(3)]
+    u8 = response.encode(mi, channels, response.device_scale(mi))
+    dr.eval(u8)
+    on_device = np.array(u8).reshape(batch.shape)
+    assert np.abs(on_device.astype(int) - response.encode_numpy(batch)).max() <= 1
+
+
+def background() -> np.ndarray:
+    """A smooth, coloured image with a texture, as a camera might see an untouched gel."""
+    v, u = np.indices(RESOLUTION[::-1]) / 60
+    texture = np.random.default_rng(3).integers(-4, 5, (*u.shape, 1))
+    return np.clip(np.stack([90 + 60 * u, 120 - 30 * v, 60 + 50 * v], axis=-1) + texture, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("options", [{}, {"integrator": "reference", "spp": 64}], ids=["fast", "reference"])
+def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
+    from raytac.optics.raytrace import RayTracer
+
+    spec = like_a_mini()
+    spec = replace(spec, response=replace(CURVE, black_level=(0.0, 0.0, 0.0)))
+    real = background()
+    mode = RayTracer(spec, resolution=RESOLUTION, device="cpu", flat_field=real, **options)
+    grid = grid_of(spec)
+    at_rest_rgb = mode.render(at_rest(grid)).rgb
+    pressed = mode.render(surface(grid, ball(grid)[0]))
+    assert at_rest_rgb is not None and pressed.rgb is not None
+    assert np.abs(at_rest_rgb[0].astype(int) - real).max() <= 1
+    assert np.abs(pressed.rgb[0].astype(int) - real).max() > 10
+
+
+def test_flat_field_scales_in_linear_light(tracer: Build) -> None:
+    """image = background × rendered / rendered at rest, before the gamma."""
+    from raytac.optics.raytrace import RayTracer
+
+    spec = like_a_mini()
+    grid = grid_of(spec)
+    real = background()
+    pressed = surface(grid, ball(grid)[0])
+    plain = tracer(spec, outputs=("rgb", "layers"))
+    ratio = total(plain.render_layers(pressed))[0] / total(plain.render_layers(at_rest(grid)))[0]
+    expected = 255 * np.clip((real / 255) ** spec.response.gamma * ratio, 0, 1) ** (1 / spec.response.gamma)
+    rgb = RayTracer(spec, resolution=RESOLUTION, device="cpu", flat_field=real).render(pressed).rgb
+    assert rgb is not None
+    assert np.abs(rgb[0] - expected).max() <= 1.0
+
+
+def test_vignetting_darkens_the_corners(tracer: Build) -> None:
+    plain = like_a_mini()
+    dark: SensorSpec = replace(plain, response=replace(plain.response, vignetting=(-0.5, 0.0, 0.0)))
+    rest = at_rest(grid_of(plain))
+    a, b = tracer(plain, bounce=False).render(rest).rgb, tracer(dark, bounce=False).render(rest).rgb
+    assert a is not None and b is not None
+    loss = a[0].astype(int) - b[0]
+    assert loss[30, 40].max() <= 1 and loss[0, 0].max() > 10

@@ -1,0 +1,108 @@
+"""The main job with the real physics and the real ray tracer: the command writes its folder, and the README's Python runs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from raytac.cli import main
+from raytac.frame import TactileFrame
+from raytac.io.exr import read_exr
+from raytac.io.metrics import read_metrics
+from raytac.io.png import read_png
+from raytac.specs import load_sensor
+
+ROOT = Path(__file__).parents[1]
+LAYERS = ("red", "green", "blue")
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("press") / "coin"
+    size = "x".join(map(str, SIZE))
+    assert main(["press", "coin", "--resolution", size, "--device", "cpu", "--seed", "4", "--out", str(out)]) == 0
+    return out
+
+
+def test_every_file_is_there(folder: Path) -> None:
+    assert {path.name for path in folder.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    preview = read_png(folder / "preview.png")
+    assert preview.shape[1] > 1000 and preview.std() > 20
+
+
+def test_exr_has_the_documented_channels_and_its_layers_sum_to_the_image(folder: Path) -> None:
+    channels, header = read_exr(folder / "frame.exr")
+    lights = {f"led_{name}.{c}" for name in LAYERS for c in "RGB"}
+    assert set(channels) == {*"RGB", "Z", *(f"{v}.{c}" for v in "NP" for c in "XYZ"), *lights}
+    for name, image in channels.items():
+        assert image.shape == SIZE[::-1] and np.isfinite(image).all(), name
+    for c in "RGB":
+        summed = sum(channels[f"led_{name}.{c}"] for name in LAYERS)
+        np.testing.assert_allclose(summed, channels[c], rtol=1e-5, atol=1e-7)
+    assert (header["sensor"], header["scene"], header["mode"], header["seed"]) == (
+        "gelsight_mini",
+        "coin",
+        "rigid+raytrace-fast",
+        "4",
+    )
+    assert "version:mitsuba" in header
+
+
+def test_rgb_is_the_exr_through_the_cameras_response(folder: Path) -> None:
+    channels, _ = read_exr(folder / "frame.exr")
+    linear = np.stack([channels[c] for c in "RGB"], axis=-1)
+    sensor = load_sensor("gelsight_mini")
+    response, (a1, a2, a3) = sensor.response, sensor.response.vignetting
+    v, u = np.indices(SIZE[::-1]) + 0.5
+    scale = SIZE[0] / sensor.camera.resolution[0]
+    cx, cy = (scale * c for c in sensor.camera.principal_point)
+    r2 = ((u - cx) ** 2 + (v - cy) ** 2) / (0.25 * (SIZE[0] ** 2 + SIZE[1] ** 2))
+    gain = response.exposure * (1 + a1 * r2 + a2 * r2**2 + a3 * r2**3)[..., None] * np.array(response.white_balance)
+    value = np.clip(gain * linear + response.black_level, 0, 1)
+    rgb = read_png(folder / "rgb.png")
+    assert np.abs(rgb - 255 * value ** (1 / response.gamma)).max() <= 1.0
+    assert rgb.shape == (SIZE[1], SIZE[0], 3) and rgb.std() > 5 and 20 < rgb.mean() < 235
+
+
+def test_geometry_agrees_between_the_files(folder: Path) -> None:
+    channels, _ = read_exr(folder / "frame.exr")
+    height = np.load(folder / "height.npy")
+    sensor = load_sensor("gelsight_mini")
+    assert height.dtype == np.float32 and height.max() < 2e-4
+    np.testing.assert_allclose(channels["Z"], channels["P.Z"] - sensor.camera.position[2], atol=1e-7)
+    np.testing.assert_allclose(np.sqrt(sum(channels[f"N.{c}"] ** 2 for c in "XYZ")), 1, atol=1e-4)
+    assert channels["N.Z"].max() < 0
+    # Each seen point lies on the surface that the physics gave.
+    (ny, nx), (width, depth) = height.shape, sensor.gelpad.size
+    rows, columns = (channels["P.Y"] / depth + 0.5) * (ny - 1), (channels["P.X"] / width + 0.5) * (nx - 1)
+    assert np.abs(channels["P.Z"] - map_coordinates(height, [rows, columns], order=1)).max() < 2e-6
+
+
+def test_metrics_tell_time_contact_and_versions(folder: Path) -> None:
+    metrics = read_metrics(folder / "metrics.json")
+    for stage in ("physics", "surface", "optics"):
+        assert float(metrics[f"time.{stage}_ms"]) > 0
+    assert metrics["device"] == "cpu" and metrics["seed"] == 4 and metrics["mode"] == "rigid+raytrace-fast"
+    assert (metrics["image.width_px"], metrics["image.height_px"]) == SIZE
+    assert "versions.mitsuba" in metrics and float(metrics["wall_s"]) > 0
+    assert float(metrics["contact.max_indentation_mm"]) == pytest.approx(0.7, abs=0.1)
+    assert float(metrics["image.change_from_rest_mean_u8"]) > 2
+
+
+def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)
+    monkeypatch.chdir(tmp_path)  # shipped scenes are found from anywhere
+    # A process has one device, and the other tests of this one use the CPU.
+    assert "outputs=(" in snippet
+    names: dict[str, object] = {}
+    exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
+    frame = names["frame"]
+    assert isinstance(frame, TactileFrame)
+    assert frame.rgb is not None and frame.rgb.shape == (1, 240, 320, 3) and frame.rgb.dtype == np.uint8
+    assert frame.depth is not None and frame.depth.shape == (1, 240, 320) and frame.depth.dtype == np.float32
+    assert frame.force is not None and frame.force.shape == (1, 3)
