@@ -49,8 +49,8 @@ def test_300_fast_updates_hold_memory_flat(tracer: Build) -> None:
 
 
 @needs_proc
-def test_60_reference_updates_hold_memory_flat(tracer: Build) -> None:
-    assert growth_mb(tracer, 60, warm_up=15, integrator="reference", spp=1, resolution=(32, 24)) < 20
+def test_30_reference_updates_hold_memory_flat(tracer: Build) -> None:
+    assert growth_mb(tracer, 30, warm_up=10, integrator="reference", spp=1, resolution=(32, 24)) < 20
 
 
 @needs_proc
