@@ -1,0 +1,636 @@
+"""How fast is the ray tracer, and how far is it from converged? Error beside time, for ``fast`` and for path tracing, in one run.
+
+Every frame has a new surface, and everything from the height field to the 8-bit image counts:
+
+    python experiments/bench_optics.py --out runs/bench_optics                      # about 20 minutes on two cores
+    python experiments/bench_optics.py --out runs/bench_cuda --device cuda --parts speed,error
+
+docs/performance.md explains the figures. References are kept in DIR/references by content, so that an interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from raytac.errors import InputError, RaytacError
+from raytac.gel.surface import GelSurface
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.options import CommonOptions
+from raytac.sensor import TactileSensor
+from raytac.specs.sensor import SensorSpec
+
+PARTS = ("speed", "error", "peer", "stages", "memory", "first_image")
+SPP = (1, 4, 16, 64)
+"""Samples a pixel at which path tracing is measured."""
+BATCHES = {"cpu": {"320x240": (1, 8), "640x480": (1,)}, "cuda": {"320x240": (1, 16, 64, 256), "640x480": (1, 256)}}
+NOT_IN_REFERENCE = {"base.py", "bounce.py", "coat.py", "denoise.py", "fast.py", "raytrace.py", "response.py"}
+"""Files of raytac/optics on which a reference image (linear, path-traced) does not depend."""
+FAST_VARIANTS: dict[str, dict[str, Any]] = {"fast": {}, "fast_no_bounce": {"bounce": False}, "fast_4_rays": {"spp": 4}}
+
+CHILD = """
+import json, os, resource, sys, time
+start = time.perf_counter()
+import raytac
+imported = time.perf_counter()
+name, device, scene, updates, resolution = sys.argv[1:]
+sensor = raytac.TactileSensor(name, outputs=("rgb",), device=device, resolution=tuple(map(int, resolution.split("x"))))
+frame = sensor.press(scene)
+done = time.perf_counter()
+assert frame.rgb is not None and frame.rgb.max() > 0
+result = {"import_s": imported - start, "first_image_s": done - start}
+def resident_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
+if int(updates):
+    import numpy as np
+    from dataclasses import replace
+    rest, height = frame.surface.grid.rest.astype(np.float32), frame.surface.height
+    for k in range(-100, int(updates)):
+        if k == 0:
+            before = resident_mb()
+        sensor.update(replace(frame.surface, height=rest + (0.7 + 0.3 * (0.618 * k % 1)) * (height - rest)))
+    result |= {"before_mb": before, "after_mb": resident_mb()}
+print(json.dumps(result | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10}))
+"""
+"""A process of its own: from nothing to the first image, then updates with a surface that changes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Measure error and time of the optical modes."""
+
+    parts: str = ",".join(PARTS)
+    """What to measure, joined by commas: speed, error, peer, stages, memory, first_image."""
+    scenes: str = "sphere,coin,pins"
+    """Shipped press scenes or scene files, joined by commas, on which error and peers are measured."""
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+    spp: int = 1024
+    """Samples a pixel of the reference, without limit of depth; two independent halves give its noise."""
+    frames: int = 60
+    """Timed frames a figure (at least 40 for a median to quote)."""
+    quick: bool = False
+    """80x60, one scene, 16 samples, five frames: shows that all runs; its figures mean nothing."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all parts share; ``surfaces`` are presses of one environment on the grid of ``size``."""
+
+    args: Args
+    device: str
+    spec: SensorSpec
+    size: tuple[int, int]
+    surfaces: dict[str, GelSurface]
+    frames: int
+    spp: int
+    peer_spp: tuple[int, ...]
+    out: Path
+    built: dict[str, Any] = field(default_factory=dict)
+    """Ray tracers by their options (building one fits the case's light, which takes seconds), and the last child's result."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.size[0]}x{self.size[1]}"
+
+    @property
+    def key(self) -> str:
+        return f"{self.device}.{self.name}"
+
+    def tracer(self, size: tuple[int, int] | None = None, **options: Any) -> Any:
+        """Ray tracer of this size and device; path tracers light all LEDs in one pass, three channels, as a plain image needs."""
+        from raytac.optics.raytrace import RayTracer
+
+        key = repr((size, sorted(options.items())))
+        if key not in self.built:
+            spec = self.spec
+            if options.get("integrator") in ("path", "reference"):
+                leds = tuple(replace(led, layer="all") for led in spec.lights.leds)
+                spec = replace(spec, lights=replace(spec.lights, leds=leds))
+            self.built[key] = RayTracer(spec, resolution=size or self.size, device=self.device, seed=self.args.seed, **options)
+        return self.built[key]
+
+
+# ------------------------------------------------------------------------------------------------------------ building blocks
+
+
+def names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """Comma-joined names, each once. Raises InputError for none, or one that is not in ``choices``."""
+    found = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in found:
+        if choices is not None and name not in choices:
+            raise InputError(option, value=name, rule="must be known names joined by commas", choices=choices)
+    if not found:
+        raise InputError(option, value=text, rule="must name at least one", choices=choices or ())
+    return found
+
+
+def press_all(args: Args, scenes: Sequence[str], size: tuple[int, int]) -> tuple[SensorSpec, dict[str, GelSurface]]:
+    """Surface of each scene at its peak, on a grid whose pitch is that of a pixel (at most 0.1 mm)."""
+    sensor = TactileSensor(args.sensor, outputs=("height",), resolution=size, device="cpu", seed=args.seed)
+    return sensor.spec, {Path(scene).stem: sensor.press(scene).surface for scene in scenes}
+
+
+def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
+    """``count`` batches that take turns among ``surfaces``, each environment at 70 to 100 % of the indentation."""
+    batches = []
+    for k in range(count):
+        picks = [surfaces[(k * batch + b) % len(surfaces)] for b in range(batch)]
+        share = 0.7 + 0.3 * (0.618034 * (k * batch + np.arange(batch, dtype=np.float32)) % 1)
+        rest = picks[0].grid.rest.astype(np.float32)
+        height = rest + share[:, None, None].astype(np.float32) * (np.concatenate([s.height for s in picks]) - rest)
+        contact, centre = (np.concatenate([getattr(s, a) for s in picks]) for a in ("contact", "contact_centre"))
+        batches.append(GelSurface(picks[0].grid, height, contact, centre))
+    return batches
+
+
+def once(call: Callable[[Any], object], value: Any) -> float:
+    """Milliseconds of one call."""
+    start = time.perf_counter()
+    call(value)
+    return 1e3 * (time.perf_counter() - start)
+
+
+def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> np.ndarray:
+    """Milliseconds of ``frames`` warm calls with ``inputs`` in turn; each input is called once before, to warm up."""
+    for value in inputs:
+        call(value)
+    return np.array([once(call, inputs[k % len(inputs)]) for k in range(frames)])
+
+
+def kernels(call: Callable[[], object]) -> list[tuple[int, float]]:
+    """(width, milliseconds) of every kernel that ``call`` launches."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        call()
+        dr.sync_thread()
+        return [(entry["size"], entry["execution_time"]) for entry in dr.kernel_history()]
+
+
+def psnr(rmse_levels: float) -> float:
+    """PSNR [dB] of an 8-bit image from its RMSE [levels]; equal images count as a tenth of a level."""
+    return float(20 * np.log10(255 / max(rmse_levels, 0.1)))
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2)))
+
+
+def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) -> float:
+    """Samples a pixel at which path tracing has the error ``target``, at least the first of ``spp``.
+
+    Between the measured points log error is linear in log spp; beyond the last, error falls as spp^−1/2.
+    """
+    if target < errors[-1]:
+        return float(spp[-1] * (errors[-1] / target) ** 2)
+    falling = np.maximum.accumulate(-np.log(errors))
+    return float(np.exp(np.interp(-np.log(target), falling, np.log(spp))))
+
+
+def cost_at(spp: Sequence[int], ms: Sequence[float], wanted: float) -> float:
+    """Kernel time [ms] at ``wanted`` samples: linear between the measured points, proportional beyond the last."""
+    return float(ms[-1] * wanted / spp[-1]) if wanted > spp[-1] else float(np.interp(wanted, spp, ms))
+
+
+def path_trace(tracer: Any, surface: GelSurface, spp: int, seed: int) -> np.ndarray:
+    """Linear radiance (H, W, 3) from a path tracer of ``Bench.tracer``, with its vertex update and BVH rebuild."""
+    tracer.spp, tracer.seed = spp, seed
+    return tracer.render_layers(surface)["all"][0]
+
+
+def set_surface(tracer: Any, surface: GelSurface) -> None:
+    """Vertex update, normals and BVH rebuild alone."""
+    import drjit as dr
+
+    tracer.scene.set_surface(surface.height[0])
+    dr.sync_thread()
+
+
+class References:
+    """Two independent half-``spp`` images a scene, linear; kept in ``out/references`` under a hash of all that shapes them."""
+
+    def __init__(self, bench: Bench) -> None:
+        import raytac.optics
+
+        self.bench, self.folder = bench, bench.out / "references"
+        code = sorted(Path(raytac.optics.__file__).parent.glob("*.py"))
+        spec = replace(bench.spec, source=None, lights=replace(bench.spec.lights, source=None))
+        basis = [repr(spec), bench.name, str(bench.spp), str(bench.args.seed), *versions(("mitsuba", "drjit")).values()]
+        self._basis = "\n".join(basis).encode() + b"".join(p.read_bytes() for p in code if p.name not in NOT_IN_REFERENCE)
+
+    def halves(self, scene: str) -> np.ndarray:
+        """(2, H, W, 3) float32."""
+        surface = self.bench.surfaces[scene]
+        path = self.folder / f"{scene}-{hashlib.sha256(self._basis + surface.height.tobytes()).hexdigest()[:20]}.npz"
+        if path.is_file():
+            return np.load(path)["halves"]
+        tracer, seed, half = (
+            self.bench.tracer(integrator="reference", progress=True),
+            2 * self.bench.args.seed,
+            self.bench.spp // 2,
+        )
+        print(f"reference of {scene}: 2 x {half} spp")
+        halves = np.stack([path_trace(tracer, surface, half, seed + k) for k in (0, 1)])
+        self.folder.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial.npz")
+        np.savez(partial, halves=halves)
+        os.replace(partial, path)
+        return halves
+
+    def linear(self, scene: str) -> np.ndarray:
+        return self.halves(scene).mean(axis=0)
+
+
+# ------------------------------------------------------------------------------------------------------------ parts
+
+
+def speed(bench: Bench) -> dict[str, Metric]:
+    """``fast`` over moving surfaces: NumPy in and out, and from heights on the device to an image on the device."""
+    import drjit as dr
+
+    plan = {bench.name: (1, 2)} if bench.args.quick else BATCHES[bench.device]
+    metrics: dict[str, Metric] = {}
+    for name, batches in plan.items():
+        width, height = (int(n) for n in name.split("x"))
+        surfaces = bench.surfaces
+        if (width, height) != bench.size:
+            surfaces = press_all(bench.args, names(bench.args.scenes, "scenes"), (width, height))[1]
+        tracer = bench.tracer(None if (width, height) == bench.size else (width, height))
+        for batch in tqdm(batches, desc=f"speed {name}", leave=False, disable=None):
+            inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
+
+            def on_device(heights: Any, tracer: Any = tracer) -> None:
+                dr.eval(tracer.render_device(heights)["rgb"])
+                dr.sync_thread()
+
+            host = timed(tracer.render, inputs, bench.frames)
+            uploaded = [tracer.mi.Float(s.height.astype(np.float32).ravel()) for s in inputs]
+            device = timed(on_device, uploaded, bench.frames)
+            key = f"fast.{bench.device}.{name}"
+            for part, ms in (("", host), ("device_", device)):
+                median = float(np.median(ms))
+                metrics[f"{key}.batch{batch}.{part}fps"] = 1e3 * batch / median
+                metrics[f"{key}.batch{batch}.{part}call_ms"] = median
+                metrics[f"{key}.batch{batch}.{part}call_ms_p90"] = float(np.percentile(ms, 90))
+            if batch == 1:
+                metrics |= {f"{key}.fps": 1e3 / float(np.median(host)), f"{key}.ms": float(np.median(host))}
+                metrics[f"{key}.ms_p90"] = float(np.percentile(host, 90))
+    return metrics
+
+
+def contact_box(tracer: Any, surface: GelSurface) -> tuple[slice, slice]:
+    """Rows and columns [px] of the box round the contact in the image; the whole image if nothing touches."""
+    iy, ix = np.nonzero(surface.contact[0])
+    points = np.stack([surface.grid.x[ix], surface.grid.y[iy], surface.height[0, iy, ix]], axis=-1)
+    limits = np.array(tracer.camera.resolution) - 1
+    pixels = np.clip(np.floor(tracer.camera.project(points)).astype(int), 0, limits) if len(ix) else np.array([[0, 0], limits])
+    low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def linear_image(tracer: Any, surface: GelSurface) -> np.ndarray:
+    """Sum of the layers of ``fast``, (H, W, 3)."""
+    return np.sum(list(tracer.render_layers(surface).values()), axis=0)[0]
+
+
+def error(bench: Bench, references: References) -> dict[str, Metric]:
+    """8-bit image of ``fast`` and its variants against the reference, over the image and in the contact's bounding box."""
+    metrics: dict[str, Metric] = {"reference.spp": bench.spp}
+    inputs = moving(list(bench.surfaces.values()), 1, 6)
+    variants = {"fast": FAST_VARIANTS["fast"]} if bench.args.quick else FAST_VARIANTS
+    for variant, options in tqdm(variants.items(), desc="error", leave=False, disable=None):
+        tracer = bench.tracer(**options)
+        encode, key = tracer.response.encode_numpy, f"{variant}.{bench.key}"
+        for scene, surface in bench.surfaces.items():
+            truth, image = encode(references.linear(scene)), tracer.render(surface).rgb[0]
+            box = contact_box(tracer, surface)
+            metrics |= {
+                f"{key}.psnr_db.{scene}": psnr(rmse(image, truth)),
+                f"{key}.mae_levels.{scene}": float(np.abs(image.astype(float) - truth).mean()),
+                f"{key}.contact_psnr_db.{scene}": psnr(rmse(image[box], truth[box])),
+                f"{key}.contact_mae_levels.{scene}": float(np.abs(image[box].astype(float) - truth[box]).mean()),
+            }
+            if variant == "fast":
+                # The halves are independent: half their difference has the variance of their mean.
+                noise = rmse(*(encode(half) for half in references.halves(scene))) / 2
+                metrics |= {f"reference.noise_levels.{scene}": noise, f"reference.noise_psnr_db.{scene}": psnr(noise)}
+                metrics[f"reference.mean_level.{scene}"] = float(truth.mean())
+        metrics[f"{key}.psnr_db"] = min(float(metrics[f"{key}.psnr_db.{scene}"]) for scene in bench.surfaces)
+        if variant != "fast":
+            metrics[f"{key}.ms"] = float(np.median(timed(tracer.render, inputs, bench.frames)))
+    return metrics
+
+
+@dataclass(frozen=True)
+class Row:
+    """Path tracing at one number of samples: kernels alone and whole frame [ms], RMSE in levels and in linear light."""
+
+    kernel_ms: float
+    ms: float
+    rmse_levels: float
+    rmse_linear: float
+
+
+def rebuild_ms(tracer: Any, surface: GelSurface, frames: int) -> float:
+    return float(np.median(timed(functools.partial(set_surface, tracer), moving([surface], 1, 3), frames)))
+
+
+def trace_rows(bench: Bench, tracer: Any, surface: GelSurface, linear: np.ndarray) -> list[Row]:
+    """One row for each of ``peer_spp``: times are medians, errors root mean squares over independent images."""
+    encode = tracer.response.encode_numpy
+    truth, rows = encode(linear), []
+    path_trace(tracer, surface, bench.peer_spp[0], 0)
+    vertices = sum(ms for _, ms in kernels(lambda: set_surface(tracer, surface)))
+    for spp in bench.peer_spp:
+        # Seeds apart from those of the reference images: shared samples would share their error.
+        seeds = [100_000 + 1_000 * bench.args.seed + k for k in range(3)]
+        images, launched, whole = [], [], []
+
+        def frame(seed: int, spp: int = spp, images: list[np.ndarray] = images) -> None:
+            images.append(path_trace(tracer, surface, spp, seed))
+            encode(images[-1])
+
+        for seed in seeds:  # the first may compile; a median of three leaves it out
+            start = time.perf_counter()
+            launched.append(kernels(functools.partial(frame, seed)))
+            whole.append(1e3 * (time.perf_counter() - start))
+        off = [(rmse(encode(image), truth) ** 2, rmse(image, linear) ** 2) for image in images]
+        levels, light = np.sqrt(np.mean(off, axis=0))
+        kernel_ms = statistics.median(sum(ms for _, ms in frame_kernels) for frame_kernels in launched) - vertices
+        rows.append(Row(kernel_ms, statistics.median(whole), float(levels), float(light)))
+    return rows
+
+
+def peer(bench: Bench, references: References) -> dict[str, Metric]:
+    """What path tracing needs to reach the error of ``fast``: Mitsuba's ``path`` and our ``reference``, same surfaces, same run.
+
+    Its cost is the least one could pay: vertex update with BVH rebuild, and kernels, without Python, transfer or response.
+    The error of ``fast`` is taken with the reference's noise in it, which favours the peer.
+    """
+    fast, metrics, mine = bench.tracer(), {}, {}
+    for scene, surface in bench.surfaces.items():
+        linear = references.linear(scene)
+        ms = float(np.median(timed(fast.render, moving([surface], 1, 6), bench.frames)))
+        levels = rmse(fast.render(surface).rgb[0], fast.response.encode_numpy(linear))
+        mine[scene] = Row(ms, ms, levels, rmse(linear_image(fast, surface), linear))
+    metrics |= combined(f"fast.{bench.key}.peer", list(mine.values()))
+    for kind in ("path", "reference"):
+        tracer = bench.tracer(integrator=kind, progress=kind == "reference")
+        rows_of: list[list[Row]] = []
+        ratios: dict[str, list[float]] = {"": [], "_linear": [], "_without_rebuild": []}
+        for scene, surface in tqdm(bench.surfaces.items(), desc=f"peer {kind}", leave=False, disable=None):
+            rows = trace_rows(bench, tracer, surface, references.linear(scene))
+            rebuild = rebuild_ms(tracer, surface, max(3, bench.frames // 6))
+            rows_of.append(rows)
+            needed = spp_for_error(bench.peer_spp, [row.rmse_levels for row in rows], mine[scene].rmse_levels)
+            needed_linear = spp_for_error(bench.peer_spp, [row.rmse_linear for row in rows], mine[scene].rmse_linear)
+            cost, cost_linear = (cost_at(bench.peer_spp, [row.kernel_ms for row in rows], n) for n in (needed, needed_linear))
+            for unit, ms in (("", rebuild + cost), ("_linear", rebuild + cost_linear), ("_without_rebuild", cost)):
+                ratios[unit].append(ms / mine[scene].ms)
+            metrics[f"{kind}.{bench.key}.spp_for_equal_error.{scene}"] = needed
+            metrics[f"fast.{bench.device}.speedup_vs_{kind}_equal_error.{scene}"] = ratios[""][-1]
+        for k, spp in enumerate(bench.peer_spp):
+            metrics |= combined(f"{kind}.{bench.key}.spp{spp}", [rows[k] for rows in rows_of])
+        metrics |= {f"fast.{bench.device}.speedup_vs_{kind}_equal_error{unit}": min(values) for unit, values in ratios.items()}
+    return metrics
+
+
+def combined(key: str, rows: Sequence[Row]) -> dict[str, Metric]:
+    """Over scenes: medians of times, root mean squares of errors."""
+    metrics: dict[str, Metric] = {
+        f"{key}.{name}": statistics.median(getattr(row, name) for row in rows) for name in ("kernel_ms", "ms")
+    }
+    for name in ("rmse_levels", "rmse_linear"):
+        metrics[f"{key}.{name}"] = float(np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows])))
+    return metrics
+
+
+def stages(bench: Bench) -> dict[str, Metric]:
+    """Where a frame of ``fast`` goes, by leaving parts out and from its kernels; and what a rebuilt BVH would cost instead."""
+    import drjit as dr
+
+    inputs = moving(list(bench.surfaces.values()), 1, 6)
+    tracers = {"whole": bench.tracer(), "direct": bench.tracer(bounce=False), "bare": bench.tracer(bounce=False, shadows=False)}
+    mi, pixels = tracers["whole"].mi, bench.size[0] * bench.size[1]
+    timings: dict[str, list[float]] = {}
+
+    def note(name: str, ms: float) -> None:
+        timings.setdefault(name, []).append(ms)
+
+    def upload(surface: GelSurface) -> None:
+        dr.eval(mi.Float(surface.height.astype(np.float32).ravel()))
+        dr.sync_thread()
+
+    for tracer in tracers.values():
+        timed(tracer.render, inputs, 0)
+    set_surface(tracers["whole"], inputs[0])
+    for k in range(bench.frames):  # in turn, so that a busy machine slows all alike
+        surface = inputs[k % len(inputs)]
+        for name, tracer in tracers.items():
+            note(name, once(tracer.render, surface))
+        launched = kernels(lambda surface=surface: tracers["bare"].render(surface))
+        first = next((i for i, (width, _) in enumerate(launched) if width == pixels), len(launched))
+        note("coat", sum(ms for _, ms in launched[:first]))
+        note("shade", sum(ms for _, ms in launched[first:]))
+        note("kernels", sum(ms for _, ms in kernels(lambda surface=surface: tracers["whole"].render(surface))))
+        note("upload", once(upload, surface))
+        image = mi.UInt8(dr.arange(mi.UInt32, 3 * pixels) + k)
+        dr.eval(image)
+        dr.sync_thread()
+        note("read_back", once(np.array, image))
+        if k < max(5, bench.frames // 4):
+            note("rebuild", once(lambda s: set_surface(tracers["whole"], s), surface))
+    ms = {name: statistics.median(values) for name, values in timings.items()}
+    key = f"fast.{bench.key}.stage"
+    return {
+        f"{key}.whole_ms": ms["whole"],
+        f"{key}.coat_ms": ms["coat"],
+        f"{key}.bounce_ms": ms["whole"] - ms["direct"],
+        f"{key}.shadows_ms": ms["direct"] - ms["bare"],
+        f"{key}.shade_ms": ms["shade"],
+        f"{key}.upload_ms": ms["upload"],
+        f"{key}.read_back_ms": ms["read_back"],
+        f"{key}.outside_kernels_ms": ms["whole"] - ms["kernels"],
+        f"bvh.{bench.device}.rebuild_ms": ms["rebuild"],
+        f"bvh.{bench.device}.triangles": 2 * (inputs[0].height.shape[1] - 1) * (inputs[0].height.shape[2] - 1),
+    }
+
+
+def child(bench: Bench, updates: int) -> dict[str, float]:
+    """Run ``CHILD`` in a process of its own; adds ``process_s``, all of its time. With ``quick``, one run serves all."""
+    if bench.args.quick and "child" in bench.built:
+        return bench.built["child"]
+    scene = names(bench.args.scenes, "scenes")[0]
+    start = time.perf_counter()
+    command = [sys.executable, "-c", CHILD, bench.args.sensor, bench.device, scene, str(updates), bench.name]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RaytacError(f"the process that measures the first image failed: {done.stderr.strip()[-500:]}")
+    bench.built["child"] = json.loads(done.stdout.splitlines()[-1]) | {"process_s": time.perf_counter() - start}
+    return bench.built["child"]
+
+
+def memory(bench: Bench) -> dict[str, Metric]:
+    """Resident memory over many updates of a sensor, in a process of its own."""
+    updates = 50 if bench.args.quick else 2000
+    result = child(bench, updates)
+    return {
+        f"memory.growth_mb_{updates}": result["after_mb"] - result["before_mb"],
+        "memory.resident_mb": result["after_mb"],
+        "memory.peak_mb": result["peak_mb"],
+    }
+
+
+def first_image(bench: Bench) -> dict[str, Metric]:
+    """From nothing to the first image of a press, caches warm: the first process warms them and does not count."""
+    runs = [child(bench, 0) for _ in range(1 if bench.args.quick else 4)][-3:]
+    return {
+        "first_image_s": statistics.median(run["first_image_s"] for run in runs),
+        "first_image_process_s": statistics.median(run["process_s"] for run in runs),
+        "import_raytac_s": statistics.median(run["import_s"] for run in runs),
+        "first_image_peak_mb": max(run["peak_mb"] for run in runs),
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------ what is shown
+
+
+def machine() -> dict[str, Metric]:
+    """CPU, cores, load and GPU, as far as the system tells."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        cpu = next(
+            (line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), cpu
+        )
+    found: dict[str, Metric] = {
+        "machine.cpu": cpu,
+        "machine.cores": os.cpu_count() or 0,
+        "machine.load_at_start": os.getloadavg()[0],
+    }
+    try:
+        ask = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        gpu = subprocess.run(ask, capture_output=True, text=True, check=False, timeout=20).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        gpu = ""
+    return found | ({"machine.gpu": gpu.splitlines()[0]} if gpu else {})
+
+
+def as_text(metrics: dict[str, Metric], bench: Bench) -> str:
+    """Time beside error, one line a mode, then the figures that have a bound to keep."""
+    base = bench.key
+    modes = [("fast", f"fast.{base}.peer")] + [
+        (f"{k} {n} spp", f"{k}.{base}.spp{n}") for k in ("path", "reference") for n in bench.peer_spp
+    ]
+    lines = [f"{'mode':<20}{'ms a frame':>12}{'kernels ms':>12}{'RMSE levels':>13}{'PSNR dB':>9}"]
+    for label, key in modes:
+        if f"{key}.ms" in metrics:
+            ms, kernel, off = (float(metrics[f"{key}.{column}"]) for column in ("ms", "kernel_ms", "rmse_levels"))
+            lines.append(f"{label:<20}{ms:>12.2f}{kernel:>12.2f}{off:>13.3f}{psnr(off):>9.1f}")
+    lines = lines if len(lines) > 1 else []
+    others = {k: v for k, v in metrics.items() if not k.startswith(("versions.", "path.", "reference."))}
+    return "\n".join(
+        lines + [f"{key} = {value:.4g}" if isinstance(value, float) else f"{key} = {value}" for key, value in others.items()]
+    )
+
+
+def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
+    """Error against time of a frame; colours of Okabe and Ito, told apart by marker and line too."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    base = bench.key
+    style: dict[Any, Any] = {
+        "font.size": 8,
+        "axes.linewidth": 0.6,
+        "axes.labelsize": 8,
+        "legend.fontsize": 7,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+    }
+    with plt.rc_context(style):
+        figure, axes = plt.subplots(figsize=(3.5, 2.7), layout="constrained")
+        lines = (("path", "Mitsuba path", "#D55E00", "s", "--"), ("reference", "raytac reference", "#009E73", "^", "-."))
+        for kind, label, colour, marker, dash in lines:
+            ms = [float(metrics[f"{kind}.{base}.spp{spp}.ms"]) for spp in bench.peer_spp]
+            off = [float(metrics[f"{kind}.{base}.spp{spp}.rmse_levels"]) for spp in bench.peer_spp]
+            axes.plot(ms, off, color=colour, marker=marker, linestyle=dash, linewidth=1.2, markersize=4, label=label)
+            for x, y, spp in zip(ms, off, bench.peer_spp, strict=True):
+                axes.annotate(f"{spp}", (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, color=colour)
+        fast = float(metrics[f"fast.{base}.peer.ms"]), float(metrics[f"fast.{base}.peer.rmse_levels"])
+        axes.plot(*fast, color="#0072B2", marker="o", markersize=6, linestyle="none", label="raytac fast")
+        axes.axhline(255 / 100, color="0.5", linewidth=0.8, linestyle=":")
+        axes.annotate("40 dB", (1, 255 / 100), xycoords=("axes fraction", "data"), xytext=(-3, 2), textcoords="offset points",
+                      ha="right", fontsize=6, color="0.4")  # fmt: skip
+        axes.set(xscale="log", yscale="log", xlabel=f"time of a frame, {bench.name} [ms]", ylabel="RMSE [levels of 255]")
+        axes.grid(True, which="both", linewidth=0.3, color="0.88")
+        axes.set_axisbelow(True)
+        axes.legend(frameon=False)
+        figure.savefig(path, dpi=300)
+        plt.close(figure)
+
+
+def main(args: Args) -> None:
+    start = time.perf_counter()
+    parts = names(args.parts, "parts", PARTS)
+    scenes = names(args.scenes, "scenes")
+    if args.spp < 2 or args.frames < 1:
+        raise InputError("spp, frames", value=(args.spp, args.frames), rule="must be at least 2 and 1")
+    out = args.out if args.out is not None else Path("runs") / "bench_optics"
+    from raytac.optics.variant import load_mitsuba
+
+    device = load_mitsuba(args.device)[1]
+    size = (80, 60) if args.quick else (320, 240)
+    spec, surfaces = press_all(args, scenes[:1] if args.quick else scenes, size)
+    frames, spp, peer_spp = (5, 16, SPP[:2]) if args.quick else (args.frames, args.spp, SPP)
+    bench = Bench(args, device, spec, size, surfaces, frames, spp, peer_spp, out)
+    references = References(bench)
+    metrics: dict[str, Metric] = {"experiment": "bench_optics", "device": device, "seed": args.seed, **versions(), **machine()}
+    metrics |= {"frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
+    jobs: dict[str, Callable[[], dict[str, Metric]]] = {
+        "speed": lambda: speed(bench),
+        "error": lambda: error(bench, references),
+        "peer": lambda: peer(bench, references),
+        "stages": lambda: stages(bench),
+        "memory": lambda: memory(bench),
+        "first_image": lambda: first_image(bench),
+    }
+    with result_folder(out) as folder:
+        for part in parts:
+            began = time.perf_counter()
+            metrics |= jobs[part]()
+            metrics[f"wall_s.{part}"] = time.perf_counter() - began
+            print(f"{part}: {metrics[f'wall_s.{part}']:.1f} s")
+        if "peer" in parts:
+            draw(metrics, bench, folder / "pareto.png")
+        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
+        write_metrics(folder / "metrics.json", metrics)
+    print(as_text(metrics, bench))
+    print(f"{out / 'metrics.json'}" + (f", {out / 'pareto.png'}" if "peer" in parts else ""))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except RaytacError as problem:
+        sys.exit(f"error: {problem}")
