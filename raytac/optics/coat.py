@@ -18,7 +18,10 @@ from raytac.gel.surface import PadGrid
 __all__ = ["CoatField", "CoatLayout"]
 
 TILE = 1.0e-3
-"""Edge of a tile of the bounds map [m]; three tiles reach farther than any ray travels sideways inside a 4 mm pad."""
+"""Edge of a tile of the bounds map [m]. The bounds hold one edge around a place: a camera ray of slope t may be this over t above or
+below the height where its tile is looked up, 2.8 mm for the Mini's steepest ray."""
+LOOK_UP_Z = -1.0e-3
+"""Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class CoatField:
         """
         mi, g = self.mi, self.layout
         ox, oy, oz = origin
-        tile = self.tile(env, ox - tx * oz, oy - ty * oz)
+        tile = self.tile(env, ox + (LOOK_UP_Z - oz) * tx, oy + (LOOK_UP_Z - oz) * ty)
         lo, hi = dr.gather(mi.Float, self.lowest, tile), dr.gather(mi.Float, self.highest, tile)
         lo, hi = lo - 1e-6, hi + 1e-6
         steps = dr.ceil((hi - lo) * dr.sqrt(tx * tx + ty * ty) / min(g.dx, g.dy)) + 1

@@ -14,7 +14,9 @@ PLUGIN = "raytac_led"
 
 
 def register(mi: Any) -> None:
-    """Register the plugin ``raytac_led`` for the variant that is active in ``mi``; parameters ``radiance`` (RGB) and ``lobe``."""
+    """Register the plugin ``raytac_led`` for the variant that is active in ``mi``, once; parameters ``radiance`` (RGB) and ``lobe``."""
+    if getattr(mi, "raytac_led_variant", None) == mi.variant():
+        return
     import drjit as dr
 
     class LobeEmitter(mi.Emitter):
@@ -59,3 +61,4 @@ def register(mi: Any) -> None:
             return f"RaytacLed[radiance={self.radiance}, exponent={self.exponent}]"
 
     mi.register_emitter(PLUGIN, LobeEmitter)
+    mi.raytac_led_variant = mi.variant()

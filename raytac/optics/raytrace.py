@@ -45,6 +45,11 @@ def total(layers: dict[str, np.ndarray]) -> np.ndarray:
     return np.asarray(np.sum(np.stack(list(layers.values())), axis=0, dtype=np.float32))
 
 
+def image_seed(seed: int, env: int) -> int:
+    """Seed of environment ``env``: ``seed`` itself for the first, unrelated streams for the others."""
+    return (seed + env * 0x9E3779B1) & 0xFFFFFFFF
+
+
 class RayTracer:
     """Ray tracing with Mitsuba 3 and Dr.Jit; fulfils ``raytac.optics.base.OpticalMode``."""
 
@@ -85,7 +90,7 @@ class RayTracer:
             max_depth: sampled integrators: number of reflections, 1 is direct light only, −1 has no limit.
             flat_field: real image of the untouched sensor, (H, W, 3) uint8 at ``resolution``: the image is then
                 flat_field × rendered / rendered at rest, in linear light.
-            denoise: run the Open Image Denoise filter on the layers of the sampled integrators.
+            denoise: filter the layers of the sampled integrators (OptiX on CUDA, Open Image Denoise on the CPU).
             progress: show a progress bar for sampled images.
 
         Raises:
@@ -99,13 +104,19 @@ class RayTracer:
         for name in outputs:
             if name not in OUTPUTS:
                 raise InputError("outputs", value=name, rule="must be an optical output", choices=OUTPUTS)
+        for name, value, lowest in (("spp", spp, 1), ("led_points", led_points, 1), ("max_depth", max_depth, -1)):
+            if value is not None and (int(value) != value or value < lowest or (name == "max_depth" and value == 0)):
+                rule = "must be a whole number >= 1" + (", or -1 for no limit" if name == "max_depth" else "")
+                raise InputError(name, value=value, rule=rule)
+        if int(seed) != seed or not 0 <= seed < 2**32:
+            raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
+        if resolution is not None and (len(resolution) != 2 or min(resolution) < 1):
+            raise InputError("resolution", value=resolution, rule="must be (width, height), each >= 1 pixel")
         self.rays = round(np.sqrt(spp or 1))
         if integrator == "fast" and self.rays**2 != (spp or 1):
             raise InputError("spp", value=spp, rule="the fast integrator takes a square number of rays a pixel", choices=(1, 4, 9, 16))
         if integrator == "fast" and denoise:
             raise InputError("denoise", value=denoise, rule="the fast integrator has no noise", choices=(False,))
-        if led_points < 1:
-            raise InputError("led_points", value=led_points, rule="must be at least 1")
         self.mi, self.device = load_mitsuba(device)
         self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
         self.label = f"raytrace-{integrator}" + ("-denoised" if denoise else "")
@@ -138,30 +149,33 @@ class RayTracer:
     def _prepare(self, grid: PadGrid) -> None:
         """Build scene, layout and fields for a pad grid; done at the first frame and kept."""
         if self._grid is not None:
-            if grid is not self._grid and not (np.array_equal(grid.x, self._grid.x) and np.array_equal(grid.y, self._grid.y)):
-                raise InputError("surface.grid", value=grid.shape, rule=f"one ray tracer renders one grid, {self._grid.shape} here")
+            same = all(np.array_equal(getattr(grid, name), getattr(self._grid, name)) for name in ("x", "y", "rest"))
+            if grid is not self._grid and not same:
+                rule = f"one ray tracer renders one grid and rest surface, the first that it was given, {self._grid.shape} here"
+                raise InputError("surface.grid", value=grid.shape, rule=rule)
             return
         self._check_view(grid)
         mi = self.mi
         self.layout = CoatLayout.from_grid(grid)
         self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
-        needs_scene = self.integrator != "fast" or self.bounce
+        # Only what the outputs need: normals and depth take camera rays on the height field alone.
+        sampled = self.integrator != "fast"
+        needs_scene = self._lit and (sampled or self.bounce)
         self.scene = SensorScene(mi, self.sensor, grid, glass=self.integrator == "path") if needs_scene else None
         self._bounce = None
-        if self.integrator == "fast" and self.bounce and self.scene is not None:
+        if not sampled and self.scene is not None:
             case = CaseLight.fit(self.scene, self._scene_lamps, self.groups, self.seed)
             self._bounce = BounceField.build(mi, self.layout, case)
-        if self.integrator != "fast" and self.scene is not None:
+        if sampled and self.scene is not None:
             kind = ReferenceIntegrator if self.integrator == "reference" else StockPathIntegrator
             self._sampled = kind(self.scene, self.camera, max_depth=self.max_depth, progress=self.progress)
-        self._grid = grid
-        if self._flat_field is not None:
-            still = np.zeros((1, *grid.shape), bool)
-            rest = GelSurface(grid, grid.rest[None].astype(np.float32), still, np.full((1, 2), np.nan))
-            self.response.set_flat_field(self._flat_field, total(self.render_layers(rest))[0])
-        self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
         # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
         self._frozen: dict[tuple[str, int], Any] = {}
+        if self._flat_field is not None and self._lit:
+            rest = grid.rest[None].astype(np.float32)
+            self.response.set_flat_field(self._flat_field, total(self._layers(rest))[0])
+        self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
+        self._grid = grid
 
     def _check_view(self, grid: PadGrid) -> None:
         # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
@@ -176,34 +190,75 @@ class RayTracer:
 
     # ---------------------------------------------------------------- images
 
+    @property
+    def _lit(self) -> bool:
+        """Whether any output needs light."""
+        return bool({"rgb", "layers"} & set(self.outputs))
+
     def render(self, surface: GelSurface) -> OpticsImages:
-        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes."""
-        self._prepare(surface.grid)
+        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
+
+        An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
+
+        Raises:
+            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, or a second grid.
+        """
+        heights, failed = self._checked(surface)
         width, height = self.camera.resolution
-        shape = (surface.batch, height, width)
-        if self.integrator == "fast":
-            device = self.render_device(self._upload(surface))
-            linear, u8 = device["layers"], device["rgb"]
-            layers = self._to_numpy_layers(linear, shape) if "layers" in self.outputs else None
-            rgb = np.array(u8).reshape(*shape, 3) if "rgb" in self.outputs else None
-        else:
-            by_layer = self.render_layers(surface)
+        shape = (len(heights), height, width)
+        rgb, layers = None, None
+        if self._lit and self.integrator == "fast":
+            device = self.render_device(self._upload(heights))
+            layers = self._to_numpy_layers(device["layers"], shape) if "layers" in self.outputs else None
+            rgb = np.array(device["rgb"]).reshape(*shape, 3) if "rgb" in self.outputs else None
+        elif self._lit:
+            by_layer = self._layers(heights)
             layers = by_layer if "layers" in self.outputs else None
             rgb = self.response.encode_numpy(total(by_layer)) if "rgb" in self.outputs else None
-        aov = self._geometry(surface, shape) if {"normals", "depth"} & set(self.outputs) else {}
-        return OpticsImages(rgb=rgb, layers=layers, **aov)
+        images = {"rgb": rgb} if rgb is not None else {}
+        if {"normals", "depth"} & set(self.outputs):
+            images |= self._geometry(surface, heights, shape)
+        if failed.any():
+            for image in (*images.values(), *(layers or {}).values()):
+                image[failed] = np.nan if image.dtype.kind == "f" else 0
+        return OpticsImages(layers=layers, **images)
 
     def render_layers(self, surface: GelSurface) -> dict[str, np.ndarray]:
-        """Linear radiance by layer, each (B, H, W, 3) float32, from either integrator."""
+        """Linear radiance by layer, each (B, H, W, 3) float32, from any integrator; whatever ``outputs`` say about rgb."""
+        if not self._lit:
+            raise InputError("outputs", value=self.outputs, rule="layers need a tracer with an output of light", choices=("rgb", "layers"))
+        heights, failed = self._checked(surface)
+        layers = self._layers(heights)
+        for image in layers.values():
+            image[failed] = np.nan
+        return layers
+
+    def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
+        """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
+        expected = surface.grid.shape
+        for name, array in (("height", surface.height), ("contact", surface.contact)):
+            if array.ndim != 3 or array.shape[1:] != expected or len(array) < 1 or len(array) != len(surface.height):
+                rule = f"must have shape (B, {expected[0]}, {expected[1]}) with B >= 1, as its grid and height say"
+                raise InputError(f"surface.{name}", value=array.shape, rule=rule)
         self._prepare(surface.grid)
+        heights = np.ascontiguousarray(surface.height, dtype=np.float32)
+        failed = np.array([not np.isfinite(one).all() for one in heights])
+        # A NaN would become an index into device memory.
+        if failed.any():
+            heights = heights.copy()
+            heights[failed] = surface.grid.rest
+        return heights, failed
+
+    def _layers(self, heights: np.ndarray) -> dict[str, np.ndarray]:
         width, height = self.camera.resolution
-        shape = (surface.batch, height, width)
         if self.integrator == "fast":
-            return self._to_numpy_layers(self._linear(self._upload(surface), FastInputs(self._rest, self.lamps, self._bounce, [])), shape)
+            inputs = FastInputs(self._rest, self.lamps, self._bounce, [])
+            return self._to_numpy_layers(self._linear(self._upload(heights), inputs), (len(heights), height, width))
+        assert self.scene is not None
         images = []
-        for b in range(surface.batch):
-            self.scene.set_surface(surface.height[b])
-            images.append(self._sampled.render(self._scene_lamps, self.groups, self.spp, self.seed + b))
+        for b, one in enumerate(heights):
+            self.scene.set_surface(one)
+            images.append(self._sampled.render(self._scene_lamps, self.groups, self.spp, image_seed(self.seed, b)))
         stack = np.stack(images, axis=1)
         if self._denoiser is not None:
             stack = np.stack([[self._denoiser(image) for image in layer] for layer in stack])
@@ -214,6 +269,11 @@ class RayTracer:
 
         Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
+        if self._grid is None:
+            raise InputError("heights", value=type(heights).__name__, rule="render a GelSurface first: it tells the grid")
+        nodes = self.layout.nx * self.layout.ny
+        if dr.width(heights) == 0 or dr.width(heights) % nodes:
+            raise InputError("heights", value=dr.width(heights), rule=f"must hold a whole number of grids of {nodes} nodes")
         rgb, layers = self._recorded(self._fast_frame, heights)
         return {"rgb": rgb, "layers": layers}
 
@@ -282,12 +342,12 @@ class RayTracer:
         seen = see(self.mi, field, self.camera, dr.width(heights) // (self.layout.nx * self.layout.ny))
         return seen.p, seen.n
 
-    def _upload(self, surface: GelSurface) -> Any:
-        return self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+    def _upload(self, heights: np.ndarray) -> Any:
+        return self.mi.Float(heights.ravel())
 
-    def _geometry(self, surface: GelSurface, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    def _geometry(self, surface: GelSurface, heights: np.ndarray, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
         """Normals, positions, camera depth and contact seen through the pixel centres; only what the outputs name."""
-        seen_p, seen_n = self._recorded(self._seen, self._upload(surface))
+        seen_p, seen_n = self._recorded(self._seen, self._upload(heights))
         p = np.array(seen_p).T.reshape(*shape, 3)
         grid = surface.grid
         ix = np.clip(np.rint((p[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)

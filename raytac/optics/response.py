@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import ResponseSpec
 
@@ -28,9 +29,17 @@ class Response:
         self.black = np.asarray(spec.black_level, dtype=np.float32)
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
-        """From now on turn the radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8), in linear light."""
+        """From now on turn the radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8), in linear light.
+
+        Raises:
+            InputError: a pixel that no light reaches at rest.
+        """
+        dark = int((at_rest <= 0).sum())
+        if dark:
+            rule = f"{dark} of {at_rest.size} values rendered at rest are dark, so no gain makes them bright"
+            raise InputError("flat_field", value=background.shape, rule=rule)
         target = (background.astype(np.float32) / 255) ** self.spec.gamma - self.black
-        self.scale = (target / np.maximum(at_rest, 1e-9)).astype(np.float32)
+        self.scale = (target / at_rest).astype(np.float32)
 
     def encode(self, mi: Any, linear: list[Any], scale: list[Any]) -> Any:
         """8-bit values, interleaved RGB (N·3), of three device arrays of B·H·W radiances; ``scale`` as ``device_scale`` gives it."""

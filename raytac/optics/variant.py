@@ -40,7 +40,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
             mi.set_variant(variant)
         except (ImportError, RuntimeError) as error:
             raise BackendError(f"Mitsuba variant {variant} does not start: {error}; run `raytac doctor`") from error
-        from raytac.optics import led
+    from raytac.optics import led
 
-        led.register(mi)
+    led.register(mi)
     return mi, name

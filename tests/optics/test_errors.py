@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from raytac.errors import BackendError, InputError
+from raytac.gel.surface import GelSurface
 from raytac.optics.raytrace import RayTracer
 from raytac.optics.variant import load_mitsuba
 from tests.optics.conftest import Build
-from tests.optics.scenes import RESOLUTION, at_rest, grid_of, led, like_a_mini, sensor
+from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, led, like_a_mini, sensor, surface
 
 
 @pytest.mark.parametrize(
@@ -22,7 +23,11 @@ from tests.optics.scenes import RESOLUTION, at_rest, grid_of, led, like_a_mini, 
         ({"layers": "color"}, r"layers = 'color'.*did you mean 'colour'.*colour, led"),
         ({"outputs": ("rgb", "normal")}, r"outputs = 'normal'.*did you mean 'normals'.*rgb, layers, normals, depth"),
         ({"spp": 3}, r"spp = 3.*square.*1, 4, 9, 16"),
-        ({"led_points": 0}, r"led_points = 0.*at least 1"),
+        ({"led_points": 0}, r"led_points = 0.*>= 1"),
+        ({"spp": 0, "integrator": "reference"}, r"spp = 0.*>= 1"),
+        ({"max_depth": 0}, r"max_depth = 0.*>= 1, or -1"),
+        ({"seed": -1}, r"seed = -1.*2\^32"),
+        ({"resolution": (0, 60)}, r"resolution = \(0, 60\).*>= 1 pixel"),
         ({"denoise": True}, r"denoise = True.*no noise"),
         ({"device": "gpu"}, r"device = 'gpu'.*auto, cpu, cuda"),
         (
@@ -35,7 +40,7 @@ from tests.optics.scenes import RESOLUTION, at_rest, grid_of, led, like_a_mini, 
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        RayTracer(like_a_mini(), resolution=RESOLUTION, **{"device": "cpu", **options})
+        RayTracer(like_a_mini(), **{"resolution": RESOLUTION, "device": "cpu", **options})
 
 
 def test_a_second_grid_is_refused(tracer: Build) -> None:
@@ -43,7 +48,7 @@ def test_a_second_grid_is_refused(tracer: Build) -> None:
     mode = tracer(spec, bounce=False)
     mode.render(at_rest(grid_of(spec)))
     mode.render(at_rest(grid_of(spec)))  # an equal grid is the same grid
-    with pytest.raises(InputError, match=r"surface\.grid = \(53, 64\).*one grid, \(84, 102\)"):
+    with pytest.raises(InputError, match=r"surface\.grid = \(53, 64\).*one grid.*\(84, 102\)"):
         mode.render(at_rest(grid_of(spec, 0.4e-3)))
 
 
@@ -70,3 +75,71 @@ def test_without_llvm_the_error_says_how_to_mend_it(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("raytac.optics.variant.llvm_library", lambda: None)
     with pytest.raises(BackendError, match=r"pip install karellen-llvm-core.*DRJIT_LIBLLVM_PATH.*raytac doctor"):
         load_mitsuba("cpu")
+
+
+def test_another_rest_surface_is_refused(tracer: Build) -> None:
+    spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
+    mode = tracer(spec, bounce=False)
+    grid = grid_of(spec)
+    mode.render(at_rest(grid))
+    with pytest.raises(InputError, match=r"surface\.grid.*rest surface"):
+        mode.render(at_rest(replace(grid, rest=grid.rest - 1e-4)))
+
+
+@pytest.mark.parametrize("shape", [(0, 84, 102), (84, 102), (1, 82, 102)], ids=["no environment", "no batch axis", "rows missing"])
+def test_surfaces_of_another_shape_are_refused(tracer: Build, shape: tuple[int, ...]) -> None:
+    spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
+    grid = grid_of(spec)
+    wrong = GelSurface(grid, np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros((1, 2)))
+    with pytest.raises(InputError, match=r"surface\.height = .*\(B, 84, 102\) with B >= 1"):
+        tracer(spec, bounce=False).render(wrong)
+
+
+def test_device_heights_must_fill_whole_grids(tracer: Build) -> None:
+    spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
+    mode = tracer(spec, bounce=False)
+    mode.render(at_rest(grid_of(spec)))
+    with pytest.raises(InputError, match="whole number of grids of 8568 nodes"):
+        mode.render_device(mode.mi.Float(np.zeros(8569, np.float32)))
+    with pytest.raises(InputError, match="render a GelSurface first"):
+        RayTracer(spec, resolution=RESOLUTION, device="cpu").render_device(mode.mi.Float(0.0))
+
+
+@pytest.mark.parametrize("integrator", ["fast", "reference"])
+def test_an_environment_that_failed_leaves_the_others_running(tracer: Build, integrator: str) -> None:
+    spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
+    grid = grid_of(spec)
+    press, _ = ball(grid)
+    broken = press.copy()
+    broken[3, 4] = np.nan
+    options: dict[str, Any] = {"bounce": False, "outputs": ("rgb", "layers", "depth")}
+    if integrator == "reference":
+        options = {"integrator": integrator, "spp": 1, "outputs": ("rgb", "layers", "depth")}
+    mode = tracer(spec, **options)
+    alone = mode.render(surface(grid, press))
+    together = mode.render(surface(grid, press, broken))
+    assert together.rgb is not None and together.depth is not None and together.layers is not None and alone.rgb is not None
+    assert np.abs(together.rgb[0].astype(int) - alone.rgb[0]).max() <= 1 and alone.rgb.any()
+    assert not together.rgb[1].any() and np.isnan(together.depth[1]).all() and np.isfinite(together.depth[0]).all()
+    assert all(np.isnan(layer[1]).all() for layer in together.layers.values())
+
+
+def test_geometry_alone_traces_no_light() -> None:
+    mode = RayTracer(like_a_mini(), resolution=RESOLUTION, device="cpu", integrator="reference", spp=10**6, outputs=("depth",))
+    grid = grid_of(like_a_mini())
+    images = mode.render(at_rest(grid))
+    assert images.rgb is None and images.depth is not None
+    assert mode.scene is None, "a Mitsuba scene was built though no output needs light"
+
+
+def test_a_variant_that_the_user_set_first_works() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import raytac.optics, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
+        "from raytac.optics.variant import load_mitsuba; load_mitsuba('cpu');"
+        "mi.load_dict({'type': 'rectangle', 'emitter': {'type': 'raytac_led', 'radiance': [1, 1, 1], 'lobe': 2.0}})"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr[-2000:]
