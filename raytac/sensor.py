@@ -15,6 +15,7 @@ from raytac.frame import OUTPUTS, TactileFrame
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.io.options import parse_resolution
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ OPTICS = ("raytrace",)
 """Names that ``optics=`` accepts."""
 INTEGRATORS = ("fast", "reference", "path")
 """Names that ``integrator=`` accepts."""
+LARGEST_SIDE = 8192
+"""Longest side of an image [px], as in sensor files."""
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""
 COARSEST_PITCH = 0.1e-3
@@ -60,8 +63,8 @@ class TactileSensor:
         *,
         physics: str = "rigid",
         optics: str | OpticalMode = "raytrace",
-        outputs: Sequence[str] = ("rgb",),
-        resolution: tuple[int, int] | None = None,
+        outputs: Sequence[str] | str = ("rgb",),
+        resolution: tuple[int, int] | str | None = None,
         integrator: str = "fast",
         spp: int | None = None,
         device: str = "auto",
@@ -77,13 +80,13 @@ class TactileSensor:
             physics: how the gel deforms, one of ``PHYSICS``.
             optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
                 outputs and device).
-            outputs: what a frame holds, from ``raytac.frame.OUTPUTS``; nothing else is computed.
-            resolution: (width, height) of the images [px]; None is the sensor's own.
+            outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
+            resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own.
             integrator: one of ``INTEGRATORS``.
-            spp: samples a pixel of a sampled integrator; None is the integrator's own.
+            spp: ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
-            seed: of every random number.
-            num_envs: number of environments B that a press simulates.
+            seed: of every random number, in [0, 2^32).
+            num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
             optics_options: further keyword arguments of the optical mode.
 
@@ -96,18 +99,22 @@ class TactileSensor:
             _check_name("optics", optics, OPTICS)
         _check_name("integrator", integrator, INTEGRATORS)
         _check_name("device", device, ("auto", "cpu", "cuda"))
-        if isinstance(outputs, str):
+        if not isinstance(outputs, (str, Sequence)):
             raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
+        outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in outputs:
             _check_name("outputs", name, OUTPUTS)
         _check_whole("num_envs", num_envs)
         _check_whole("spp", 1 if spp is None else spp)
-        for side in resolution or ():
-            _check_whole("resolution", side)
+        size = _checked_resolution(resolution)
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
+            raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
+        if not isinstance(sensor, (str, Path, SensorSpec)):
+            raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
         self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
         self.physics, self.integrator, self.spp = physics, integrator, spp
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
-        self.resolution = (resolution[0], resolution[1]) if resolution is not None else self.spec.camera.resolution
+        self.resolution = size if size is not None else self.spec.camera.resolution
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
         self._pitch = self._pixel_pitch() if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
@@ -123,8 +130,21 @@ class TactileSensor:
 
     @property
     def label(self) -> str:
-        """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports."""
-        return f"{self.physics}+{self._optics_name}" if self._optical_outputs else self.physics
+        """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
+
+        The optical mode names itself once it is built, which options such as a denoiser change.
+        """
+        optics = self._optics_name if self._mode is None else self._mode.label
+        return f"{self.physics}+{optics}" if self._optical_outputs else self.physics
+
+    @property
+    def sampling(self) -> dict[str, int | str]:
+        """``integrator`` and ``spp`` of the optical mode, for headers and reports; empty without images, or if it has neither."""
+        mode = self.optical_mode if self._optical_outputs else None
+        integrator = getattr(mode, "integrator", None)
+        if integrator is None:
+            return {}
+        return {"integrator": integrator, "spp": getattr(mode, "rays", 1) ** 2 if integrator == "fast" else getattr(mode, "spp", 0)}
 
     @property
     def device_used(self) -> str:
@@ -135,34 +155,53 @@ class TactileSensor:
     def _optical_outputs(self) -> tuple[str, ...]:
         return tuple(name for name in self.outputs if name in OPTICAL_OUTPUTS)
 
-    def press(self, scene: str | Path | PressScene) -> TactileFrame:
+    def press(
+        self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
+    ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
 
+        ``offsets`` and ``depths`` are as for ``load``.
+
         Raises:
+            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
-        press = scene if isinstance(scene, PressScene) else load_press(scene)
+        press = _press_scene(scene)
         validate_press(self.spec, press)
         start = time.perf_counter()
-        pad = self.load(press)
+        pad = self.load(press, offsets=offsets, depths=depths)
         state = pad.peak(pad.run())
         physics_ms = 1e3 * (time.perf_counter() - start)
         frame = self.update(state)
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
 
-    def load(self, scene: str | Path | PressScene) -> RigidPad:
-        """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``."""
+    def load(
+        self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
+    ) -> RigidPad:
+        """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
+
+        Args:
+            scene: name of a shipped press scene, path of a scene file, or a scene.
+            offsets: added to the object's x, y per environment [m], pad frame, shape (B, 2) with B = ``num_envs``; None is none.
+            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+
+        Raises:
+            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
+            SpecError: the scene breaks a rule.
+        """
         from raytac.physics.rigid import RigidPad
 
-        press = scene if isinstance(scene, PressScene) else load_press(scene)
-        self._pad = RigidPad(self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed)
+        press = _press_scene(scene)
+        self._pad = RigidPad(
+            self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed, offsets=offsets, depths=depths
+        )
         return self._pad
 
     def update(self, state: ContactState | GelSurface) -> TactileFrame:
         """Frame of a gel surface, or of a state of the physics that ``load`` or ``press`` set up.
 
         Raises:
-            InputError: a state, and no scene was loaded.
+            InputError: a state, and no scene was loaded, or another one than the state is of.
         """
         start = time.perf_counter()
         if isinstance(state, GelSurface):
@@ -208,6 +247,9 @@ class TactileSensor:
     def _surface(self, state: ContactState) -> GelSurface:
         if self._pad is None:
             raise InputError("state", value=type(state).__name__, rule="needs a scene: call load() first, or give a GelSurface")
+        if state.scene is not None and state.scene != self._pad.scene:
+            rule = f"belongs to the scene {state.scene.name!r}, and {self._pad.scene.name!r} was loaded since"
+            raise InputError("state", value=type(state).__name__, rule=rule)
         return self._pad.surface(state)
 
     @property
@@ -232,6 +274,26 @@ class TactileSensor:
                 **self._optics_options,
             )
         return mode
+
+
+def _press_scene(scene: object) -> PressScene:
+    if not isinstance(scene, (str, Path, PressScene)):
+        raise InputError("scene", value=scene, rule=f"must be a name, a path or a PressScene, not {type(scene).__name__}")
+    return scene if isinstance(scene, PressScene) else load_press(scene)
+
+
+def _checked_resolution(resolution: object) -> tuple[int, int] | None:
+    if resolution is None:
+        return None
+    if isinstance(resolution, str):
+        resolution = parse_resolution(resolution)
+    if not isinstance(resolution, (tuple, list)) or len(resolution) != 2:
+        raise InputError("resolution", value=resolution, rule="must be (width, height) in pixels, as in (320, 240) or '320x240'")
+    for side in resolution:
+        _check_whole("resolution", side)
+        if side > LARGEST_SIDE:
+            raise InputError("resolution", value=side, rule=f"must be at most {LARGEST_SIDE} pixels a side")
+    return int(resolution[0]), int(resolution[1])
 
 
 def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:

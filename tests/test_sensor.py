@@ -21,13 +21,19 @@ from tests.conftest import Shader, make_surface
         ({"physics": "rigd"}, r"physics = 'rigd'.*did you mean 'rigid'.*rigid"),
         ({"optics": "taxm"}, r"optics = 'taxm'.*raytrace"),
         ({"outputs": ("rgb", "deph")}, r"outputs = 'deph'.*did you mean 'depth'.*rgb, layers"),
-        ({"outputs": "rgb"}, "sequence of names"),
+        ({"outputs": 3}, "sequence of names"),
+        ({"outputs": "rgb,depth"}, "outputs = 'rgb,depth'.*layers"),
         ({"integrator": "quick"}, "fast, reference"),
         ({"device": "gpu"}, "auto, cpu, cuda"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"spp": 0}, "spp = 0"),
         ({"spp": 1.5}, "spp = 1.5"),
         ({"resolution": (0, 240)}, "resolution = 0"),
+        ({"resolution": (320, 9000)}, "resolution = 9000.*8192"),
+        ({"resolution": (320,)}, r"\(width, height\)"),
+        ({"resolution": "320*240"}, "WIDTHxHEIGHT"),
+        ({"seed": -1}, r"seed = -1.*2\^32"),
+        ({"seed": 2**32}, "seed = 4294967296"),
     ],
 )
 def test_bad_names_and_numbers_are_refused_with_the_choices(options: dict, message: str, sensor_spec: SensorSpec) -> None:
@@ -38,6 +44,42 @@ def test_bad_names_and_numbers_are_refused_with_the_choices(options: dict, messa
 def test_a_state_needs_a_scene(sensor_spec: SensorSpec) -> None:
     with pytest.raises(InputError, match=r"load\(\)"):
         TactileSensor(sensor_spec, outputs=("height",)).update(object())  # type: ignore[arg-type]
+
+
+def test_a_sensor_or_scene_of_another_type_is_named(sensor_spec: SensorSpec) -> None:
+    with pytest.raises(InputError, match=r"sensor = 3.*not int"):
+        TactileSensor(3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"scene = 3.*not int"):
+        TactileSensor(sensor_spec, outputs="height").press(3)  # type: ignore[arg-type]
+
+
+def test_one_output_and_resolution_as_text(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, outputs="depth", resolution="32x24")
+    assert sensor.outputs == ("depth",) and sensor.resolution == (32, 24)
+
+
+def test_a_state_of_another_scene_is_refused(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, outputs="height", pitch=0.5e-3)
+    pad = sensor.load("coin")
+    state = next(pad.run())
+    sensor.load("sphere")
+    with pytest.raises(InputError, match=r"'coin'.*'sphere' was loaded since"):
+        sensor.update(state)
+    sensor.load("coin")
+    assert sensor.update(state).height is not None
+
+
+def test_environments_differ_by_offset_and_depth(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, outputs="height", num_envs=2, pitch=0.2e-3)
+    frame = sensor.press("sphere", offsets=np.array([[0.0, 0.0], [2e-3, 0.0]]), depths=np.array([0.4e-3, 0.8e-3]))
+    assert frame.surface.contact_centre[1, 0] - frame.surface.contact_centre[0, 0] == pytest.approx(2e-3, abs=0.2e-3)
+    assert frame.surface.indentation[1].max() > 1.5 * frame.surface.indentation[0].max()
+
+
+def test_the_mode_names_itself(sensor_spec: SensorSpec) -> None:
+    mode = Shader(sensor_spec)
+    mode.label = "raytrace-reference-denoised"
+    assert TactileSensor(sensor_spec, optics=mode).label == "rigid+raytrace-reference-denoised"
 
 
 def test_contact_changes_the_image_and_release_restores_it(sensor_spec: SensorSpec) -> None:

@@ -48,6 +48,8 @@ class ContactState:
     shear_force: np.ndarray
     twist_torque: np.ndarray
     failed: np.ndarray
+    scene: PressScene | None = None
+    """Scene that the object belongs to; None if it is not known."""
 
 
 @dataclass
@@ -272,7 +274,7 @@ class RigidPad:
             if e.failed:
                 failed[b] = True
                 pose[b], depth[b], force[b], shear[b], torque[b] = np.nan, np.nan, np.nan, np.nan, np.nan
-        return ContactState(stage, kind, fraction, pose, depth, force, shear, torque, failed)
+        return ContactState(stage, kind, fraction, pose, depth, force, shear, torque, failed, self.scene)
 
 
 def _per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -15,9 +15,12 @@ from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.png import write_png
 from raytac.sensor import TactileSensor
-from raytac.specs import PressScene
+from raytac.specs import PressScene, validate_press
 
-__all__ = ["exr_channels", "exr_header", "press_metrics", "run_press"]
+__all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "run_press"]
+
+FILES = ("rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json")
+"""Every file that a press may write; those of an earlier press that a new one does not write are removed."""
 
 
 def run_press(
@@ -26,10 +29,15 @@ def run_press(
     """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
 
     ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. Returns the files written.
-    Nothing is in ``out`` until everything is computed and written.
+    Nothing in ``out`` changes until everything is computed and written.
+
+    Raises:
+        SpecError: the scene does not fit this sensor.
+        RaytacError: the press did not settle.
     """
     start = time.perf_counter() if start is None else start
-    with result_folder(out) as folder:
+    validate_press(sensor.spec, scene)
+    with result_folder(out, FILES) as folder:
         began = time.perf_counter()
         rest = sensor.rest()
         setup_ms = 1e3 * (time.perf_counter() - began)
@@ -40,7 +48,7 @@ def run_press(
             write_png(folder / "rgb.png", frame.rgb[0])
         channels = exr_channels(frame, outputs)
         if channels:
-            write_exr(folder / "frame.exr", channels, exr_header(sensor, scene))
+            write_exr(folder / "frame.exr", channels, exr_header(sensor, scene, frame))
         if "height" in outputs:
             np.save(folder / "height.npy", frame.surface.height[0].astype(np.float32))
         _write_preview(folder / "preview.png", sensor, scene, frame, rest, outputs)
@@ -71,14 +79,19 @@ def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) ->
     return channels
 
 
-def exr_header(sensor: TactileSensor, scene: PressScene) -> dict[str, str]:
+def exr_header(sensor: TactileSensor, scene: PressScene, frame: TactileFrame) -> dict[str, str]:
     """What is needed to know where an image came from; all text."""
-    header = {
+    size = _image_size(frame)
+    header = {key: str(value) for key, value in sensor.sampling.items()}
+    if size is not None:
+        header["resolution"] = f"{size[0]}x{size[1]}"
+    if frame.layers is not None:
+        header["layers"] = " ".join(f"led_{name}" for name in frame.layers)
+    header |= {
         "sensor": sensor.spec.name,
         "scene": scene.name,
         "mode": sensor.label,
         "seed": str(sensor.seed),
-        "layers": " ".join(f"led_{name}" for name in sensor.spec.lights.layers),
         "unitsRadiance": "linear, relative W/(m^2 sr)",
         "unitsPosition": "m",
         "unitsDepth": "m",
@@ -99,11 +112,13 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         "device": sensor.device_used,
         "seed": sensor.seed,
         "machine.cpus": os.cpu_count() or 1,
-        "image.width_px": sensor.resolution[0],
-        "image.height_px": sensor.resolution[1],
+        **{f"image.{key}": value for key, value in sensor.sampling.items()},
         "contact.max_indentation_mm": 1e3 * float(surface.indentation[0].max()),
         "contact.area_mm2": 1e6 * dx * dy * int(surface.contact[0].sum()),
     }
+    size = _image_size(frame)
+    if size is not None:
+        metrics["image.width_px"], metrics["image.height_px"] = size
     if np.isfinite(surface.contact_centre[0]).all():
         metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"] = (1e3 * float(v) for v in surface.contact_centre[0])
     if frame.force is not None:
@@ -115,6 +130,14 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         metrics["image.change_from_rest_max_u8"] = float(change.max())
     metrics |= {f"time.{name}_ms": value for name, value in frame.time_ms.items()}
     return metrics | versions()
+
+
+def _image_size(frame: TactileFrame) -> tuple[int, int] | None:
+    """(width, height) of the frame's images [px], None if it has none."""
+    for image in (frame.rgb, frame.normals, frame.depth, *(frame.layers or {}).values()):
+        if image is not None:
+            return image.shape[2], image.shape[1]
+    return None
 
 
 def _write_preview(

@@ -46,3 +46,16 @@ def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match="a file of that name exists"), result_folder(tmp_path / "out"):
         pass
+
+
+def test_what_an_earlier_run_wrote_and_this_one_does_not_is_removed(tmp_path: Path) -> None:
+    owned = ("rgb.png", "height.npy", "metrics.json")
+    for names in (owned, ("height.npy", "metrics.json")):
+        with result_folder(tmp_path / "out", owned) as folder:
+            for name in names:
+                (folder / name).write_text("")
+        (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"height.npy", "metrics.json", "notes.txt"}
+    with pytest.raises(RuntimeError), result_folder(tmp_path / "out", owned):
+        raise RuntimeError
+    assert (tmp_path / "out" / "height.npy").exists()

@@ -45,6 +45,7 @@ def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: Pr
     np.testing.assert_allclose(channels["Z"], channels["P.Z"] - sensor_spec.camera.position[2], atol=1e-8)
     assert (header["sensor"], header["scene"], header["mode"], header["seed"]) == ("test_sensor", "sphere", "rigid+shader", "0")
     assert header["unitsDepth"] == "m" and "version:raytac" in header
+    assert header["resolution"] == "64x48" and header["layers"] == "led_red led_green led_blue"
 
     rgb = read_png(tmp_path / "out" / "rgb.png")
     linear = np.stack([channels[c] for c in "RGB"], axis=-1)
@@ -73,6 +74,14 @@ def test_only_what_was_asked_for_is_written(
     assert {path.name for path in tmp_path.iterdir()} == files | {"preview.png", "metrics.json"}
     if channels:
         assert set(read_exr(tmp_path / "frame.exr")[0]) == channels
+
+
+def test_a_second_press_leaves_nothing_of_the_first(sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path) -> None:
+    sensor = sensor_with(sensor_spec, Shader(sensor_spec, SIZE))
+    run_press(sensor, scene, tmp_path, outputs=OUTPUTS)
+    (tmp_path / "notes.txt").write_text("mine")
+    run_press(sensor, scene, tmp_path, outputs=("height",))
+    assert {path.name for path in tmp_path.iterdir()} == {"height.npy", "preview.png", "metrics.json", "notes.txt"}
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
