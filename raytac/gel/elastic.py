@@ -20,6 +20,8 @@ CONTACT_SCALE = 0.4
 """Share of the deepest overlap from which a node counts as in full contact."""
 _FINEST = 0.2
 """Gaussians narrower than this share of the pitch move nothing that the grid can hold and are skipped."""
+_ROUNDING = 1e-5
+"""Share of the deepest overlap that w may exceed u by in a contact: above what float32 gathers in the pyramid, far below a shape."""
 
 
 class ElasticSurround:
@@ -30,7 +32,7 @@ class ElasticSurround:
     is rest − w. How the contact is re-imposed is the ``contact_rule``:
 
     - ``"unilateral"`` (default): w ← max(w, u⁺). The gel never reaches into the object and leaves it where the Gaussians hold it deeper;
-      the contact is where w = u. Everything stays continuous.
+      the contact is where w = u, up to 10⁻⁵ of the deepest overlap (float32). Everything stays continuous.
     - ``"threshold"``: Taxim's own, w = u⁺ on the full contact C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief,
       tears the surface along the border of C on steep walls (dots in the image) and lets the gel reach into the object outside C.
 
@@ -98,7 +100,10 @@ class ElasticSurround:
                 np.maximum(moved, pressed, out=moved)
             else:
                 np.copyto(moved, pressed, where=full)
-        contact = (overlap > 0.0) & (moved <= pressed) if self.contact_rule == "unilateral" else full
+        # Where the overlap is constant the Gaussians keep it, up to rounding: without slack, rounding would decide the contact. The
+        # deepest node is always within it, since no Gaussian exceeds the maximum.
+        slack = np.float32(max(_ROUNDING * float(deepest), float(np.finfo(np.float32).tiny)))
+        contact = (overlap > 0.0) & (moved <= pressed + slack) if self.contact_rule == "unilateral" else full
         return (moved if self._final is None else self._final(moved)), contact
 
     def _centroid(self, overlap: np.ndarray, contact: np.ndarray) -> tuple[float, float]:

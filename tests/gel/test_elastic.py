@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -96,12 +97,31 @@ def test_gel_never_reaches_into_the_object() -> None:
     gap = sphere - surface.height[0].astype(float)
     contact = surface.contact[0]
     assert gap.min() > -1e-9, f"the gel reaches {-gap.min():.2e} m into the sphere"
-    assert np.abs(gap[contact]).max() < 1e-9 and gap[~contact & np.isfinite(gap)].min() > 0
+    assert np.abs(gap[contact]).max() < 1.01e-5 * depth and gap[~contact & np.isfinite(gap)].min() > 1e-5 * depth - 1e-9
     area = contact.sum() * grid.pitch[0] * grid.pitch[1]
     overlap_area = math.pi * (radius**2 - (radius - depth) ** 2)
     # Hertz's contact has half the area of the overlap with the resting surface; the Gaussians' is between the two.
     assert 0.5 * overlap_area < area < overlap_area
     assert np.abs(np.diff(surface.height[0].astype(float), axis=1)).max() < 0.1e-3  # no step anywhere: slope below 1
+
+
+@pytest.mark.parametrize("depth", [1e-7, 0.05e-3, 0.3e-3, 0.7e-3, 1.5e-3])
+def test_flat_punch_on_a_flat_pad_is_all_contact(depth: float) -> None:
+    """Constant overlap: every Gaussian keeps it in the middle, so rounding must not decide which nodes touch."""
+    grid = make_grid(dataclasses.replace(PAD, dome_radius=(math.inf, math.inf)), 0.1e-3)
+    off_axis = np.hypot(grid.x[None, :] - 1e-3, grid.y[:, None] + 0.5e-3)
+    punch = off_axis <= 4e-3
+    surface = ElasticSurround(grid).surface(np.where(punch, -depth, np.inf)[None])
+    np.testing.assert_array_equal(surface.contact[0], punch)
+    np.testing.assert_allclose(surface.contact_centre[0], (1e-3, -0.5e-3), atol=0.02e-3)
+
+
+@pytest.mark.parametrize("depth", [1e-40, 1e-12, 0.7e-3])
+def test_a_slab_over_the_whole_pad_has_a_centre(depth: float) -> None:
+    grid = make_grid(dataclasses.replace(PAD, dome_radius=(math.inf, math.inf)), 0.2e-3)
+    surface = ElasticSurround(grid).surface(np.full((1, *grid.shape), -depth))
+    assert surface.contact.all()
+    np.testing.assert_allclose(surface.contact_centre[0], 0.0, atol=1e-9)
 
 
 def test_unknown_contact_rule_is_refused() -> None:
