@@ -14,8 +14,8 @@ __all__ = ["ObjectSpec", "PressScene", "StageSpec"]
 class ObjectSpec:
     """The indenter, a union of convex or concave parts rigidly joined.
 
-    Parts are MuJoCo geoms (``sphere capsule ellipsoid cylinder box mesh``); cone, torus, pins and coin are meshes generated in
-    code from a few lengths, so that no binary asset is needed.
+    Most kinds are exact shapes: sphere, cylinder, edge, cone, torus and pins are computed from a few lengths, so that no facet
+    shows in an image; a coin is an elevation map made in code; only ``mesh`` reads triangles from a file.
     """
 
     kind: str
