@@ -17,8 +17,9 @@ def validate_sensor(sensor: SensorSpec) -> None:
     """Check a sensor as a whole; for sensors changed in code (``dataclasses.replace``), files are checked on loading.
 
     Raises:
-        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or does not see the pad; the
-            vignette leaves no light; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case.
+        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the
+            vignette leaves no light; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case; with
+            ``refraction.model = "slab"``, camera or LED do not lie below the slab's face to the air.
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
@@ -63,17 +64,48 @@ def _check_camera(sensor: SensorSpec) -> None:
         if any(v > size + _SLACK for v, size in zip(view, outer, strict=True)):
             rule = f"the view of {_mm(view)} mm (resolution times pitch) must not be larger than the {name}, {_mm(outer)} mm"
             raise _error(sensor, "camera.pixel_pitch_mm", _mm(camera.pixel_pitch), rule)
+    _check_view(sensor)
+
+
+def _check_view(sensor: SensorSpec) -> None:
+    """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0 for u = 0 and u = W; y likewise."""
+    pad, camera = sensor.gelpad, sensor.camera
+    for axis, name in enumerate("xy"):
+        at, principal = camera.position[axis], camera.principal_point[axis]
+        pixels, pitch = camera.resolution[axis], camera.pixel_pitch[axis]
+        low, high = at - principal * pitch, at + (pixels - principal) * pitch
+        half = pad.size[axis] / 2
+        if low < -half - _SLACK or high > half + _SLACK:
+            rule = (
+                f"the view runs off the pad: at z = 0 it covers {name} = {low * 1e3:.4g} to {high * 1e3:.4g} mm, "
+                f"must stay within {-half * 1e3:.4g} to {half * 1e3:.4g} mm"
+            )
+            if abs((pixels / 2 - principal) * pitch) > abs(at):
+                raise _error(sensor, "camera.principal_point_px", list(camera.principal_point), rule)
+            raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
 
 
 def _check_vignetting(sensor: SensorSpec) -> None:
     camera, (a1, a2, a3) = sensor.camera, sensor.response.vignetting
     (width, height), (px, py) = camera.resolution, camera.principal_point
     farthest = max(math.hypot(u - px, v - py) for u in (0, width) for v in (0, height)) / (math.hypot(width, height) / 2)
-    for step in range(257):
-        r2 = (farthest * step / 256) ** 2
-        if 1 + r2 * (a1 + r2 * (a2 + r2 * a3)) <= 0:
-            rule = "1 + a1 r² + a2 r⁴ + a3 r⁶ must stay above 0 over the whole image"
-            raise _error(sensor, "response.vignetting", list(sensor.response.vignetting), rule)
+    # A cubic in s = r² is least at an end or where its slope a1 + 2 a2 s + 3 a3 s² is 0. It may rise again: some lenses do.
+    lowest = [s for s in _real_roots(3 * a3, 2 * a2, a1) if 0 < s < farthest**2]
+    if min(1 + s * (a1 + s * (a2 + s * a3)) for s in (farthest**2, *lowest)) <= 0:
+        rule = "1 + a1 r² + a2 r⁴ + a3 r⁶ must stay above 0 over the whole image"
+        raise _error(sensor, "response.vignetting", list(sensor.response.vignetting), rule)
+
+
+def _real_roots(a: float, b: float, c: float) -> tuple[float, ...]:
+    """Real roots of a s² + b s + c; none where it is constant."""
+    if a == 0:
+        return () if b == 0 else (-c / b,)
+    square = b * b - 4 * a * c
+    if square < 0:
+        return ()
+    # The stable form: no difference of two nearly equal numbers, also for a tiny a.
+    q = -0.5 * (b + math.copysign(math.sqrt(square), b))
+    return (q / a,) if q == 0 else (q / a, c / q)
 
 
 def _check_markers(sensor: SensorSpec) -> None:
@@ -97,12 +129,19 @@ def _check_markers(sensor: SensorSpec) -> None:
 
 def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     pad, back = sensor.gelpad, _back_face(sensor)
+    slab = sensor.refraction.model == "slab"
     half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
     file, key, value = sensor.lights.source, f"led[{index}].position_mm", _mm(led.position)
     for x, y, z in (led.position, *led_corners(led)):
+        if slab and z >= -back:  # beside the pad too: the slab fills the case's cross-section
+            highest = max(corner[2] for corner in led_corners(led))
+            rule = (
+                f"LED {led.name!r} reaches up to z = {highest * 1e3:.4g} mm: with refraction.model = 'slab' "
+                f"all of it must lie below the slab's air face, z < {-back * 1e3:.4g} mm (thickness plus plate)"
+            )
+            raise SpecError(rule, file=file, key=key, value=value)
         if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
-            behind = "gel and its plate" if back > pad.thickness else "gel"
-            rule = f"LED {led.name!r} lies inside the {behind}: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
+            rule = f"LED {led.name!r} lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
         rest = -dome_depth(pad, min(abs(x), half_x), min(abs(y), half_y))
         if z > rest + _SLACK:

@@ -103,7 +103,16 @@ SENSOR_ERRORS: list[tuple[str, Any, str]] = [
     ("response.white_balance", [1.0, 1.0], "must be 3 numbers, each in (0, 100]"),
     ("response.gamma", 0.0, "must be a number in [0.5, 5]"),
     ("response.black_level", [0.0, 0.9, 0.0], "must be 3 numbers, each in [-0.5, 0.5]"),
+    ("camera.principal_point_px", [210.0, 120.0], "the view runs off the pad: at z = 0 it covers x = -13.31 to 6.974 mm"),
+    ("camera.principal_point_px", [110.0, 120.0], "the view runs off the pad: at z = 0 it covers x = -6.974 to 13.31 mm"),
+    ("camera.principal_point_px", [160.0, 170.0], "the view runs off the pad: at z = 0 it covers y = -10.78 to 4.438 mm"),
+    ("camera.principal_point_px", [160.0, 70.0], "the view runs off the pad: at z = 0 it covers y = -4.438 to 10.78 mm"),
+    ("camera.position_mm", [-3.0, 0.0, -28.0], "the view runs off the pad: at z = 0 it covers x = -13.14 to 7.144 mm"),
+    ("camera.position_mm", [0.0, 3.0, -28.0], "the view runs off the pad: at z = 0 it covers y = -4.608 to 10.61 mm"),
     ("response.vignetting", [-1.5, 0.0, 0.0], "must stay above 0 over the whole image"),
+    ("response.vignetting", [-4.0, 4.0, 0.0], "must stay above 0 over the whole image"),  # 0 at r² = 1/2 alone
+    ("response.vignetting", [0.0, 0.0, -1.0], "must stay above 0 over the whole image"),
+    ("response.vignetting", [-9.0, 10.0, 1e-300], "must stay above 0 over the whole image"),
     ("markers.rows", 7, "must both be 0 or both be positive"),
     ("refraction.model", "fresnel", "must be a known name"),
     ("refraction.ior", 0.9, "must be a number in [1, 3]"),
@@ -232,10 +241,36 @@ def test_led_errors_name_the_lights_file(make_sensor: MakeSensor, key: str, valu
 def test_a_slab_keeps_camera_and_leds_out_of_the_plate(make_sensor: MakeSensor) -> None:
     slab = {"refraction.model": "slab", "refraction.plate_thickness_mm": 5.0}
     assert load_sensor(make_sensor({**slab, "refraction.plate_thickness_mm": 3.0})).refraction.model == "slab"
-    with pytest.raises(SpecError, match=r"inside the gel and its plate: under the pad all of it must have z <= -9 mm"):
-        load_sensor(make_sensor(slab, lights={"led[0].position_mm": [0.0, -8.0, -8.5]}))
+    for position in ([0.0, -8.0, -8.5], [0.0, -12.0, -8.5]):  # under the pad and beside it
+        with pytest.raises(SpecError, match=r"below the slab's air face, z < -9 mm") as caught:
+            load_sensor(make_sensor(slab, lights={"led[0].position_mm": position}))
+        assert caught.value.file is not None and caught.value.file.name == "lights.toml"
+        assert caught.value.key == "led[0].position_mm" and "reaches up to z = -8.053 mm" in str(caught.value)
     with pytest.raises(SpecError, match=r"camera.position_mm = .*must lie behind the gel, z < -9 mm"):
         load_sensor(make_sensor({**slab, "camera.position_mm": [0.0, 0.0, -8.9]}))
+
+
+def test_a_led_may_not_dip_into_the_slab_with_one_corner(make_sensor: MakeSensor) -> None:
+    """led[1] is centred at z = −8 mm and its corners are at −7.551 mm: a face between the two cuts it."""
+    above = {"refraction.model": "slab", "refraction.plate_thickness_mm": 3.5}
+    assert load_sensor(make_sensor(above))
+    with pytest.raises(SpecError, match=r"led\[1\]\.position_mm = .*LED 'green' reaches up to z = -7\.551 mm"):
+        load_sensor(make_sensor({**above, "refraction.plate_thickness_mm": 3.6}))
+
+
+def test_the_mini_has_room_for_its_plate() -> None:
+    mini = load_sensor("gelsight_mini")
+    slab = dataclasses.replace(mini.refraction, model="slab")
+    validate_sensor(dataclasses.replace(mini, refraction=slab))
+    highest = max(corner[2] for led in mini.lights.leds for corner in led_corners(led))
+    with pytest.raises(SpecError, match="below the slab's air face"):
+        too_thick = -highest - mini.gelpad.thickness
+        validate_sensor(dataclasses.replace(mini, refraction=dataclasses.replace(slab, plate_thickness=too_thick)))
+
+
+@pytest.mark.parametrize("vignetting", [[-1.78, 1.17, 0.0], [0.5, -0.2, 0.0], [-3.9, 4.0, 0.0], [-0.9, 0.0, 0.0]])
+def test_a_vignette_may_rise_again_while_it_leaves_light(make_sensor: MakeSensor, vignetting: list[float]) -> None:
+    assert list(load_sensor(make_sensor({"response.vignetting": vignetting})).response.vignetting) == vignetting
 
 
 def test_unknown_names_list_the_known_ones(make_sensor: MakeSensor, tmp_path: Path) -> None:
