@@ -6,6 +6,7 @@ takes down only its probe.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -154,6 +155,10 @@ def _no_cuda() -> str:
     return "" if optix_library() else "the NVIDIA driver brings no OptiX (libnvoptix.so.1)"
 
 
+def _no_warp() -> str:
+    return "" if importlib.util.find_spec("warp") else "not installed: only the soft pad will need it"
+
+
 def _no_llvm() -> str:
     return "" if llvm_library() else "no libLLVM found"
 
@@ -173,7 +178,7 @@ PROBES = (
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),
     Probe("assets", _ASSETS, True, "reinstall raytac, or run it from a complete checkout"),
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
-    Probe("warp", _WARP, False, "pip install warp-lang; only the soft pad (ipc) needs it"),
+    Probe("warp", _WARP, False, "pip install warp-lang; nothing here uses it yet", _no_warp),
 )  # fmt: skip
 
 

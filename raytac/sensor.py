@@ -144,7 +144,8 @@ class TactileSensor:
         integrator = getattr(mode, "integrator", None)
         if integrator is None:
             return {}
-        return {"integrator": integrator, "spp": getattr(mode, "rays", 1) ** 2 if integrator == "fast" else getattr(mode, "spp", 0)}
+        spp = getattr(mode, "rays", 1) ** 2 if integrator == "fast" else getattr(mode, "spp", None)
+        return {"integrator": integrator} | ({} if spp is None else {"spp": spp})
 
     @property
     def device_used(self) -> str:

@@ -27,8 +27,10 @@ def run(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         (["coin", "--resolution", "320*240"], ["resolution", "WIDTHxHEIGHT"]),
         (["coin", "--physics", "soft"], ["physics = 'soft'", "rigid"]),
         (["coin", "--optics", "phong"], ["optics = 'phong'", "raytrace"]),
-        (["coin", "--integrator", "path"], ["integrator = 'path'", "fast, reference"]),
+        (["coin", "--integrator", "pth"], ["integrator = 'pth'", "fast, reference, path"]),
         (["coin", "--spp", "0"], ["spp = 0"]),
+        (["coin", "--resolution", "99999x4"], ["resolution = 99999", "8192"]),
+        (["coin", "--seed", "-1"], ["seed = -1"]),
         (["con"], ["'con'", "did you mean", "coin"]),
         (["no/such/scene.toml"], ["no/such/scene.toml", "does not exist"]),
         (["coin", "--sensor", "gelsight_min"], ["gelsight_mini"]),
@@ -65,6 +67,14 @@ def test_a_press_without_images_from_any_folder(tmp_path: Path) -> None:
     assert np.load(out / "height.npy").ndim == 2
     metrics = read_metrics(out / "metrics.json")
     assert metrics["mode"] == "rigid" and "time.optics_ms" not in metrics
+
+
+def test_help_names_the_choices(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["press", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for words in ("{fast,reference,path}", "{rgb,layers,normals,depth,height}", "256 if not given"):
+        assert words in told
 
 
 def test_out_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,6 +42,14 @@ def test_nothing_is_started_where_there_is_nothing_to_try() -> None:
     assert not check.ok and check.detail == "no such card"
 
 
+def test_warp_that_is_not_installed_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    (warp,) = (p for p in doctor.PROBES if p.name == "warp")
+    check = run_probe(warp)
+    assert check.detail == "not installed: only the soft pad will need it" and not check.required
+    assert "failed" not in Report("cpu", (check,), {}).to_text()
+
+
 def test_a_broken_llvm_leaves_the_gpu_and_the_other_way_round() -> None:
     broken = "import os; os.abort()"
     assert diagnose([probe("mitsuba-cuda"), probe("mitsuba-llvm", broken, False)]).device == "cuda"

@@ -12,7 +12,7 @@ import tyro
 from raytac.frame import OUTPUTS
 from raytac.io.options import CommonOptions, parse_outputs, parse_resolution
 from raytac.report.press import run_press
-from raytac.sensor import TactileSensor
+from raytac.sensor import INTEGRATORS, TactileSensor
 from raytac.specs import load_press
 
 __all__ = ["PressArgs"]
@@ -23,7 +23,7 @@ class PressArgs(CommonOptions):
     """Press an object into the gel and write image, layers, height and a preview to a folder.
 
     Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, preview.png and
-    metrics.json; nothing is left half-written if it is interrupted.
+    metrics.json. An error or Ctrl-C leaves the folder as it was; a press that is done replaces an earlier one there as a whole.
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -34,14 +34,14 @@ class PressArgs(CommonOptions):
     """How the gel deforms: rigid."""
     optics: str = "raytrace"
     """How images are made: raytrace."""
-    integrator: str = "fast"
-    """fast (quadrature over the LEDs, no noise) or reference (path tracing)."""
+    integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
+    """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
     spp: int | None = None
-    """Samples a pixel of the reference integrator."""
+    """fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
     resolution: str | None = None
-    """WIDTHxHEIGHT of the images in pixels, as in 320x240; the sensor's own if not given."""
-    outputs: str = ",".join(OUTPUTS)
-    """What to compute, joined by commas."""
+    """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
+    outputs: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = ",".join(OUTPUTS)
+    """What to compute: one or several of rgb, layers, normals, depth and height, joined by commas."""
 
     def run(self) -> int:
         start = time.perf_counter()
@@ -58,6 +58,7 @@ class PressArgs(CommonOptions):
             spp=self.spp,
             device=self.device,
             seed=self.seed,
+            optics_options={"progress": self.integrator != "fast"},
         )
         scene = load_press(self.scene)
         out = self.out if self.out is not None else Path("runs") / "press" / scene.name

@@ -18,9 +18,9 @@ __all__ = ["result_folder"]
 def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
     """Give a temporary folder beside ``out``; when the block ends well, move its files into ``out``, else delete them.
 
-    A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run that
-    this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` moves last: where it
-    is, the rest is complete.
+    A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run
+    that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` moves last:
+    where it is, the rest is complete.
 
     Raises:
         InputError: ``out`` is a file, or its folder cannot be written.

@@ -22,7 +22,7 @@ class CommonOptions:
     device: DeviceName = "auto"
     """Where to compute; auto is CUDA if it works, else the CPU."""
     seed: int = 0
-    """Seed of every random number; the same seed gives the same result."""
+    """Seed of every random number; the same seed gives the same result. In [0, 2^32)."""
 
 
 def parse_resolution(text: str) -> tuple[int, int]:
