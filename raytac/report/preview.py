@@ -41,6 +41,8 @@ _STYLE = {
     "ytick.major.pad": 2,
 }
 _GEL, _REST, _OBJECT = "#9fc5cf", "#22586b", "#5b5b60"
+_PLATE = {"frameon": True, "facecolor": "white", "edgecolor": "none", "framealpha": 0.85, "borderpad": 0.3, "borderaxespad": 0.3}
+"""Ground of the section's legend, so that it reads over the dark object too."""
 _TICKS_MM = (-15, -10, -5, 0, 5, 10, 15)
 _UNTOUCHED = 1e-6
 """Indentation [m] below which the pad counts as untouched when the section's plane is chosen."""
@@ -157,7 +159,8 @@ def _object_panel(axes: Axes, data: PreviewData) -> None:
     if data.contact.any() and not data.contact.all():
         x, y = 1e3 * data.grid.x, 1e3 * data.grid.y
         axes.contour(x, y, data.contact.astype(float), levels=[0.5], colors="#d55e00", linewidths=0.7)
-        axes.text(0.03, 0.04, "contact", color="#d55e00", fontsize=7, transform=axes.transAxes)
+        label = axes.text(0.03, 0.04, "contact", color="#d55e00", fontsize=7, transform=axes.transAxes)
+        label.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0})
 
 
 def _indentation_panel(axes: Axes, data: PreviewData) -> None:
@@ -183,15 +186,15 @@ def _normals_panel(axes: Axes, data: PreviewData) -> None:
     assert data.normals is not None
     _map_axes(axes, data, "surface normals")
     axes.imshow(_normal_colours(data.normals), extent=data.extent_mm, interpolation="nearest")
-    key = axes.inset_axes((0.80, 0.73, 0.19, 0.25))
+    key = axes.inset_axes((1.02, 0.70, 0.19, 0.30))  # beside the image, which it must not cover
     key.set_axis_off()
     u, v = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 96))
     ball = np.dstack([u, v, -np.sqrt(np.clip(1 - u**2 - v**2, 0, 1))])
     disc = key.imshow(_normal_colours(ball), extent=(-1, 1, 1, -1))
-    circle = Circle((0, 0), 1.0, fill=False, edgecolor="white", linewidth=0.9, transform=key.transData)
+    circle = Circle((0, 0), 1.0, fill=False, edgecolor="#555555", linewidth=0.6, transform=key.transData)
     disc.set_clip_path(circle)
     key.add_patch(circle)
-    key.set(xlim=(-1.08, 1.08), ylim=(1.08, -1.08), aspect="equal")
+    key.set(xlim=(-1.08, 1.08), ylim=(1.08, -1.08), aspect="equal", anchor="NW")
 
 
 def _normal_colours(normals: np.ndarray) -> np.ndarray:
@@ -235,10 +238,11 @@ def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="z [mm]")
     axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
     stretch = abs((data.extent_mm[2] - data.extent_mm[3]) / (high - low))
+    y_mm = round(y_mm, 1) + 0.0  # no "−0.0"
     axes.set_title(f"section y = {y_mm:.1f} mm (z × {stretch:.1f})".replace("-", "−"), loc="left")
     handles = [
         Patch(facecolor=_GEL, edgecolor=_REST, linewidth=0.6, label="gel"),
         Patch(facecolor=_OBJECT, label="object"),
         Line2D([], [], color=_REST, linewidth=0.8, linestyle=(0, (3, 1.5)), label="rest"),
     ]
-    axes.legend(handles=handles, loc="lower center", fontsize=7, ncols=3, handlelength=1.2, columnspacing=0.9, frameon=False)
+    axes.legend(handles=handles, loc="lower center", fontsize=7, ncols=3, handlelength=1.2, columnspacing=0.9, **_PLATE)

@@ -70,6 +70,21 @@ def test_what_was_not_computed_has_no_panel(data: PreviewData, sensor_spec: Sens
     assert titles(bare, sensor_spec)[2].startswith("(c) section")
 
 
+def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    grid = replace(data.grid, y=data.grid.y - data.grid.y[len(data.grid.y) // 2] - 1e-6)
+    (title,) = (title for title in titles(replace(data, grid=grid), sensor_spec) if "section" in title)
+    assert "y = 0.0 mm" in title
+
+
+def test_the_key_of_the_normals_lies_beside_the_image(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    figure = draw_preview(data, sensor_spec)
+    (panel,) = (axes for axes in figure.axes if "normals" in axes.get_title(loc="left"))
+    (key,) = panel.child_axes
+    figure.canvas.draw()
+    assert key.get_position().x0 >= panel.get_position().x1
+    assert all(key.get_position().x1 < axes.get_position().x0 for axes in figure.axes if "(f)" in axes.get_title(loc="left"))
+
+
 def test_difference_is_grey_for_none_and_saturates_at_the_stated_range() -> None:
     rest = np.full((1, 1, 3), 100, np.uint8)
     assert (difference_to_rest(rest, rest) == 0.5).all()
