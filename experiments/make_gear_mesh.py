@@ -4,37 +4,53 @@ The teeth are involutes: half a tooth at radius r subtends the angle π/(2z) + i
 cos α_r = r_b / r, where r_b = (m z / 2) cos α is the base radius (ISO 21771). The solid is a
 closed ring of closed rings of equally many vertices, so that it is watertight by construction.
 
+It generates data: nothing in it is random, and it computes on the CPU whatever ``--device`` says.
+
     python experiments/make_gear_mesh.py && cp runs/make_gear_mesh/gear.stl scenes/meshes/
 """
 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import tyro
 
 
-@dataclass(frozen=True)
-class Args:
-    out: Path = Path("runs/make_gear_mesh")
-    """Folder of gear.stl and metrics.json."""
+from raytac.errors import InputError, RaytacError
+from raytac.io.folder import result_folder
+from raytac.io.metrics import versions, write_metrics
+from raytac.io.options import CommonOptions
+
+FEWEST_TEETH = 12
+"""With fewer, the roots of the teeth would cut into the face, whose outer edge has radius 4.3 m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Write a spur gear as an STL file, in millimetres."""
+
     teeth: int = 12
-    """Number of teeth z."""
+    """Number of teeth z, 12 to 200."""
     module_mm: float = 1.0
     """Module m [mm]: the pitch circle has diameter m z."""
     width_mm: float = 4.0
-    """Width of the rim [mm]."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Taken for the sake of one command line everywhere; a mesh needs no device."""
-    seed: int = 0
-    """Taken likewise; nothing here is random."""
+    """Width of the rim [mm], more than 1.5 m."""
     quick: bool = False
-    """Taken likewise; it always is."""
+    """Changes nothing: it takes a moment."""
+
+    def check(self) -> None:
+        """Raises ``InputError`` for a gear that cannot be."""
+        if not FEWEST_TEETH <= self.teeth <= 200:
+            raise InputError("teeth", value=self.teeth, rule=f"must be a whole number in [{FEWEST_TEETH}, 200]")
+        if not 0.0 < self.module_mm < math.inf:
+            raise InputError("module_mm", value=self.module_mm, rule="must be finite and > 0")
+        if not 1.5 * self.module_mm < self.width_mm < math.inf:
+            raise InputError("width_mm", value=self.width_mm, rule="must be finite and more than 1.5 modules")
 
 
 def outline(teeth: int, module: float, pressure_angle: float = math.radians(20.0)) -> np.ndarray:
@@ -91,28 +107,34 @@ def solid(teeth: int, module: float, width: float) -> tuple[np.ndarray, np.ndarr
 def main(args: Args) -> None:
     import trimesh
 
-    from raytac.io.metrics import versions, write_metrics
     from raytac.specs import load_mesh
 
     start = time.perf_counter()
+    args.check()
+    out = args.out if args.out is not None else Path("runs") / "make_gear_mesh"
     vertices, faces = solid(args.teeth, args.module_mm, args.width_mm)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / "gear.stl"
-    mesh.export(path)
-    read_vertices, read_faces = load_mesh(path, 0.001)
-    metrics = {
-        "device": "cpu",
-        **versions(),
-        "mesh.vertices": len(read_vertices),
-        "mesh.faces": len(read_faces),
-        "mesh.volume_mm3": float(mesh.volume),
-        "mesh.bytes": path.stat().st_size,
-        "wall_s": time.perf_counter() - start,
-    }
-    write_metrics(args.out / "metrics.json", metrics)
-    print(f"{path}: {len(read_vertices)} vertices, {len(read_faces)} faces, {path.stat().st_size} bytes")
+    with result_folder(out, ("gear.stl", "metrics.json")) as folder:
+        path = folder / "gear.stl"
+        mesh.export(path)
+        read_vertices, read_faces = load_mesh(path, 0.001)
+        metrics = {
+            "experiment": "make_gear_mesh",
+            "device": "cpu",
+            "seed": args.seed,
+            **versions(),
+            "mesh.vertices": len(read_vertices),
+            "mesh.faces": len(read_faces),
+            "mesh.volume_mm3": float(mesh.volume),
+            "mesh.bytes": path.stat().st_size,
+            "wall_s": time.perf_counter() - start,
+        }
+        write_metrics(folder / "metrics.json", metrics)
+    print(f"{out / 'gear.stl'}: {len(read_vertices)} vertices, {len(read_faces)} faces, {metrics['mesh.bytes']} bytes")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args))
+    except RaytacError as error:
+        sys.exit(f"error: {error}")
