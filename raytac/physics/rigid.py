@@ -16,7 +16,7 @@ from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.objects import object_parts
 from raytac.physics.rig import PressRig
-from raytac.specs.press import PressScene, StageSpec
+from raytac.specs.press import PressScene
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CLEARANCE", "ContactState", "RigidPad"]
@@ -103,8 +103,8 @@ class RigidPad:
             depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
 
         Raises:
-            InputError: arguments of the wrong shape, an object that does not lie over the pad, a press deeper than the pad.
-            SpecError: the scene's object or trajectory is impossible.
+            InputError: arguments of the wrong shape, ``depths`` deeper than the pad.
+            SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
         """
         self.sensor, self.scene, self.seed, self.num_envs = sensor, scene, seed, num_envs
         if num_envs < 1:
@@ -126,7 +126,9 @@ class RigidPad:
         ``release`` lifts the object ``CLEARANCE`` above the gel.
 
         Raises:
-            InputError: a force that would press deeper than the pad.
+            InputError: ``steps_per_stage`` below 1.
+            SpecError: a force that would press deeper than the pad, or an object that does not start over the pad or is sheared or
+                twisted off it; names the scene's file and key.
         """
         if steps_per_stage < 1:
             raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
@@ -137,7 +139,7 @@ class RigidPad:
             for step in range(1, steps_per_stage + 1):
                 for b, (e, old) in enumerate(zip(environments, before, strict=True)):
                     if not e.failed:
-                        self._advance(e, old, stage, b, step / steps_per_stage, steps_per_stage)
+                        self._advance(e, old, index, b, step / steps_per_stage, steps_per_stage)
                 yield self._state(index, stage.kind, step / steps_per_stage, environments)
 
     def peak(self, states: Iterable[ContactState]) -> ContactState:
@@ -162,36 +164,53 @@ class RigidPad:
 
     def _check_trajectory(self) -> None:
         thickness = self.sensor.gelpad.thickness
-        within = f"must be > 0 and less than the pad's thickness, {thickness} m"
+        within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
         if self.scene.trajectory and not self.parts:
-            raise SpecError("a scene without object must have no trajectory", key="object.kind", value=self.scene.object.kind)
+            rule = "a scene without object must have no trajectory"
+            raise SpecError(rule, file=self.scene.source, key="object.kind", value=self.scene.object.kind)
         for index, stage in enumerate(self.scene.trajectory):
             key = f"trajectory[{index}]"
             if stage.kind not in STAGE_KINDS:
-                raise SpecError("unknown stage", key=f"{key}.kind", value=stage.kind, choices=STAGE_KINDS)
+                raise SpecError("unknown stage", file=self.scene.source, key=f"{key}.kind", value=stage.kind, choices=STAGE_KINDS)
             if stage.kind != "indent":
                 continue
             if (stage.depth is None) == (stage.force is None):
-                raise SpecError("needs exactly one of depth and force", key=key, value=(stage.depth, stage.force))
+                raise SpecError("needs exactly one of depth and force", file=self.scene.source, key=key, value=(stage.depth, stage.force))
             if stage.depth is not None and not 0.0 < stage.depth < thickness:
-                raise SpecError(within, key=f"{key}.depth", value=stage.depth)
+                raise SpecError(within, file=self.scene.source, key=f"{key}.depth_mm", value=stage.depth * 1e3)
             if stage.force is not None and not 0.0 < stage.force < np.inf:
-                raise SpecError("must be finite and > 0 [N]", key=f"{key}.force", value=stage.force)
+                raise SpecError("must be finite and > 0 [N]", file=self.scene.source, key=f"{key}.force_n", value=stage.force)
         if self._depths is not None:
             bad = self._depths[np.isfinite(self._depths) & ~((self._depths > 0.0) & (self._depths < thickness))]
             if len(bad):
-                raise InputError("depths", value=float(bad[0]), rule=within)
+                raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
 
     def _start(self, b: int) -> _Environment:
         x, y = np.asarray(self.scene.object.position[:2]) + self._offsets[b]
         if not np.isfinite([x, y]).all() or (self._depths is not None and not np.isfinite(self._depths[b])):
             return _Environment(np.full(3, np.nan), PressRig(self.scene.object.mass, 1.0), failed=True)
-        touch, law = self._touch(x, y, 0.0)
+        try:
+            touch, law = self._touch(x, y, 0.0)
+        except InputError as error:
+            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
+            raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
         stiffest = float((np.diff(law.table) / np.diff(law.depth)).max())
         e = _Environment(np.array([x, y, touch]), PressRig(self.scene.object.mass, stiffest), shear=np.zeros(2))
         e.rig.place(e.origin, touch)
         e.rig.hold(np.array([0.0, 0.0, CLEARANCE, 0.0]), law.secant_stiffness)
         return e
+
+    def _stage_error(self, index: int, error: InputError) -> SpecError:
+        """``error`` of a stage, under the file and key that asked for it, in the unit of the file."""
+        stage = self.scene.trajectory[index]
+        if stage.kind == "shear":
+            name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
+        elif stage.kind == "twist":
+            name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
+        else:
+            name, value = "force_n", error.value
+        kept = f"the force kept here, {error.value:.4g} N, " if error.name == "force" and stage.kind != "indent" else ""
+        return SpecError(kept + error.rule, file=self.scene.source, key=f"trajectory[{index}].{name}", value=value)
 
     def _touch(self, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
         """First-touch height of the object's origin and load law at a place and angle; kept, since environments share them."""
@@ -206,9 +225,10 @@ class RigidPad:
             self._touches[key] = float(pose[2, 3]), LoadLaw(gap, pitch[0] * pitch[1], self.sensor.gelpad)
         return self._touches[key]
 
-    def _advance(self, e: _Environment, old: _Environment, stage: StageSpec, b: int, fraction: float, steps: int) -> None:
-        """Bring one environment from where it was before the stage to ``fraction`` of it."""
+    def _advance(self, e: _Environment, old: _Environment, index: int, b: int, fraction: float, steps: int) -> None:
+        """Bring one environment from where it was before stage ``index`` to ``fraction`` of it."""
         assert old.shear is not None
+        stage = self.scene.trajectory[index]
         previous_force = e.force
         if stage.kind == "shear":
             e.shear = old.shear + fraction * (np.asarray(stage.shear, float) - old.shear)
@@ -217,7 +237,10 @@ class RigidPad:
         elif stage.kind == "indent":
             e.by_force = stage.force is not None
         assert e.shear is not None
-        touch, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
+        try:
+            touch, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
+        except InputError as error:
+            raise self._stage_error(index, error) from error
         e.rig.place(e.origin, touch)
         lift = e.origin[2] - touch
         if stage.kind == "release":
@@ -228,7 +251,10 @@ class RigidPad:
             e.depth = max(old.depth, 0.0) + fraction * (target - max(old.depth, 0.0))
         if e.by_force:
             target = old.force + fraction * ((stage.force or old.force) - old.force)
-            law.depth_at(target)
+            try:
+                law.depth_at(target)
+            except InputError as error:
+                raise self._stage_error(index, error) from error
             e.rig.data.qpos[:] = *e.shear, -max(e.depth, lift), e.twist
             settled = e.rig.load(previous_force, target, stage.duration / steps, law.secant_stiffness)
             e.failed = not settled
