@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-
 from raytac.errors import InputError, RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import versions, write_metrics
