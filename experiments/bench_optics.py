@@ -391,6 +391,7 @@ def peer(bench: Bench, references: References) -> dict[str, Metric]:
         ms = float(np.median(timed(fast.render, moving([surface], 1, 6), bench.frames)))
         levels = rmse(fast.render(surface).rgb[0], fast.response.encode_numpy(linear))
         mine[scene] = Row(ms, ms, levels, rmse(linear_image(fast, surface), linear))
+        metrics[f"fast.{bench.key}.ms.{scene}"] = ms
     metrics |= combined(f"fast.{bench.key}.peer", list(mine.values()))
     for kind in ("path", "reference"):
         tracer = bench.tracer(integrator=kind, progress=kind == "reference")
@@ -558,6 +559,7 @@ def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullLocator
 
     base = bench.key
     style: dict[Any, Any] = {
@@ -580,12 +582,17 @@ def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
         fast = float(metrics[f"fast.{base}.peer.ms"]), float(metrics[f"fast.{base}.peer.rmse_levels"])
         axes.plot(*fast, color="#0072B2", marker="o", markersize=6, linestyle="none", label="raytac fast")
         axes.axhline(255 / 100, color="0.5", linewidth=0.8, linestyle=":")
-        axes.annotate("40 dB", (1, 255 / 100), xycoords=("axes fraction", "data"), xytext=(-3, 2), textcoords="offset points",
-                      ha="right", fontsize=6, color="0.4")  # fmt: skip
+        place = {"xycoords": ("axes fraction", "data"), "xytext": (3, 2), "textcoords": "offset points"}
+        axes.annotate("40 dB", (0, 255 / 100), fontsize=6, color="0.4", **place)
         axes.set(xscale="log", yscale="log", xlabel=f"time of a frame, {bench.name} [ms]", ylabel="RMSE [levels of 255]")
-        axes.grid(True, which="both", linewidth=0.3, color="0.88")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_locator(NullLocator())
+        axes.grid(True, linewidth=0.3, color="0.88")
         axes.set_axisbelow(True)
-        axes.legend(frameon=False)
+        axes.margins(x=0.12, y=0.12)
+        axes.legend(frameon=False, title="numbers: samples a pixel", title_fontsize=6)
         figure.savefig(path, dpi=300)
         plt.close(figure)
 
