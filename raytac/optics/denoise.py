@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -22,9 +23,9 @@ def make_denoiser(mi: Any, device: str, resolution: tuple[int, int]) -> Callable
         optix = mi.OptixDenoiser(input_size=list(resolution))
         return lambda image: np.array(optix(mi.TensorXf(image)))
     try:
-        import mitsuba_oidn
+        oidn = importlib.import_module("mitsuba_oidn")  # an extra: absent from the default install
     except ImportError as error:
         raise BackendError(
             "denoising on the CPU needs Open Image Denoise: `pip install raytac[denoise]`, or render with denoise=False"
         ) from error
-    return lambda image: mitsuba_oidn.denoise(np.ascontiguousarray(image, dtype=np.float32), hdr=True)
+    return lambda image: oidn.denoise(np.ascontiguousarray(image, dtype=np.float32), hdr=True)
