@@ -16,6 +16,7 @@ from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.io.options import parse_resolution
+from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
 
 if TYPE_CHECKING:
@@ -28,12 +29,8 @@ PHYSICS = ("rigid",)
 """Names that ``physics=`` accepts."""
 OPTICS = ("raytrace",)
 """Names that ``optics=`` accepts."""
-INTEGRATORS = ("fast", "reference", "path")
-"""Names that ``integrator=`` accepts."""
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
-OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
-"""Outputs that need an optical mode; without them no renderer is imported."""
 COARSEST_PITCH = 0.1e-3
 """Spacing of the pad's grid where the image does not ask for a finer one [m]."""
 

@@ -9,7 +9,12 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface
 
-__all__ = ["OpticalMode", "OpticsImages"]
+__all__ = ["INTEGRATORS", "OPTICAL_OUTPUTS", "OpticalMode", "OpticsImages"]
+
+INTEGRATORS = ("fast", "reference", "path")
+"""Integrators of the ray tracer."""
+OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
+"""Outputs that need an optical mode; without them no renderer is imported."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.base import OpticsImages
+from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS, OpticsImages
 from raytac.optics.bounce import BounceField, CaseLight
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField, CoatLayout
@@ -26,8 +26,6 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["RayTracer"]
 
-INTEGRATORS = ("fast", "reference", "path")
-OUTPUTS = ("rgb", "layers", "normals", "depth")
 
 
 @dataclass(frozen=True)
@@ -102,8 +100,8 @@ class RayTracer:
         if layers not in ("colour", "led"):
             raise InputError("layers", value=layers, rule="must be a known grouping", choices=("colour", "led"))
         for name in outputs:
-            if name not in OUTPUTS:
-                raise InputError("outputs", value=name, rule="must be an optical output", choices=OUTPUTS)
+            if name not in OPTICAL_OUTPUTS:
+                raise InputError("outputs", value=name, rule="must be an optical output", choices=OPTICAL_OUTPUTS)
         for name, value, lowest in (("spp", spp, 1), ("led_points", led_points, 1), ("max_depth", max_depth, -1)):
             if value is not None and (int(value) != value or value < lowest or (name == "max_depth" and value == 0)):
                 rule = "must be a whole number >= 1" + (", or -1 for no limit" if name == "max_depth" else "")
