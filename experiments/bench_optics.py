@@ -11,16 +11,14 @@ docs/performance.md explains the figures. References are kept in DIR/references 
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +30,20 @@ from raytac.errors import InputError, RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
-from raytac.sensor import TactileSensor
+from raytac.io.options import CommonOptions, parse_names
+from raytac.report.equal_error import cost_at, spp_for_error
+from raytac.report.image_error import mae, psnr, rmse
+from raytac.report.machine import machine
+from raytac.report.references import References
+from raytac.report.surfaces import press_peaks
+from raytac.report.timing import moving, once, timed
+from raytac.report.tracers import Tracers, path_trace
 from raytac.specs.sensor import SensorSpec
 
 PARTS = ("speed", "error", "peer", "stages", "memory", "first_image")
 SPP = (1, 4, 16, 64)
 """Samples a pixel at which path tracing is measured."""
 BATCHES = {"cpu": {"320x240": (1, 8), "640x480": (1,)}, "cuda": {"320x240": (1, 16, 64, 256), "640x480": (1, 256)}}
-NOT_IN_REFERENCE = {"base.py", "bounce.py", "coat.py", "denoise.py", "fast.py", "raytrace.py", "response.py"}
-"""Files of raytac/optics on which a reference image (linear, path-traced) does not depend."""
 FAST_VARIANTS: dict[str, dict[str, Any]] = {"fast": {}, "fast_no_bounce": {"bounce": False}, "fast_4_rays": {"spp": 4}}
 
 CHILD = """
@@ -102,8 +104,9 @@ class Bench:
     spp: int
     peer_spp: tuple[int, ...]
     out: Path
+    tracers: Tracers
     built: dict[str, Any] = field(default_factory=dict)
-    """Ray tracers by their options (building one fits the case's light, which takes seconds), and the last child's result."""
+    """The last child's result."""
 
     @property
     def name(self) -> str:
@@ -114,64 +117,11 @@ class Bench:
         return f"{self.device}.{self.name}"
 
     def tracer(self, size: tuple[int, int] | None = None, **options: Any) -> Any:
-        """Ray tracer of this size and device; path tracers light all LEDs in one pass, three channels, as a plain image needs."""
-        from raytac.optics.raytrace import RayTracer
-
-        key = repr((size, sorted(options.items())))
-        if key not in self.built:
-            spec = self.spec
-            if options.get("integrator") in ("path", "reference"):
-                leds = tuple(replace(led, layer="all") for led in spec.lights.leds)
-                spec = replace(spec, lights=replace(spec.lights, leds=leds))
-            self.built[key] = RayTracer(spec, resolution=size or self.size, device=self.device, seed=self.args.seed, **options)
-        return self.built[key]
+        """Ray tracer of this size and device, as ``Tracers.get`` says."""
+        return self.tracers.get(size or self.size, **options)
 
 
 # ------------------------------------------------------------------------------------------------------------ building blocks
-
-
-def names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """Comma-joined names, each once. Raises InputError for none, or one that is not in ``choices``."""
-    found = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    for name in found:
-        if choices is not None and name not in choices:
-            raise InputError(option, value=name, rule="must be known names joined by commas", choices=choices)
-    if not found:
-        raise InputError(option, value=text, rule="must name at least one", choices=choices or ())
-    return found
-
-
-def press_all(args: Args, scenes: Sequence[str], size: tuple[int, int]) -> tuple[SensorSpec, dict[str, GelSurface]]:
-    """Surface of each scene at its peak, on a grid whose pitch is that of a pixel (at most 0.1 mm)."""
-    sensor = TactileSensor(args.sensor, outputs=("height",), resolution=size, device="cpu", seed=args.seed)
-    return sensor.spec, {Path(scene).stem: sensor.press(scene).surface for scene in scenes}
-
-
-def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
-    """``count`` batches that take turns among ``surfaces``, each environment at 70 to 100 % of the indentation."""
-    batches = []
-    for k in range(count):
-        picks = [surfaces[(k * batch + b) % len(surfaces)] for b in range(batch)]
-        share = 0.7 + 0.3 * (0.618034 * (k * batch + np.arange(batch, dtype=np.float32)) % 1)
-        rest = picks[0].grid.rest.astype(np.float32)
-        height = rest + share[:, None, None].astype(np.float32) * (np.concatenate([s.height for s in picks]) - rest)
-        contact, centre = (np.concatenate([getattr(s, a) for s in picks]) for a in ("contact", "contact_centre"))
-        batches.append(GelSurface(picks[0].grid, height, contact, centre))
-    return batches
-
-
-def once(call: Callable[[Any], object], value: Any) -> float:
-    """Milliseconds of one call."""
-    start = time.perf_counter()
-    call(value)
-    return 1e3 * (time.perf_counter() - start)
-
-
-def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> np.ndarray:
-    """Milliseconds of ``frames`` warm calls with ``inputs`` in turn; each input is called once before, to warm up."""
-    for value in inputs:
-        call(value)
-    return np.array([once(call, inputs[k % len(inputs)]) for k in range(frames)])
 
 
 def kernels(call: Callable[[], object]) -> list[tuple[int, float]]:
@@ -185,78 +135,12 @@ def kernels(call: Callable[[], object]) -> list[tuple[int, float]]:
         return [(entry["size"], entry["execution_time"]) for entry in dr.kernel_history()]
 
 
-def psnr(rmse_levels: float) -> float:
-    """PSNR [dB] of an 8-bit image from its RMSE [levels]; equal images count as a tenth of a level."""
-    return float(20 * np.log10(255 / max(rmse_levels, 0.1)))
-
-
-def rmse(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.sqrt(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2)))
-
-
-def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) -> float:
-    """Samples a pixel at which path tracing has the error ``target``, at least the first of ``spp``.
-
-    Between the measured points log error is linear in log spp; beyond the last, error falls as spp^−1/2.
-    """
-    if target < errors[-1]:
-        return float(spp[-1] * (errors[-1] / target) ** 2)
-    falling = np.maximum.accumulate(-np.log(errors))
-    return float(np.exp(np.interp(-np.log(target), falling, np.log(spp))))
-
-
-def cost_at(spp: Sequence[int], ms: Sequence[float], wanted: float) -> float:
-    """Kernel time [ms] at ``wanted`` samples: linear between the measured points, proportional beyond the last."""
-    return float(ms[-1] * wanted / spp[-1]) if wanted > spp[-1] else float(np.interp(wanted, spp, ms))
-
-
-def path_trace(tracer: Any, surface: GelSurface, spp: int, seed: int) -> np.ndarray:
-    """Linear radiance (H, W, 3) from a path tracer of ``Bench.tracer``, with its vertex update and BVH rebuild."""
-    tracer.spp, tracer.seed = spp, seed
-    return tracer.render_layers(surface)["all"][0]
-
-
 def set_surface(tracer: Any, surface: GelSurface) -> None:
     """Vertex update, normals and BVH rebuild alone."""
     import drjit as dr
 
     tracer.scene.set_surface(surface.height[0])
     dr.sync_thread()
-
-
-class References:
-    """Two independent half-``spp`` images a scene, linear; kept in ``out/references`` under a hash of all that shapes them."""
-
-    def __init__(self, bench: Bench) -> None:
-        import raytac.optics
-
-        self.bench, self.folder = bench, bench.out / "references"
-        code = sorted(Path(raytac.optics.__file__).parent.glob("*.py"))
-        spec = replace(bench.spec, source=None, lights=replace(bench.spec.lights, source=None))
-        basis = [repr(spec), bench.name, str(bench.spp), str(bench.args.seed), *versions(("mitsuba", "drjit")).values()]
-        self._basis = "\n".join(basis).encode() + b"".join(p.read_bytes() for p in code if p.name not in NOT_IN_REFERENCE)
-
-    def halves(self, scene: str) -> np.ndarray:
-        """(2, H, W, 3) float32."""
-        surface = self.bench.surfaces[scene]
-        path = self.folder / f"{scene}-{hashlib.sha256(self._basis + surface.height.tobytes()).hexdigest()[:20]}.npz"
-        if path.is_file():
-            return np.load(path)["halves"]
-        tracer, seed, half = (
-            self.bench.tracer(integrator="reference", progress=True),
-            2 * self.bench.args.seed,
-            self.bench.spp // 2,
-        )
-        print(f"reference of {scene}: 2 x {half} spp")
-        halves = np.stack([path_trace(tracer, surface, half, seed + k) for k in (0, 1)])
-        self.folder.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial.npz")
-        np.savez(partial, halves=halves)
-        os.replace(partial, path)
-        return halves
-
-    def linear(self, scene: str) -> np.ndarray:
-        return self.halves(scene).mean(axis=0)
 
 
 # ------------------------------------------------------------------------------------------------------------ parts
@@ -272,7 +156,9 @@ def speed(bench: Bench) -> dict[str, Metric]:
         width, height = (int(n) for n in name.split("x"))
         surfaces = bench.surfaces
         if (width, height) != bench.size:
-            surfaces = press_all(bench.args, names(bench.args.scenes, "scenes"), (width, height))[1]
+            surfaces = press_peaks(bench.args.sensor, parse_names(bench.args.scenes, "scenes"), (width, height), bench.args.seed)[
+                1
+            ]
         tracer = bench.tracer(None if (width, height) == bench.size else (width, height))
         for batch in tqdm(batches, desc=f"speed {name}", leave=False, disable=None):
             inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
@@ -296,16 +182,6 @@ def speed(bench: Bench) -> dict[str, Metric]:
     return metrics
 
 
-def contact_box(tracer: Any, surface: GelSurface) -> tuple[slice, slice]:
-    """Rows and columns [px] of the box round the contact in the image; the whole image if nothing touches."""
-    iy, ix = np.nonzero(surface.contact[0])
-    points = np.stack([surface.grid.x[ix], surface.grid.y[iy], surface.height[0, iy, ix]], axis=-1)
-    limits = np.array(tracer.camera.resolution) - 1
-    pixels = np.clip(np.floor(tracer.camera.project(points)).astype(int), 0, limits) if len(ix) else np.array([[0, 0], limits])
-    low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
 def linear_image(tracer: Any, surface: GelSurface) -> np.ndarray:
     """Sum of the layers of ``fast``, (H, W, 3)."""
     return np.sum(list(tracer.render_layers(surface).values()), axis=0)[0]
@@ -320,17 +196,18 @@ def error(bench: Bench, references: References) -> dict[str, Metric]:
         tracer = bench.tracer(**options)
         encode, key = tracer.response.encode_numpy, f"{variant}.{bench.key}"
         for scene, surface in bench.surfaces.items():
-            truth, image = encode(references.linear(scene)), tracer.render(surface).rgb[0]
-            box = contact_box(tracer, surface)
+            truth, image = encode(references.linear(scene, surface)), tracer.render(surface).rgb[0]
+            box = bench.tracers.regions(bench.size, surface)["box"]
+            box = box if box.any() else np.ones_like(box)
             metrics |= {
                 f"{key}.psnr_db.{scene}": psnr(rmse(image, truth)),
-                f"{key}.mae_levels.{scene}": float(np.abs(image.astype(float) - truth).mean()),
-                f"{key}.contact_psnr_db.{scene}": psnr(rmse(image[box], truth[box])),
-                f"{key}.contact_mae_levels.{scene}": float(np.abs(image[box].astype(float) - truth[box]).mean()),
+                f"{key}.mae_levels.{scene}": mae(image, truth),
+                f"{key}.box_psnr_db.{scene}": psnr(rmse(image[box], truth[box])),
+                f"{key}.box_mae_levels.{scene}": mae(image[box], truth[box]),
             }
             if variant == "fast":
                 # The halves are independent: half their difference has the variance of their mean.
-                noise = rmse(*(encode(half) for half in references.halves(scene))) / 2
+                noise = rmse(*(encode(half) for half in references.halves(scene, surface))) / 2
                 metrics |= {f"reference.noise_levels.{scene}": noise, f"reference.noise_psnr_db.{scene}": psnr(noise)}
                 metrics[f"reference.mean_level.{scene}"] = float(truth.mean())
         metrics[f"{key}.psnr_db"] = min(float(metrics[f"{key}.psnr_db.{scene}"]) for scene in bench.surfaces)
@@ -387,7 +264,7 @@ def peer(bench: Bench, references: References) -> dict[str, Metric]:
     """
     fast, metrics, mine = bench.tracer(), {}, {}
     for scene, surface in bench.surfaces.items():
-        linear = references.linear(scene)
+        linear = references.linear(scene, surface)
         ms = float(np.median(timed(fast.render, moving([surface], 1, 6), bench.frames)))
         levels = rmse(fast.render(surface).rgb[0], fast.response.encode_numpy(linear))
         mine[scene] = Row(ms, ms, levels, rmse(linear_image(fast, surface), linear))
@@ -398,7 +275,7 @@ def peer(bench: Bench, references: References) -> dict[str, Metric]:
         rows_of: list[list[Row]] = []
         ratios: dict[str, list[float]] = {"": [], "_linear": [], "_without_rebuild": []}
         for scene, surface in tqdm(bench.surfaces.items(), desc=f"peer {kind}", leave=False, disable=None):
-            rows = trace_rows(bench, tracer, surface, references.linear(scene))
+            rows = trace_rows(bench, tracer, surface, references.linear(scene, surface))
             rebuild = rebuild_ms(tracer, surface, max(3, bench.frames // 6))
             rows_of.append(rows)
             needed = spp_for_error(bench.peer_spp, [row.rmse_levels for row in rows], mine[scene].rmse_levels)
@@ -479,7 +356,7 @@ def child(bench: Bench, updates: int) -> dict[str, float]:
     """Run ``CHILD`` in a process of its own; adds ``process_s``, all of its time. With ``quick``, one run serves all."""
     if bench.args.quick and "child" in bench.built:
         return bench.built["child"]
-    scene = names(bench.args.scenes, "scenes")[0]
+    scene = parse_names(bench.args.scenes, "scenes")[0]
     start = time.perf_counter()
     command = [sys.executable, "-c", CHILD, bench.args.sensor, bench.device, scene, str(updates), bench.name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -512,27 +389,6 @@ def first_image(bench: Bench) -> dict[str, Metric]:
 
 
 # ------------------------------------------------------------------------------------------------------------ what is shown
-
-
-def machine() -> dict[str, Metric]:
-    """CPU, cores, load and GPU, as far as the system tells."""
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        cpu = next(
-            (line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), cpu
-        )
-    found: dict[str, Metric] = {
-        "machine.cpu": cpu,
-        "machine.cores": os.cpu_count() or 0,
-        "machine.load_at_start": os.getloadavg()[0],
-    }
-    try:
-        ask = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-        gpu = subprocess.run(ask, capture_output=True, text=True, check=False, timeout=20).stdout.strip()
-    except (OSError, subprocess.TimeoutExpired):
-        gpu = ""
-    return found | ({"machine.gpu": gpu.splitlines()[0]} if gpu else {})
 
 
 def as_text(metrics: dict[str, Metric], bench: Bench) -> str:
@@ -599,8 +455,8 @@ def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
 
 def main(args: Args) -> None:
     start = time.perf_counter()
-    parts = names(args.parts, "parts", PARTS)
-    scenes = names(args.scenes, "scenes")
+    parts = parse_names(args.parts, "parts", PARTS)
+    scenes = parse_names(args.scenes, "scenes")
     if args.spp < 2 or args.frames < 1:
         raise InputError("spp, frames", value=(args.spp, args.frames), rule="must be at least 2 and 1")
     out = args.out if args.out is not None else Path("runs") / "bench_optics"
@@ -608,10 +464,11 @@ def main(args: Args) -> None:
 
     device = load_mitsuba(args.device)[1]
     size = (80, 60) if args.quick else (320, 240)
-    spec, surfaces = press_all(args, scenes[:1] if args.quick else scenes, size)
+    spec, surfaces = press_peaks(args.sensor, scenes[:1] if args.quick else scenes, size, args.seed)
     frames, spp, peer_spp = (5, 16, SPP[:2]) if args.quick else (args.frames, args.spp, SPP)
-    bench = Bench(args, device, spec, size, surfaces, frames, spp, peer_spp, out)
-    references = References(bench)
+    tracers = Tracers(spec, device, args.seed)
+    bench = Bench(args, device, spec, size, surfaces, frames, spp, peer_spp, out, tracers)
+    references = References(out / "references", tracers, size, spp)
     metrics: dict[str, Metric] = {"experiment": "bench_optics", "device": device, "seed": args.seed, **versions(), **machine()}
     metrics |= {"frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
     jobs: dict[str, Callable[[], dict[str, Metric]]] = {

@@ -8,7 +8,7 @@ from typing import Literal
 
 from raytac.errors import InputError
 
-__all__ = ["CommonOptions", "DeviceName", "parse_outputs", "parse_resolution"]
+__all__ = ["CommonOptions", "DeviceName", "parse_names", "parse_outputs", "parse_resolution"]
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -37,16 +37,26 @@ def parse_resolution(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once, in the order given.
+
+    Raises:
+        InputError: none, or one that is not in ``choices`` (None is any).
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in names:
+        if choices is not None and name not in choices:
+            raise InputError(option, value=name, rule="must be known names joined by commas", choices=choices)
+    if not names:
+        raise InputError(option, value=text, rule="must name at least one", choices=choices or ())
+    return names
+
+
 def parse_outputs(text: str, choices: tuple[str, ...]) -> tuple[str, ...]:
     """``"rgb,depth"`` to names in the order of ``choices``, each once.
 
     Raises:
         InputError: an unknown name, or none.
     """
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in choices:
-            raise InputError("outputs", value=name, rule="must be known outputs joined by commas", choices=choices)
-    if not names:
-        raise InputError("outputs", value=text, rule="must name at least one output", choices=choices)
+    names = parse_names(text, "outputs", choices)
     return tuple(name for name in choices if name in names)

@@ -1,0 +1,45 @@
+"""A digest of the source code that a result depends on, so that a kept result is never taken for one of other code."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+from collections.abc import Iterable
+from pathlib import Path
+
+__all__ = ["code_digest", "module_sources"]
+
+
+def module_sources(roots: Iterable[str], within: str = "raytac.optics") -> dict[str, Path]:
+    """Source files of ``roots`` and of all that they import, also inside functions, in the package ``within``; missing ones are left out.
+
+    Only imports are followed, nothing is run except the ``__init__`` of packages.
+    """
+    found: dict[str, Path] = {}
+    waiting = list(roots)
+    while waiting:
+        name = waiting.pop()
+        if name in found or not (name + ".").startswith(within + "."):
+            continue
+        try:
+            spec = importlib.util.find_spec(name)
+        except ModuleNotFoundError:
+            spec = None
+        if spec is None or spec.origin is None:
+            continue
+        found[name] = Path(spec.origin)
+        for node in ast.walk(ast.parse(found[name].read_bytes())):
+            if isinstance(node, ast.Import):
+                waiting += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return found
+
+
+def code_digest(*roots: str) -> str:
+    """Hex digest of the names and contents of ``module_sources(roots)``."""
+    digest = hashlib.sha256()
+    for name, path in sorted(module_sources(roots).items()):
+        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
