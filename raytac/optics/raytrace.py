@@ -21,6 +21,7 @@ from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.refraction import Slab
 from raytac.optics.response import Response
 from raytac.optics.scene import UNIT, SensorScene
+from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, safe_heights
 from raytac.optics.variant import load_mitsuba
 from raytac.specs.sensor import SensorSpec
 
@@ -147,12 +148,9 @@ class RayTracer:
     def _prepare(self, grid: PadGrid) -> None:
         """Build scene, layout and fields for a pad grid; done at the first frame and kept."""
         if self._grid is not None:
-            same = all(np.array_equal(getattr(grid, name), getattr(self._grid, name)) for name in ("x", "y", "rest"))
-            if grid is not self._grid and not same:
-                rule = f"one ray tracer renders one grid and rest surface, the first that it was given, {self._grid.shape} here"
-                raise InputError("surface.grid", value=grid.shape, rule=rule)
+            check_same_grid(grid, self._grid)
             return
-        self._check_view(grid)
+        check_view(self.camera, grid)
         mi = self.mi
         self.layout = CoatLayout.from_grid(grid)
         self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
@@ -174,17 +172,6 @@ class RayTracer:
             self.response.set_flat_field(self._flat_field, total(self._layers(rest))[0])
         self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
         self._grid = grid
-
-    def _check_view(self, grid: PadGrid) -> None:
-        # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
-        width, height = self.camera.resolution
-        cx, cy = self.camera.principal
-        views = self.camera.ray(np.array([0.0, width]), cy), self.camera.ray(cx, np.array([0.0, height]))
-        for k, (axis, nodes, (origin, slope)) in enumerate(zip("xy", (grid.x, grid.y), views, strict=True)):
-            seen = origin[k] - slope[k] * origin[2]
-            if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
-                rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
-                raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)
 
     # ---------------------------------------------------------------- images
 
@@ -233,19 +220,9 @@ class RayTracer:
 
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
-        expected = surface.grid.shape
-        for name, array in (("height", surface.height), ("contact", surface.contact)):
-            if array.ndim != 3 or array.shape[1:] != expected or len(array) < 1 or len(array) != len(surface.height):
-                rule = f"must have shape (B, {expected[0]}, {expected[1]}) with B >= 1, as its grid and height say"
-                raise InputError(f"surface.{name}", value=array.shape, rule=rule)
+        check_shapes(surface)
         self._prepare(surface.grid)
-        heights = np.ascontiguousarray(surface.height, dtype=np.float32)
-        failed = np.array([not np.isfinite(one).all() for one in heights])
-        # A NaN would become an index into device memory.
-        if failed.any():
-            heights = heights.copy()
-            heights[failed] = surface.grid.rest
-        return heights, failed
+        return safe_heights(surface)
 
     def _layers(self, heights: np.ndarray) -> dict[str, np.ndarray]:
         width, height = self.camera.resolution
