@@ -6,15 +6,14 @@ import math
 
 import numpy as np
 
-from raytac.errors import SpecError
+from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part, mesh_part, primitive
 from raytac.gel.relief import relief_part
 from raytac.physics.coin import coin_elevation
 from raytac.specs.press import ObjectSpec
+from raytac.specs.press_file import OBJECT_SCHEMA
 
-__all__ = ["OBJECT_KINDS", "object_parts"]
-
-OBJECT_KINDS = ("none", "sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
+__all__ = ["object_parts"]
 
 
 def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
@@ -24,11 +23,12 @@ def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
     centre at the origin (standing; turn it by 90° about y to lie along x). ``edge``: a cube about the origin with one edge down,
     along x. ``cone``: rounded tip down at the origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying
     flat. ``pins``: a plate with rows × columns (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0.
-    ``coin``: face down, field at z = 0. ``mesh``: as its file has it.
-    Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind or a missing or impossible length.
+    ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
+    Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind, a missing or impossible length, or a model
+    that MuJoCo refuses or that has no such body.
     """
-    if spec.kind not in OBJECT_KINDS:
-        raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=OBJECT_KINDS)
+    if spec.kind not in OBJECT_SCHEMA:
+        raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=tuple(OBJECT_SCHEMA))
     if spec.kind == "none":
         return ()
     if spec.kind == "sphere":
@@ -48,6 +48,8 @@ def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
         return _pins(spec)
     if spec.kind == "coin":
         return _coin(spec)
+    if spec.kind == "mjcf":
+        return _mjcf(spec)
     from raytac.specs.mesh import load_mesh
 
     vertices, faces = load_mesh(str(spec.params["path"]), _length(spec, "scale"))
@@ -72,6 +74,20 @@ def _coin(spec: ObjectSpec) -> tuple[Part, ...]:
     radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
     body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
     return body, relief_part(coin_elevation(radius, relief), radius)
+
+
+def _mjcf(spec: ObjectSpec) -> tuple[Part, ...]:
+    from raytac.physics.geoms import body_parts, load_mjcf
+
+    try:
+        model = load_mjcf(str(spec.params["path"]))
+    except InputError as error:
+        raise SpecError(error.rule, key="object.path", value=spec.params["path"]) from error
+    try:
+        return body_parts(model, str(spec.params["body"]))
+    except InputError as error:
+        about = "" if error.name == "body" else f"{error.name} = {error.value!r} "
+        raise SpecError(about + error.rule, key="object.body", value=spec.params["body"], choices=error.choices) from error
 
 
 def _shift(x: float, y: float, z: float) -> np.ndarray:

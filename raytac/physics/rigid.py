@@ -7,24 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from raytac.errors import InputError, SpecError
+from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
+from raytac.gel.part import Part
 from raytac.gel.surface import GelSurface
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.objects import object_parts
 from raytac.physics.rig import PressRig
 from raytac.specs.press import PressScene
+from raytac.specs.press_file import STAGE_SCHEMA
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CLEARANCE", "ContactState", "RigidPad"]
 
 CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before the press and after a release."""
-STAGE_KINDS = ("indent", "shear", "twist", "release")
-"""What a stage of a trajectory can be."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class RigidPad:
         if num_envs < 1:
             raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
         self.grid = make_grid(sensor.gelpad, pitch)
-        self.parts = object_parts(scene.object)
+        self.parts = self._object_parts()
         self._surround = ElasticSurround(self.grid)
         self._offsets = _per_environment("offsets", offsets, (num_envs, 2))
         self._depths = None if depths is None else _per_environment("depths", depths, (num_envs,))
@@ -162,6 +162,16 @@ class RigidPad:
         height = object_height(self.parts, pad_from_object, self.grid.x, self.grid.y, below=highest)
         return self._surround.surface(height, pad_from_object if self.parts else None)
 
+    def _object_parts(self) -> tuple[Part, ...]:
+        try:
+            return object_parts(self.scene.object)
+        except MeshError:  # names its own file
+            raise
+        except SpecError as error:
+            raise SpecError(
+                error.rule, file=self.scene.source, key=error.key, value=error.value, choices=error.choices
+            ) from error
+
     def _check_trajectory(self) -> None:
         thickness = self.sensor.gelpad.thickness
         within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
@@ -170,12 +180,15 @@ class RigidPad:
             raise SpecError(rule, file=self.scene.source, key="object.kind", value=self.scene.object.kind)
         for index, stage in enumerate(self.scene.trajectory):
             key = f"trajectory[{index}]"
-            if stage.kind not in STAGE_KINDS:
-                raise SpecError("unknown stage", file=self.scene.source, key=f"{key}.kind", value=stage.kind, choices=STAGE_KINDS)
+            if stage.kind not in STAGE_SCHEMA:
+                choices = tuple(STAGE_SCHEMA)
+                raise SpecError("unknown stage", file=self.scene.source, key=f"{key}.kind", value=stage.kind, choices=choices)
             if stage.kind != "indent":
                 continue
             if (stage.depth is None) == (stage.force is None):
-                raise SpecError("needs exactly one of depth and force", file=self.scene.source, key=key, value=(stage.depth, stage.force))
+                raise SpecError(
+                    "needs exactly one of depth and force", file=self.scene.source, key=key, value=(stage.depth, stage.force)
+                )
             if stage.depth is not None and not 0.0 < stage.depth < thickness:
                 raise SpecError(within, file=self.scene.source, key=f"{key}.depth_mm", value=stage.depth * 1e3)
             if stage.force is not None and not 0.0 < stage.force < np.inf:

@@ -8,7 +8,7 @@ from typing import Final
 from raytac.assets import AssetKind, asset_root
 from raytac.errors import SpecError
 
-__all__ = ["available", "find_file"]
+__all__ = ["available", "find_file", "is_file"]
 
 _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "sensor": ("scenes", "sensors"),
@@ -44,12 +44,17 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
         raise SpecError(f"the path has no meaning here ({error})", key=what, value=text) from error
     candidates = [base / path] if base is not None else [Path.cwd() / path, asset_root(_FOLDERS[what][0]).parent / path]
     for candidate in candidates:
-        try:
-            if candidate.is_file():
-                return candidate.resolve()
-        except (OSError, ValueError):
-            continue
+        if is_file(candidate):
+            return candidate.resolve()
     raise SpecError("the file does not exist", file=candidates[0], key=what, value=text)
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; False for a path that no file can have, such as a name too long."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _folder(what: str) -> Path:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import MeshError
+from raytac.specs.files import is_file
 
 __all__ = ["MESH_SUFFIXES", "SIZE_RANGE", "load_mesh"]
 
@@ -36,7 +37,7 @@ def load_mesh(path: str | Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError("must be a finite number of metres per file unit > 0", file=path, key="scale", value=scale)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError("unknown mesh format", file=path, key="suffix", value=path.suffix, choices=MESH_SUFFIXES)
-    if not _is_file(path):
+    if not is_file(path):
         raise MeshError("the mesh file does not exist", file=path)
     mesh = _read(path)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
@@ -55,13 +56,6 @@ def load_mesh(path: str | Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
         rule = f"the object is {extent * 1e3:.4g} mm long, must be {low:g} to {high:g} mm: scale is metres per file unit"
         raise MeshError(rule, file=path, key="scale", value=scale)
     return np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int32)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name too long for the file system
-        return False
 
 
 def _read(path: Path) -> Any:

@@ -15,14 +15,15 @@ class ObjectSpec:
     """The indenter, a union of convex or concave parts rigidly joined.
 
     Most kinds are exact shapes: sphere, cylinder, edge, cone, torus and pins are computed from a few lengths, so that no facet
-    shows in an image; a coin is an elevation map made in code; only ``mesh`` reads triangles from a file.
+    shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body.
     """
 
     kind: str
-    """``none sphere cylinder edge cone torus pins coin mesh``."""
+    """``none sphere cylinder edge cone torus pins coin mesh mjcf``."""
     params: dict[str, float | int | str]
     """Lengths [m] and counts of the kind, by the key of its TOML file without the unit; for ``mesh`` the absolute ``path`` and
-    ``scale`` [m per file unit]. Object frame of each kind: ``scenes/README.md``."""
+    ``scale`` [m per file unit], for ``mjcf`` the absolute ``path`` and the name of the ``body``. Object frame of each kind:
+    ``scenes/README.md``."""
     position: Vec3
     """Offset of the object's origin from first touch above the pad centre, pad frame [m]; z is not used (contact sets it)."""
     quaternion: tuple[float, float, float, float]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from raytac.errors import MeshError, SpecError
-from raytac.specs.files import find_file
+from raytac.specs.files import find_file, is_file
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -34,6 +34,7 @@ OBJECT_SCHEMA: Final[dict[str, Schema]] = {
     },
     "coin": {"radius_mm": _LENGTH, "thickness_mm": _LENGTH, "relief_height_mm": _LENGTH},
     "mesh": {"path": Text(), "scale_m_per_unit": Number("(0, 10]")},
+    "mjcf": {"path": Text(), "body": Text()},
 }
 """Kind of object to the keys of its own in ``[object]``."""
 
@@ -62,7 +63,8 @@ def load_press(name_or_path: str | Path) -> PressScene:
         name_or_path: shipped name such as ``"coin"``, or path of a TOML file (see ``scenes/README.md``).
 
     Returns:
-        The scene in SI units; its name is the file's stem. A mesh is read once to check it; ``params["path"]`` is absolute.
+        The scene in SI units; its name is the file's stem. A mesh is read once to check it; ``params["path"]`` is absolute. An MJCF
+        model is compiled only when it is pressed.
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, an object whose lengths
@@ -121,8 +123,12 @@ def _read_object(table: Table) -> ObjectSpec:
         raise table.error(rule, "quaternion_wxyz", table.data["quaternion_wxyz"])
     w, i, j, k = (component / length for component in quaternion)
     _check_lengths(table, kind, values)
+    if kind in ("mesh", "mjcf"):
+        values["path"] = str(_resolved(table, values["path"]))
     if kind == "mesh":
-        _resolve_mesh(table, values)
+        _check_mesh(table, values)
+    elif kind == "mjcf" and not is_file(Path(values["path"])):
+        raise table.error(f"the model file does not exist ({values['path']})", "path", table.data["path"])
     return ObjectSpec(kind, values, (x, y, 0.0), (w, i, j, k), mass)
 
 
@@ -138,19 +144,21 @@ def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
         raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
 
 
-def _resolve_mesh(table: Table, values: dict[str, Any]) -> None:
+def _resolved(table: Table, path: str) -> Path:
+    """Absolute path of a file that a scene names, relative to the scene's folder."""
     try:
-        path = (table.file.parent / Path(values["path"]).expanduser()).resolve()
+        return (table.file.parent / Path(path).expanduser()).resolve()
     except (OSError, RuntimeError) as error:  # "~nobody/x.stl", or a circle of links
-        raise table.error(f"the path has no meaning here ({error})", "path", values["path"]) from error
+        raise table.error(f"the path has no meaning here ({error})", "path", path) from error
+
+
+def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
     try:
-        load_mesh(path, values["scale"])
+        load_mesh(values["path"], values["scale"])
     except MeshError as error:
         key = "scale_m_per_unit" if error.key == "scale" else "path"
-        raise MeshError(
-            f"{error.rule} (mesh {path})", file=table.file, key=f"object.{key}", value=table.data[key], choices=error.choices
-        ) from error
-    values["path"] = str(path)
+        rule = f"{error.rule} (mesh {values['path']})"
+        raise MeshError(rule, file=table.file, key=f"object.{key}", value=table.data[key], choices=error.choices) from error
 
 
 def _read_trajectory(tables: tuple[Table, ...]) -> tuple[StageSpec, ...]:
