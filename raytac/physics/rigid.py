@@ -1,4 +1,4 @@
-"""The rigid pad: MuJoCo moves the object, the contact's compliance ties depth to force, the gel's shape follows from geometry."""
+"""The rigid pad: MuJoCo moves the object or the case, the contact's compliance ties depth to force, the gel's shape follows from geometry."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.objects import object_parts
 from raytac.physics.rig import PressRig
-from raytac.specs.press import PressScene
+from raytac.specs.press import MOVES, PressScene
 from raytac.specs.press_file import STAGE_SCHEMA
 from raytac.specs.sensor import SensorSpec
 
@@ -31,7 +31,8 @@ CLEARANCE = 1e-3
 class ContactState:
     """B environments at one instant. Forces are those of the object on the gel, pad frame.
 
-    pad_from_object, shape (B, 4, 4): pose of the object. depth [m], (B,): travel below first touch at zero shear and twist;
+    pad_from_object, shape (B, 4, 4): pose of the object. world_from_pad, shape (B, 4, 4): pose of the case; the identity unless the
+    scene moves it (world and pad frame are one at first touch). depth [m], (B,): travel below first touch at zero shear and twist;
     negative when lifted. normal_force [N], (B,): towards −z, >= 0. shear_force [N], (B, 2): along x and y. twist_torque [N m],
     (B,): about +z. failed, (B,) bool: the state of this environment is not finite or did not settle (its pose is then NaN).
     """
@@ -43,6 +44,7 @@ class ContactState:
     fraction: float
     """How much of the stage is done, in (0, 1]."""
     pad_from_object: np.ndarray
+    world_from_pad: np.ndarray
     depth: np.ndarray
     normal_force: np.ndarray
     shear_force: np.ndarray
@@ -173,6 +175,8 @@ class RigidPad:
             ) from error
 
     def _check_trajectory(self) -> None:
+        if self.scene.moves not in MOVES:
+            raise SpecError("must be a known side", file=self.scene.source, key="moves", value=self.scene.moves, choices=MOVES)
         thickness = self.sensor.gelpad.thickness
         within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
         if self.scene.trajectory and not self.parts:
@@ -201,17 +205,20 @@ class RigidPad:
     def _start(self, b: int) -> _Environment:
         x, y = np.asarray(self.scene.object.position[:2]) + self._offsets[b]
         if not np.isfinite([x, y]).all() or (self._depths is not None and not np.isfinite(self._depths[b])):
-            return _Environment(np.full(3, np.nan), PressRig(self.scene.object.mass, 1.0), failed=True)
+            return _Environment(np.full(3, np.nan), self._rig(1.0), failed=True)
         try:
             touch, law = self._touch(x, y, 0.0)
         except InputError as error:
             place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
             raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
         stiffest = float((np.diff(law.table) / np.diff(law.depth)).max())
-        e = _Environment(np.array([x, y, touch]), PressRig(self.scene.object.mass, stiffest), shear=np.zeros(2))
+        e = _Environment(np.array([x, y, touch]), self._rig(stiffest), shear=np.zeros(2))
         e.rig.place(e.origin, touch)
         e.rig.hold(np.array([0.0, 0.0, CLEARANCE, 0.0]), law.secant_stiffness)
         return e
+
+    def _rig(self, stiffest: float) -> PressRig:
+        return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
 
     def _stage_error(self, index: int, error: InputError) -> SpecError:
         """``error`` of a stage, under the file and key that asked for it, in the unit of the file."""
@@ -268,10 +275,10 @@ class RigidPad:
                 law.depth_at(target)
             except InputError as error:
                 raise self._stage_error(index, error) from error
-            e.rig.data.qpos[:] = *e.shear, -max(e.depth, lift), e.twist
+            e.rig.joints = np.array([*e.shear, -max(e.depth, lift), e.twist])
             settled = e.rig.load(previous_force, target, stage.duration / steps, law.secant_stiffness)
             e.failed = not settled
-            e.depth = -float(e.rig.data.qpos[2])
+            e.depth = -float(e.rig.joints[2])
         if not e.failed:
             e.force = e.rig.hold(np.array([*e.shear, -e.depth, e.twist]), law.secant_stiffness)
             e.failed = not np.isfinite(e.force)
@@ -298,13 +305,13 @@ class RigidPad:
 
     def _state(self, stage: int, kind: str, fraction: float, environments: list[_Environment]) -> ContactState:
         batch = self.num_envs
-        pose = np.tile(np.eye(4), (batch, 1, 1))
+        pose, case = np.tile(np.eye(4), (2, batch, 1, 1))
         depth, force, shear, torque = np.zeros(batch), np.zeros(batch), np.zeros((batch, 2)), np.zeros(batch)
         failed = np.zeros(batch, bool)
         turn = np.eye(4)
         turn[:3, :3] = self._rotation
         for b, e in enumerate(environments):
-            pose[b] = e.rig.pose @ turn
+            pose[b], case[b] = e.rig.pad_from_object @ turn, e.rig.world_from_pad
             depth[b], force[b] = e.depth, e.force
             if e.stuck_shear is not None and e.shear is not None:
                 _, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
@@ -312,8 +319,9 @@ class RigidPad:
                 torque[b] = law.twist_stiffness(e.rig.depth) * (e.twist - e.stuck_twist)
             if e.failed:
                 failed[b] = True
-                pose[b], depth[b], force[b], shear[b], torque[b] = np.nan, np.nan, np.nan, np.nan, np.nan
-        return ContactState(stage, kind, fraction, pose, depth, force, shear, torque, failed, self.scene)
+                for array in (pose, case, depth, force, shear, torque):
+                    array[b] = np.nan
+        return ContactState(stage, kind, fraction, pose, case, depth, force, shear, torque, failed, self.scene)
 
 
 def _per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

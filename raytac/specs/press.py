@@ -7,7 +7,10 @@ from pathlib import Path
 
 from raytac.specs.sensor import Vec3
 
-__all__ = ["ObjectSpec", "PressScene", "StageSpec"]
+__all__ = ["MOVES", "ObjectSpec", "PressScene", "StageSpec"]
+
+MOVES = ("object", "case")
+"""What a press can move; the other side stands still."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class ObjectSpec:
     quaternion: tuple[float, float, float, float]
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
-    """Mass of the object [kg] (matters only for force-driven stages)."""
+    """Mass on the drive [kg]; matters only for the way to a force, not for where it settles."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class PressScene:
     object: ObjectSpec
     trajectory: tuple[StageSpec, ...]
     """Empty for an untouched pad."""
+    moves: str = "object"
+    """Which side the trajectory moves, one of ``MOVES``. Targets are the object's against the pad either way."""
     source: Path | None = None
 
     @property

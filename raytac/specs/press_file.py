@@ -10,11 +10,11 @@ from typing import Any, Final
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import find_file, is_file
 from raytac.specs.mesh import load_mesh
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.specs.press import MOVES, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
 
-__all__ = ["OBJECT_SCHEMA", "POSE_SCHEMA", "STAGE_SCHEMA", "load_press", "validate_press"]
+__all__ = ["OBJECT_SCHEMA", "POSE_SCHEMA", "SCENE_SCHEMA", "STAGE_SCHEMA", "load_press", "validate_press"]
 
 _LENGTH = Number("(0, 100]")
 
@@ -37,6 +37,9 @@ OBJECT_SCHEMA: Final[dict[str, Schema]] = {
     "mjcf": {"path": Text(), "body": Text()},
 }
 """Kind of object to the keys of its own in ``[object]``."""
+
+SCENE_SCHEMA: Final[Schema] = {"moves": Text(choices=MOVES, default="object")}
+"""Keys at the top of a scene."""
 
 POSE_SCHEMA: Final[Schema] = {
     "position_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
@@ -73,14 +76,16 @@ def load_press(name_or_path: str | Path) -> PressScene:
     """
     path = find_file("press scene", name_or_path)
     top = read_toml(path)
-    top.read({}, sections=("object", "trajectory"))
+    moves = top.read(SCENE_SCHEMA, sections=("object", "trajectory"))["moves"]
     target = _read_object(top.section("object"))
     stages = top.sections("trajectory")
+    if target.kind == "none" and "moves" in top.data:
+        raise top.error("must be absent where there is no object", "moves", moves)
     if target.kind == "none" and stages:
         raise top.error("must be absent where there is no object", "trajectory")
     if target.kind != "none" and not stages:
         raise top.error("at least one [[trajectory]] stage is needed to press the object", "trajectory")
-    return PressScene(path.stem, target, _read_trajectory(stages), source=path)
+    return PressScene(path.stem, target, _read_trajectory(stages), moves, source=path)
 
 
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:

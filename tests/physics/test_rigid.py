@@ -119,8 +119,9 @@ def test_force_grows_with_depth(kind: str) -> None:
     assert force[0] == 0.0 and (np.diff(force) > 0.0).all()
 
 
-def test_mujoco_contact_has_the_stiffness_it_was_given() -> None:
-    rig = PressRig(mass=0.05, stiffest=5e3)
+@pytest.mark.parametrize("moves", ["object", "case"])
+def test_mujoco_contact_has_the_stiffness_it_was_given(moves: str) -> None:
+    rig = PressRig(mass=0.05, stiffest=5e3, moves=moves)
     rig.place(np.array([0.0, 0.0, 3e-3]), 3e-3)
     for stiffness in (200.0, 1000.0, 5000.0):
         force = rig.hold(np.array([0.0, 0.0, -0.4e-3, 0.0]), lambda _, k=stiffness: k)
@@ -245,6 +246,47 @@ def test_diverging_state_marks_its_environment() -> None:
     assert not rig.load(0.0, math.nan, 0.01, lambda _: 1e3)
 
 
+@pytest.mark.parametrize("kind", ["sphere", "torus", "coin"])
+def test_moving_the_case_is_the_same_press(kind: str) -> None:
+    """Every stage; the rig of the case has other joints in another order, so nothing but the physics makes them agree."""
+    tilted = (math.cos(0.04), 0.6 * math.sin(0.04), 0.8 * math.sin(0.04), 0.0)
+    stages = (
+        indent(0.4e-3),
+        StageSpec("indent", force=1.5),
+        StageSpec("shear", shear=(0.8e-3, -0.5e-3)),
+        StageSpec("twist", twist=0.4),
+        StageSpec("release"),
+    )
+    scene = scene_of(kind, *stages, position=(2e-3, 1e-3, 0.0), quaternion=tilted)
+    pad, moved_object = press(scene, steps=2)
+    _, moved_case = press(dataclasses.replace(scene, moves="case"), steps=2)
+    fixed = moved_case[0].world_from_pad[0] @ moved_case[0].pad_from_object[0]
+    for a, b in zip(moved_object, moved_case, strict=True):
+        np.testing.assert_array_equal(a.world_from_pad[0], np.eye(4))
+        np.testing.assert_allclose(b.pad_from_object, a.pad_from_object, rtol=0.0, atol=1e-9)
+        for name in ("depth", "normal_force", "shear_force", "twist_torque"):
+            np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(pad.surface(b).height, pad.surface(a).height, rtol=0.0, atol=1e-9)
+        np.testing.assert_array_equal(pad.surface(b).contact, pad.surface(a).contact)
+        np.testing.assert_allclose(b.world_from_pad[0] @ b.pad_from_object[0], fixed, rtol=0.0, atol=1e-12)
+    assert pad.surface(moved_case[-3]).contact.any()
+
+
+def test_the_case_moves_against_the_object() -> None:
+    """Up by the depth, against the shear; turned the other way about the object's axis."""
+    scene = scene_of(
+        "sphere", indent(0.5e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.3), position=(2e-3, 0, 0)
+    )
+    _, (start, pressed, sheared, twisted) = press(dataclasses.replace(scene, moves="case"))
+    np.testing.assert_allclose(start.world_from_pad[0, :3, 3], (0.0, 0.0, -CLEARANCE), atol=1e-12)
+    np.testing.assert_allclose(pressed.world_from_pad[0, :3, 3], (0.0, 0.0, 0.5e-3), atol=1e-12)
+    np.testing.assert_allclose(sheared.world_from_pad[0, :3, 3], (-1e-3, 0.0, 0.5e-3), atol=1e-12)
+    c, s = math.cos(0.3), math.sin(0.3)
+    np.testing.assert_allclose(twisted.world_from_pad[0, :2, :2], [[c, s], [-s, c]], atol=1e-12)
+    # The ball's centre, x = 2 mm in the world, stays put: in the turned case it is at x = 3 mm on the pad's own axis.
+    np.testing.assert_allclose(twisted.world_from_pad[0, :2, :] @ [3e-3, 0.0, 0.0, 1.0], (2e-3, 0.0), atol=1e-12)
+
+
 def test_untouched_pad() -> None:
     pad, states = press(scene_of("none"))
     assert len(states) == 1 and pad.peak(states) is states[0]
@@ -288,6 +330,8 @@ def test_impossible_scenes_are_refused() -> None:
         press(scene_of("sphere", indent(1e-3)), depths=np.array([5e-3]))
     with pytest.raises(SpecError, match="exactly one"):
         press(scene_of("sphere", StageSpec("indent")))
+    with pytest.raises(SpecError, match=r"moves = 'camera'.*object, case"):
+        press(dataclasses.replace(scene_of("sphere", indent(1e-3)), moves="camera"))
     with pytest.raises(SpecError, match="sphere"):
         object_parts(ObjectSpec("ball", {}, (0.0, 0.0, 0.0), IDENTITY, 0.1))
     with pytest.raises(SpecError, match="radius"):

@@ -56,7 +56,14 @@ def test_the_quaternion_is_normalised(make_press: MakePress) -> None:
     assert scene.object.quaternion == pytest.approx((math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0), rel=1e-12)
 
 
+def test_either_side_can_move(make_press: MakePress) -> None:
+    assert load_press("coin").moves == "object"
+    assert load_press(make_press("coin", {"moves": "case"})).moves == "case"
+
+
 ERRORS: list[tuple[str, str, Any, str]] = [
+    ("coin", "moves", "sensor", "must be a known name; choose from: object, case"),
+    ("none", "moves", "case", "must be absent where there is no object"),
     ("sphere", "object.kind", "sphre", "must be a known name; did you mean 'sphere'? choose from: none, sphere, cylinder"),
     ("sphere", "object.radius_mm", 0.0, "must be a number in (0, 100] mm"),
     ("sphere", "object.radius_mm", math.nan, "must be a number in (0, 100] mm"),

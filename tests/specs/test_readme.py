@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from raytac.assets import asset_root
-from raytac.specs.press_file import OBJECT_SCHEMA, POSE_SCHEMA, STAGE_SCHEMA
+from raytac.specs.press_file import OBJECT_SCHEMA, POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
 from raytac.specs.sensor_file import LED_SCHEMA, SENSOR_SCHEMA
 from raytac.specs.toml import Integer, Number, Schema, Text
 
@@ -45,6 +45,13 @@ def test_led_keys() -> None:
     for key, interval in ranged(LED_SCHEMA):
         assert interval in row(section("Lights"), key)
     assert set(LED_SCHEMA) == set(re.findall(r"^\| `(\w+)` \|", section("Lights"), flags=re.MULTILINE))
+
+
+def test_scene_keys() -> None:
+    for key, field in SCENE_SCHEMA.items():
+        assert isinstance(field, Text) and all(
+            f"`{choice}`" in row(section("Press"), key).split("|")[2] for choice in field.choices
+        )
 
 
 def test_object_keys() -> None:
