@@ -49,8 +49,8 @@ class ShadowTable:
     """Levels along the shadow of a contact's rim, by direction of the rim's slope and by depth.
 
     A ring pixel with slope direction a and indentation d has direction bin ⌊(a + π) / direction_precision⌋ and depth bin
-    ⌊(d − first_depth) / depth_precision⌋ + depth_offset; outside the table it casts none. It casts ``fan`` rays at
-    directions[bin] + fan[k]; at the distance s · step, s = 1, 2, … < length, along a ray the difference from the background is at most
+    ⌊(d − first_depth) / depth_precision⌋ + depth_offset; outside the table it casts none. It casts a fan of rays
+    (``rays``); at the distance s · step, s = 1, 2, … < length, along a ray the difference from the background is at most
     values[c, direction, depth, s]. ``directions`` are those of the rays in the image: x right, y down, so π/2 is down.
     """
 
@@ -70,8 +70,10 @@ class ShadowTable:
     """Width of a direction bin [rad]."""
     step: float = 1.25
     """Distance between values along a ray [calibration pixels]."""
-    fan: tuple[float, ...] = (-0.1, -0.05, 0.0, 0.05)
-    """Directions of the rays relative to ``directions`` [rad]; upstream's arange(−0.1, 0.1, 0.05)."""
+    fan_angle: float = 0.1
+    """Half the opening of the fan of rays about a direction [rad]."""
+    fan_precision: float = 0.05
+    """Angle between the rays of a fan [rad]."""
 
     def __post_init__(self) -> None:
         n_dir = len(self.directions)
@@ -87,11 +89,21 @@ class ShadowTable:
         for name, array in (("directions", self.directions), ("values", self.values)):
             if not np.isfinite(array).all():
                 raise InputError(f"shadow.{name}", value=array.dtype, rule="must be finite")
-        for name in ("depth_precision", "direction_precision", "step"):
+        for name in ("depth_precision", "direction_precision", "step", "fan_angle", "fan_precision"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"shadow.{name}", value=getattr(self, name), rule="must be finite and > 0")
-        if not self.fan or not np.isfinite(self.fan).all():
-            raise InputError("shadow.fan", value=self.fan, rule="must hold at least one finite angle [rad]")
+        if self.fan_angle > 32 * self.fan_precision:
+            raise InputError("shadow.fan_precision", value=self.fan_precision, rule="must make a fan of at most 64 rays")
+
+    def rays(self) -> np.ndarray:
+        """Ray directions [rad], shape (n_dir, n_rays): arange(a − fan_angle, a + fan_angle, fan_precision) about each direction a.
+
+        Rounding makes that one ray more for some directions than for others (upstream: 4 or 5); shorter fans repeat their last ray,
+        which changes nothing.
+        """
+        fans = [np.arange(a - self.fan_angle, a + self.fan_angle, self.fan_precision) for a in self.directions]
+        most = max(len(fan) for fan in fans)
+        return np.stack([np.pad(fan, (0, most - len(fan)), mode="edge") for fan in fans])
 
 
 @dataclass(frozen=True)
