@@ -15,7 +15,7 @@ from pathlib import Path
 
 from raytac.errors import BackendError, InputError
 
-__all__ = ["DEVICES", "cuda_device_count", "llvm_library", "optix_library", "resolve_device"]
+__all__ = ["DEVICES", "cuda_device_count", "llvm_library", "optix_library", "resolve_device", "total_memory"]
 
 DEVICES = ("auto", "cpu", "cuda")
 """Names that every ``device`` option accepts."""
@@ -61,6 +61,19 @@ def cuda_device_count() -> int:
         return 0
     count = ctypes.c_int(0)
     return count.value if driver.cuDeviceGetCount(ctypes.byref(count)) == 0 else 0
+
+
+@functools.cache
+def total_memory(device: str) -> int:
+    """Memory of the machine (``"cpu"``) or of the first CUDA device (``"cuda"``) [byte], whoever uses it. Creates no CUDA context."""
+    if device == "cpu":
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    driver, handle, size = _load(("nvcuda.dll", "libcuda.so.1", "libcuda.so")), ctypes.c_int(0), ctypes.c_size_t(0)
+    if driver is None or driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(handle), 0):
+        raise BackendError("the CUDA driver does not answer, so the device's memory is not known; run `raytac doctor`")
+    if driver.cuDeviceTotalMem_v2(ctypes.byref(size), handle):
+        raise BackendError("the CUDA driver does not tell the device's memory; run `raytac doctor`")
+    return size.value
 
 
 @functools.cache

@@ -27,6 +27,8 @@ class OpticsImages:
     position: np.ndarray | None = None
     depth: np.ndarray | None = None
     contact: np.ndarray | None = None
+    uncovered: np.ndarray | None = None
+    """Share of each image's contact pixels, (B,), whose table bin no calibration sample reached; None where that is unknown."""
 
 
 class OpticalMode(Protocol):

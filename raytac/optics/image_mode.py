@@ -1,0 +1,300 @@
+"""Optical modes that shade a height image: the camera's view of the coat as one height a pixel, and a colour from its slopes.
+
+The Taxim table and Phong's model know nothing of rays, so one front step serves both: each pixel's ray is intersected with the
+height field by two Newton steps, and slopes follow by central differences between neighbouring pixels, as published. Everything is
+Dr.Jit code on device arrays, one thread a pixel of every environment, recorded once for each batch size and replayed.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.device import total_memory
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import OpticsImages
+from raytac.optics.camera import Pinhole
+from raytac.optics.coat import CoatLayout
+from raytac.optics.raytrace import RayTracer
+from raytac.optics.refraction import Slab
+from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, safe_heights
+from raytac.optics.variant import load_mitsuba
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["HEIGHT_MODE_OUTPUTS", "ImageHeights", "ImageMode", "see_heights"]
+
+HEIGHT_MODE_OUTPUTS = ("rgb", "normals", "depth")
+"""Optical outputs of these modes: they know colours, not the light of each LED."""
+_LARGEST_ARRAY = 2**32 - 1
+"""Dr.Jit indexes with 32 bits."""
+
+
+@dataclass(frozen=True)
+class ImageHeights:
+    """What the pixels of B images see, as device arrays of B·H·W; lengths in image pixels (of the pitch along x)."""
+
+    height: Any
+    """−z of the coat [px]: grows towards the camera."""
+    moved: Any
+    """Displacement from rest [px]: rest − z."""
+    contact: Any
+    """1 where the object touches, else 0 (UInt8); None if nobody asked."""
+    envs: int
+    resolution: tuple[int, int]
+    """(width, height) [px]."""
+    aspect: float = 1.0
+    """Pitch along x over pitch along y."""
+
+    def pixel(self, mi: Any) -> tuple[Any, Any, Any, Any]:
+        """(index, index in the image, column, row) of every pixel of the batch."""
+        width, height = self.resolution
+        i = dr.arange(mi.UInt32, self.envs * width * height)
+        p = i % (width * height)
+        return i, p, p % width, p // width
+
+    def slopes(self, mi: Any, of: Any) -> tuple[Any, Any, list[Any]]:
+        """(s_x, s_y, the four neighbours' values) by central differences of ``of``; the rim repeats the pixels next to it (upstream)."""
+        width, height = self.resolution
+        i, _, column, row = self.pixel(mi)
+        first = i - row * width - column
+        inner = first + dr.clip(row, 1, height - 2) * width + dr.clip(column, 1, width - 2)
+        near = [dr.gather(mi.Float, of, k) for k in (inner + 1, inner - 1, inner + width, inner - width)]
+        return 0.5 * (near[0] - near[1]), 0.5 * self.aspect * (near[2] - near[3]), near
+
+
+def see_heights(
+    mi: Any, layout: CoatLayout, camera: Pinhole, pitch: tuple[float, float], rest: Any, heights: Any, contact: Any
+) -> ImageHeights:
+    """Heights that the pixels' central rays meet.
+
+    ``rest`` (Ny·Nx) and ``heights`` (B·Ny·Nx) [m] are device Floats, ``contact`` (B·Ny·Nx) a UInt8 or None, ``pitch`` the size of an
+    image pixel on z = 0 [m]. On a ray p(z) = o + (z − o_z) (t_x, t_y, 1) the coat Z(x, y) is met where Z(p(z)) = z. Newton's step is
+    z ← z + (Z − z) / (1 − ∇Z · t), two of them from z = 0; where the coat is steeper than half the ray the step is that of slope 1/2.
+    """
+    g = layout
+    width, height = camera.resolution
+    envs = dr.width(heights) // (g.nx * g.ny)
+    i = dr.arange(mi.UInt32, envs * width * height)
+    env, p = i // (width * height), i % (width * height)
+    origin, (tx, ty) = camera.ray(mi.Float(p % width) + 0.5, mi.Float(p // width) + 0.5)
+    ox, oy, oz = origin
+
+    def cell(z: Any) -> tuple[Any, Any, Any]:
+        fx = dr.clip((ox + (z - oz) * tx - g.x0) / g.dx, 0, g.nx - 1.001)
+        fy = dr.clip((oy + (z - oz) * ty - g.y0) / g.dy, 0, g.ny - 1.001)
+        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
+        return iy * g.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
+
+    def corners(of: Any, k: Any) -> list[Any]:
+        return [dr.gather(mi.Float, of, k + offset) for offset in (0, 1, g.nx, g.nx + 1)]
+
+    first = env * (g.nx * g.ny)
+    z = mi.Float(0)
+    for _ in range(2):
+        k, wx, wy = cell(z)
+        a, b, c, d = corners(heights, first + k)
+        top, bottom = dr.lerp(a, b, wx), dr.lerp(c, d, wx)
+        along = dr.lerp(b - a, d - c, wy) / g.dx * tx + (bottom - top) / g.dy * ty
+        z += (dr.lerp(top, bottom, wy) - z) / dr.maximum(1 - along, 0.5)
+    k, wx, wy = cell(z)
+    now, before = corners(heights, first + k), corners(rest, k)
+
+    def blend(v: list[Any]) -> Any:
+        return dr.lerp(dr.lerp(v[0], v[1], wx), dr.lerp(v[2], v[3], wx), wy) * (1 / pitch[0])
+
+    # Differences first, so that a coat at rest has moved by exactly nothing.
+    moved = blend([r - n for r, n in zip(before, now, strict=True)])
+    touched = None
+    if contact is not None:
+        nearest = k + dr.select(wx > 0.5, 1, 0) + dr.select(wy > 0.5, g.nx, 0)
+        touched = dr.gather(mi.UInt8, contact, first + nearest)
+    return ImageHeights(-blend(now), moved, touched, envs, (width, height), pitch[0] / pitch[1])
+
+
+class ImageMode(ABC):
+    """Base of the modes that shade height images; fulfils ``raytac.optics.base.OpticalMode``.
+
+    A mode gives ``_inputs`` (every device array that a frame reads, for the recording), ``_levels`` and ``_floats_per_pixel``.
+    """
+
+    label: str
+    needs_contact = False
+    """Whether a frame reads where the object touches."""
+
+    def __init__(self, sensor: SensorSpec, *, resolution: tuple[int, int] | None, outputs: tuple[str, ...], device: str) -> None:
+        for name in outputs:
+            if name not in HEIGHT_MODE_OUTPUTS:
+                rule = f"must be an output of optics={self.label.partition('-')[0]!r}; only the ray tracer has layers"
+                raise InputError("outputs", value=name, rule=rule, choices=HEIGHT_MODE_OUTPUTS)
+        if resolution is not None and (len(resolution) != 2 or min(resolution) < 3):
+            raise InputError("resolution", value=resolution, rule="must be (width, height), each >= 3 pixels")
+        self.mi, self.device = load_mitsuba(device)
+        self.sensor, self.outputs = sensor, tuple(outputs)
+        slab = Slab.from_spec(sensor)
+        self.camera = Pinhole.from_spec(sensor.camera, resolution, slab)
+        native = sensor.camera
+        px, py = (p * n / m for p, n, m in zip(native.pixel_pitch, native.resolution, self.camera.resolution, strict=True))
+        self.pitch = (px, py)
+        """Size of an image pixel on the plane z = 0 along x and y [m]."""
+        self._memory = total_memory(self.device)
+        self._grid: PadGrid | None = None
+        self._frozen: dict[tuple[str, int], Any] = {}
+        self._geometry: RayTracer | None = None
+
+    # ---------------------------------------------------------------- what a mode gives
+
+    @abstractmethod
+    def _build(self, grid: PadGrid) -> Any:
+        """Device arrays that a frame reads besides the surface, a frozen dataclass; called once, for the first grid."""
+
+    @abstractmethod
+    def _levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
+        """Three channels of B·H·W levels, neither rounded nor clipped, and counts (B·2, or one unused value)."""
+
+    @abstractmethod
+    def _floats_per_pixel(self) -> float:
+        """Device memory that ``_levels`` holds at its peak, in floats a pixel."""
+
+    # ---------------------------------------------------------------- memory
+
+    def memory_per_env(self, grid: PadGrid) -> int:
+        """Device memory of one environment in a batch on ``grid`` [byte]: nodes, height images, intermediate and final images."""
+        width, height = self.camera.resolution
+        nodes = grid.shape[0] * grid.shape[1] * (5 if self.needs_contact else 4)
+        # Heights, displacement and contact, what the mode holds, three channels and their bytes.
+        return nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 1 + 15))
+
+    def largest_batch(self, grid: PadGrid) -> int:
+        """Largest number of environments that one call may render on ``grid``."""
+        width, height = self.camera.resolution
+        return min(self._memory // self.memory_per_env(grid), _LARGEST_ARRAY // (4 * max(width * height, grid.rest.size)))
+
+    def _check_batch(self, envs: int, grid: PadGrid) -> None:
+        most = self.largest_batch(grid)
+        if envs > most:
+            each = self.memory_per_env(grid) / 1e6
+            rule = (
+                f"must be at most {most}: an environment takes {each:.1f} MB, this {self.device} has {self._memory / 1e9:.1f} GB "
+                "and an array at most 2^32 values; render in parts"
+            )
+            raise InputError("number of environments", value=envs, rule=rule)
+
+    # ---------------------------------------------------------------- images
+
+    def prepare(self, grid: PadGrid) -> None:
+        """Build what depends on the pad's grid; done at the first frame and kept.
+
+        Raises:
+            InputError: the camera sees beyond the pad, or a second grid.
+        """
+        if self._grid is not None:
+            check_same_grid(grid, self._grid)
+            return
+        check_view(self.camera, grid)
+        self.layout = CoatLayout.from_grid(grid)
+        self._rest = self.mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
+        self._inputs = self._build(grid)
+        self._grid = grid
+
+    def render(self, surface: GelSurface) -> OpticsImages:
+        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
+
+        An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
+
+        Raises:
+            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
+        """
+        images = OpticsImages()
+        if {"normals", "depth"} & set(self.outputs):
+            images = self._ray_cast(surface)
+        if "rgb" not in self.outputs:
+            return images
+        heights, contact, failed = self._upload(surface)
+        width, height = self.camera.resolution
+        rgb, counts = self.render_device(heights, contact)
+        image = np.array(rgb).reshape(surface.batch, height, width, 3)
+        image[failed] = 0
+        return replace(images, rgb=image, uncovered=self._uncovered(np.array(counts), failed))
+
+    def render_levels(self, surface: GelSurface) -> np.ndarray:
+        """The image before rounding and clipping [levels, 0-255], shape (B, H, W, 3), float32; NaN where an environment failed."""
+        heights, contact, failed = self._upload(surface)
+        seen = self._see(heights, contact, self._rest)
+        channels, _ = self._levels(seen, self._inputs)
+        width, height = self.camera.resolution
+        image = np.stack([np.array(c) for c in channels], axis=-1).reshape(surface.batch, height, width, 3)
+        image[failed] = np.nan
+        return image
+
+    def image_heights(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
+        """(−z, rest − z) of the coat through every pixel's centre [image pixels], each (B, H, W) float32."""
+        heights, contact, failed = self._upload(surface)
+        seen = self._see(heights, contact, self._rest)
+        width, height = self.camera.resolution
+        found = [np.array(v).reshape(surface.batch, height, width) for v in (seen.height, seen.moved)]
+        for image in found:
+            image[failed] = np.nan
+        return found[0], found[1]
+
+    def render_device(self, heights: Any, contact: Any = None) -> tuple[Any, Any]:
+        """On device arrays: heights (B·Ny·Nx) [m] and contact (B·Ny·Nx, UInt8, or None) to (image, counts).
+
+        The image is B·H·W·3, UInt8. Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
+        replays them afterwards.
+
+        Raises:
+            InputError: nothing was rendered or prepared before, a width that is no whole number of grids, or a batch too large.
+        """
+        if self._grid is None:
+            raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
+        nodes = self.layout.nx * self.layout.ny
+        if dr.width(heights) == 0 or dr.width(heights) % nodes:
+            raise InputError("heights", value=dr.width(heights), rule=f"must hold a whole number of grids of {nodes} nodes")
+        if self.needs_contact and (contact is None or dr.width(contact) != dr.width(heights)):
+            value = None if contact is None else dr.width(contact)
+            raise InputError("contact", value=value, rule=f"this mode needs one value a node, {dr.width(heights)} here")
+        envs = dr.width(heights) // nodes
+        self._check_batch(envs, self._grid)
+        key = "frame", envs
+        if key not in self._frozen:
+            self._frozen[key] = dr.freeze(self._frame)
+        touched = contact if self.needs_contact else self.mi.UInt8(0)
+        return self._frozen[key](heights, touched, self._rest, self._inputs)
+
+    def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any) -> tuple[Any, Any]:
+        mi = self.mi
+        channels, counts = self._levels(self._see(heights, contact, rest), inputs)
+        return mi.UInt8(dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))), counts
+
+    def _see(self, heights: Any, contact: Any, rest: Any) -> ImageHeights:
+        touched = contact if self.needs_contact else None
+        seen = see_heights(self.mi, self.layout, self.camera, self.pitch, rest, heights, touched)
+        dr.eval(seen.height, seen.moved, seen.contact)
+        return seen
+
+    def _upload(self, surface: GelSurface) -> tuple[Any, Any, np.ndarray]:
+        check_shapes(surface)
+        self.prepare(surface.grid)
+        self._check_batch(surface.batch, surface.grid)
+        heights, failed = safe_heights(surface)
+        contact = None
+        if self.needs_contact:
+            touched = surface.contact & ~failed[:, None, None] if failed.any() else surface.contact
+            contact = self.mi.UInt8(np.ascontiguousarray(touched).view(np.uint8).ravel())
+        return self.mi.Float(heights.ravel()), contact, failed
+
+    def _uncovered(self, counts: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        """Share of the contact pixels with an uncovered bin, from the counts of ``_levels``; a mode without coverage has none."""
+        return None
+
+    def _ray_cast(self, surface: GelSurface) -> OpticsImages:
+        """Normals, positions, depth and contact are those of the ray tracer: geometry has no cheaper truth."""
+        if self._geometry is None:
+            outputs = tuple(name for name in self.outputs if name != "rgb")
+            self._geometry = RayTracer(self.sensor, resolution=self.camera.resolution, outputs=outputs, device=self.device)
+        return self._geometry.render(surface)

@@ -1,0 +1,205 @@
+"""The Taxim table as an optical mode: a polynomial by slope bin, optional shadows from a table, plus the image at rest.
+
+Si and Yuan, Taxim, RA-L 2022, sections III-B and III-C; semantics of their released simulator (docs/taxim-table.md lists what is kept
+as it is, oddities included, and what differs). Deformation is not in here: the physics gives the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import BackendError, InputError
+from raytac.gel.surface import PadGrid
+from raytac.optics.image_mode import ImageHeights, ImageMode
+from raytac.optics.table import PolyTable
+from raytac.optics.table_shadow import ShadowArrays, ShadowCaster
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["TableArrays", "TableShader", "TaximMode"]
+
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class TableArrays:
+    """Device arrays of a table: what a recorded frame reads besides the surface."""
+
+    bins: Any
+    """20 floats a bin: 6 coefficients of each channel, whether it is covered, and one unused."""
+    background: Any
+    """4 floats a pixel, the last unused."""
+    shadow: ShadowArrays | None
+
+
+class TableShader:
+    """Shades height images by a table at one resolution; knows no camera and no pad."""
+
+    def __init__(self, mi: Any, table: PolyTable, resolution: tuple[int, int], pitch: float, *, shadow: bool) -> None:
+        """``resolution`` (width, height) [px] may differ from the table's; ``pitch`` is that of an image pixel along x [m]."""
+        self.mi, self.table, self.resolution = mi, table, resolution
+        self.scale = (table.resolution[0] / resolution[0], table.resolution[1] / resolution[1])
+        """Calibration pixels per image pixel along x and y."""
+        background = resized(table.background, resolution)
+        self._caster = None
+        arrays = None
+        if shadow:
+            if table.shadow is None:
+                raise InputError("shadow", value=True, rule="this table has no shadows", choices=(False,))
+            self._caster = ShadowCaster(mi, table.shadow, table.constants, resolution, self.scale, pitch)
+            arrays = self._caster.arrays()
+            background = self._caster.blur_background(background)
+        self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(_padded(background)), arrays)
+
+    def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
+        """Three channels of B·H·W levels, and (pixels in contact, of them in uncovered bins) for each environment (B·2).
+
+        Counts are one unused value where there is no contact to count.
+        """
+        mi, table = self.mi, self.table
+        displaced = table.slopes_of == "displacement"
+        of = seen.moved if displaced else seen.height
+        sx, sy, near = seen.slopes(mi, of)
+        _, p, column, row = seen.pixel(mi)
+        n = table.n_bins
+        # A flat place has direction 0; atan2(0, 0) says so on every device that Dr.Jit knows, but is not promised to.
+        flat = (sx == 0) & (sy == 0)
+        direction = dr.select(flat, 0, dr.atan2(sy, dr.select(flat, 1, sx)))
+        magnitude = dr.atan(dr.sqrt(sx * sx + sy * sy))
+        i = dr.minimum(mi.UInt32(magnitude * ((n - 1) / (0.5 * np.pi))), n - 1)
+        j = dr.minimum(mi.UInt32(dr.maximum(direction + np.pi, 0) * ((n - 1) / (2 * np.pi))), n - 1)
+        packet = [dr.gather(mi.Vector4f, inputs.bins, (i * n + j) * 5 + k) for k in range(5)]
+        c = [packet[k][m] for k in range(5) for m in range(4)]
+        x = (mi.Float(column) + 0.5) * self.scale[0] - 0.5
+        y = (mi.Float(row) + 0.5) * self.scale[1] - 0.5
+        basis = (x * x, y * y, x * y, x, y, mi.Float(1))
+        change = [sum((c[6 * k + m] * basis[m] for m in range(6)), mi.Float(0)) for k in range(3)]
+        if displaced:
+            still = (of == 0) & (near[0] == 0) & (near[1] == 0) & (near[2] == 0) & (near[3] == 0)
+            change = [dr.select(still, 0, d) for d in change]
+        counts = mi.UInt32(0)
+        if table.covered is not None and seen.contact is not None:
+            touched = seen.contact != 0
+            count = [dr.select(touched, mi.UInt32(1), 0), dr.select(touched & (c[18] == 0), mi.UInt32(1), 0)]
+            pixels = self.resolution[0] * self.resolution[1]
+            counts = dr.concat([dr.block_reduce(dr.ReduceOp.Add, one, pixels) for one in count])
+        if self._caster is not None and inputs.shadow is not None:
+            change = self._caster.cast(seen, of, direction, change, inputs.shadow)
+        packed = dr.gather(mi.Vector4f, inputs.background, p)
+        return [d + packed[k] for k, d in enumerate(change)], counts
+
+
+class TaximMode(ImageMode):
+    """The optical mode ``taxim``: one sensor, one table, one resolution; batches of surfaces in, images out."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        calibration: str | Path | PolyTable | None = None,
+        shadow: bool | None = None,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+    ) -> None:
+        """Load the table; kernels are compiled at the first image.
+
+        Args:
+            sensor: camera and pad; its lights matter only where ``calibration`` is None.
+            calibration: a table, a calibration folder (``raytac.optics.calib_folder``), or None for the table baked from this sensor's
+                own ray tracer, which is baked now unless that was done before. The table's image is laid over the whole image.
+            shadow: cast shadows; None is yes where the table has them.
+            resolution: (width, height) [px]; None is the sensor's own.
+            outputs: any of ``rgb``, ``normals``, ``depth``.
+            device: ``auto``, ``cpu`` or ``cuda``.
+
+        Raises:
+            InputError: a value out of its choices, or a calibration that is malformed or of another shape of image.
+            BackendError: Dr.Jit cannot run on ``device``.
+        """
+        self.label = "taxim"
+        if shadow not in (None, True, False):
+            raise InputError("shadow", value=shadow, rule="must be True, False or None", choices=(True, False, None))
+        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
+        self.table = _table(calibration, sensor, self.device)
+        self.shadow = self.table.shadow is not None if shadow is None else bool(shadow)
+        self.label = "taxim-shadow" if self.shadow else "taxim"
+        width, height = self.camera.resolution
+        columns, rows = self.table.resolution
+        ratio = (columns / rows) / (width / height)
+        if abs(ratio - 1) > _ASPECT_TOLERANCE:
+            rule = f"must have the aspect ratio of the table's image, {columns}x{rows}, within {100 * _ASPECT_TOLERANCE:.0f} %"
+            raise InputError("resolution", value=f"{width}x{height}", rule=rule)
+        self.needs_contact = self.shadow or self.table.covered is not None
+        self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadow)
+
+    @property
+    def view_ratio(self) -> tuple[float, float]:
+        """Width and height in view of the sensor over those of the table's image: 1 where they show the same piece of the pad."""
+        sizes = zip(self.pitch, self.camera.resolution, self.table.pixel_pitch, self.table.resolution, strict=True)
+        x, y = (p * n / (q * m) for p, n, q, m in sizes)
+        return x, y
+
+    def _build(self, grid: PadGrid) -> TableArrays:
+        return self._shader.inputs
+
+    def _levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
+        return self._shader.levels(seen, inputs)
+
+    def _floats_per_pixel(self) -> float:
+        # With shadows: differences, the least values found (both 3), two packed images of 4 for the blurs, direction and ring.
+        return 3 + 3 + 8 + 2 if self.shadow else 0
+
+    def _uncovered(self, counts: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        if self.table.covered is None or not self.needs_contact:
+            return None
+        touched, uncovered = counts.reshape(2, -1).astype(float)
+        share = np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=touched > 0)
+        share[failed] = np.nan
+        return share
+
+
+def resized(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) float32 resampled to ``resolution`` (width, height), pixel areas aligned; the image itself if it has that size.
+
+    Linear where it grows, a triangle over the covered pixels where it shrinks.
+    """
+    if (image.shape[1], image.shape[0]) == resolution:
+        return np.asarray(image, dtype=np.float32)
+    from PIL import Image
+
+    channels = [Image.fromarray(np.ascontiguousarray(image[..., c], dtype=np.float32)) for c in range(3)]
+    return np.stack([np.asarray(one.resize(resolution, Image.Resampling.BILINEAR)) for one in channels], axis=-1)
+
+
+def _table(calibration: object, sensor: SensorSpec, device: str) -> PolyTable:
+    if isinstance(calibration, PolyTable):
+        return calibration
+    if isinstance(calibration, (str, Path)):
+        from raytac.optics.calib_folder import load_calibration
+
+        return load_calibration(calibration)
+    if calibration is not None:
+        rule = f"must be a PolyTable, a calibration folder or None, not {type(calibration).__name__}"
+        raise InputError("calibration", value=calibration, rule=rule)
+    try:
+        from raytac.optics.bake import baked_table
+    except ImportError as error:
+        raise BackendError(f"no table can be baked here ({error}): give optics_options={{'calibration': FOLDER}}") from error
+    return baked_table(sensor, device=device)
+
+
+def _packed_bins(table: PolyTable) -> np.ndarray:
+    n = table.n_bins
+    packed = np.zeros((n, n, 20), dtype=np.float32)
+    packed[..., :18] = np.moveaxis(table.gradients, 0, 2).reshape(n, n, 18)
+    packed[..., 18] = 1 if table.covered is None else table.covered
+    return packed.ravel()
+
+
+def _padded(image: np.ndarray) -> np.ndarray:
+    return np.pad(np.asarray(image, dtype=np.float32), ((0, 0), (0, 0), (0, 1))).ravel()
