@@ -16,11 +16,10 @@ __all__ = ["make_grid", "rest_height"]
 def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Rest surface z [m] at pad-frame positions ``x``, ``y`` [m] of any shapes that broadcast.
 
-    z = −s(x; Rx) − s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
-    carried along one of radius Ry. It is 0 at the pad centre, an exact circle along both axes, agrees with the paraboloid
-    −x²/(2Rx) − y²/(2Ry) to fourth order, and is flat along an axis whose radius is ``inf``.
+    z = −``gelpad.sag(x, y)``: 0 at the pad centre, an exact circle along both axes, the paraboloid −x²/(2Rx) − y²/(2Ry) to fourth
+    order, flat along an axis whose radius is ``inf``.
     """
-    return -_sagitta(np.asarray(x, float), gelpad.dome_radius[0]) - _sagitta(np.asarray(y, float), gelpad.dome_radius[1])
+    return -gelpad.sag(np.asarray(x, float), np.asarray(y, float))
 
 
 def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
@@ -40,9 +39,3 @@ def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
             raise InputError("pitch", value=pitch, rule=f"must leave at least two cells over the pad's {size} m along {axis}")
     x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
     return PadGrid(x=x, y=y, rest=rest_height(gelpad, x[None, :], y[:, None]))
-
-
-def _sagitta(u: np.ndarray, radius: float) -> np.ndarray:
-    if math.isinf(radius):
-        return np.zeros_like(u)
-    return u**2 / (radius + np.sqrt(radius**2 - u**2))

@@ -61,7 +61,7 @@ class CoatLayout:
 class CoatField:
     """B coat surfaces as device arrays, made anew each frame from heights.
 
-    ``nodes`` holds (z, n_x, n_y, n_z) a node, so that one packet gather brings all that shading needs, ``cells`` the heights at the
+    ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
     four corners of a cell, for the walks; the normal points to the
     camera side (n_z < 0) and comes from central differences, as the vertex normals of the reference's mesh do.
     """
@@ -89,14 +89,14 @@ class CoatField:
         c = dr.gather(self.mi.Vector4f, self.cells, i, active)
         return dr.lerp(dr.lerp(c.x, c.y, wx), dr.lerp(c.z, c.w, wx), wy)
 
-    def z_and_normal(self, env: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """Bilinear height [m] and the unit normal interpolated between nodes."""
+    def normal(self, env: Any, x: Any, y: Any) -> Any:
+        """The unit normal at (x, y) [m], interpolated between nodes."""
         mi, nx = self.mi, self.layout.nx
         i, wx, wy = self._cell(env, x, y)
         a, b = dr.gather(mi.Vector4f, self.nodes, i), dr.gather(mi.Vector4f, self.nodes, i + 1)
         c, d = dr.gather(mi.Vector4f, self.nodes, i + nx), dr.gather(mi.Vector4f, self.nodes, i + nx + 1)
         node = dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
-        return node.x, dr.normalize(mi.Normal3f(node.y, node.z, node.w))
+        return dr.normalize(mi.Normal3f(node.y, node.z, node.w))
 
     def tile(self, env: Any, x: Any, y: Any) -> Any:
         """Index into the bounds map of the tile under (x, y)."""

@@ -46,7 +46,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
     u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
     origin, (tx, ty) = camera.ray(u, v)
     p = field.camera_hit(env, origin, tx, ty)
-    _, n = field.z_and_normal(env, p.x, p.y)
+    n = field.normal(env, p.x, p.y)
     exit = None
     if camera.slab is not None:
         ax, ay = camera.slope(u, v)

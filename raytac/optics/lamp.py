@@ -10,15 +10,7 @@ import numpy as np
 
 from raytac.specs.sensor import LedSpec
 
-__all__ = ["Lamp", "LampTable", "led_edges"]
-
-
-def led_edges(led: LedSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions of the rectangle's edges: u along z × axis (x if the axis is along z), v = axis × u; (u, v, axis) right-handed."""
-    axis = np.asarray(led.axis)
-    u = np.cross((0.0, 0.0, 1.0), axis)
-    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 1e-6 else np.array((1.0, 0.0, 0.0))
-    return u, np.cross(axis, u)
+__all__ = ["Lamp", "LampTable"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +30,7 @@ class Lamp:
     @classmethod
     def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
         """The LED in a world of ``unit`` length units per metre; its power grows with unit², so that I / r² stays."""
-        u, v = led_edges(led)
+        u, v = np.array(led.edges)
         lamp = cls(
             centre=mi.Point3f([unit * c for c in led.position]),
             axis=mi.Vector3f(*led.axis),

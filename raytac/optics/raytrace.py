@@ -94,6 +94,7 @@ class RayTracer:
 
         Raises:
             InputError: a value out of its choices.
+            SpecError: with ``refraction.model = "slab"``, a camera or LED that is not below the slab.
             BackendError: Mitsuba cannot run on ``device``.
         """
         if integrator not in INTEGRATORS:
@@ -120,8 +121,6 @@ class RayTracer:
         self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
         self.label = f"raytrace-{integrator}" + ("-denoised" if denoise else "")
         self.slab = Slab.from_spec(sensor)
-        if self.slab is not None:
-            self.slab.check(sensor)
         self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
         self.spp = spp or 256
         self.bounce, self.led_points, self.shadows = bounce, led_points, shadows

@@ -18,9 +18,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.errors import InputError
-from raytac.optics.lamp import led_edges
 from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor_check import check_slab
 
 __all__ = ["Link", "Slab"]
 
@@ -53,22 +52,14 @@ class Slab:
 
     @classmethod
     def from_spec(cls, sensor: SensorSpec, unit: float = 1.0) -> Slab | None:
-        """The slab of ``sensor`` in a world of ``unit`` length units per metre; None where its refraction is ``"none"``."""
+        """The slab of ``sensor`` in a world of ``unit`` length units per metre; None where its refraction is ``"none"``.
+
+        Raises SpecError unless the camera and all of every LED lie in the air below it (a sensor made in code may break that).
+        """
         if sensor.refraction.model == "none":
             return None
+        check_slab(sensor)
         return cls(-unit * (sensor.gelpad.thickness + sensor.refraction.plate_thickness), sensor.refraction.ior)
-
-    def check(self, sensor: SensorSpec) -> None:
-        """Raise InputError unless the camera and all of every LED of ``sensor`` lie in the air below the slab (lengths in metres)."""
-        if sensor.camera.position[2] >= self.z:
-            rule = f"must lie below the slab's face at z = {1e3 * self.z:.4g} mm (refraction.model = 'slab')"
-            raise InputError("camera.position z [mm]", value=round(1e3 * sensor.camera.position[2], 6), rule=rule)
-        for led in sensor.lights.leds:
-            u, v = led_edges(led)
-            top = led.position[2] + 0.5 * float(led.size[0] * abs(u[2]) + led.size[1] * abs(v[2]))
-            if top >= self.z:
-                rule = f"all of the LED must lie below the slab's face at z = {1e3 * self.z:.4g} mm (refraction.model = 'slab')"
-                raise InputError(f"LED {led.name!r}: highest z [mm]", value=round(1e3 * top, 6), rule=rule)
 
     def inside(self, p: Any) -> Any:
         """Whether point ``p`` is in the gel or plate."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid
 from raytac.optics import led as led_plugin
-from raytac.optics.lamp import Lamp, led_edges
+from raytac.optics.lamp import Lamp
 from raytac.optics.refraction import Slab
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
 
@@ -121,7 +121,7 @@ class SensorScene:
 
     def _led(self, led: LedSpec) -> dict[str, Any]:
         T = self.mi.ScalarTransform4f
-        u, v = led_edges(led)
+        u, v = np.array(led.edges)
         to_world = np.eye(4)
         to_world[:3, 0], to_world[:3, 1] = 0.5 * UNIT * led.size[0] * u, 0.5 * UNIT * led.size[1] * v
         to_world[:3, 2], to_world[:3, 3] = led.axis, UNIT * np.asarray(led.position)

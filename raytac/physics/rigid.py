@@ -1,4 +1,4 @@
-"""The rigid pad: MuJoCo moves the object or the case, the contact's compliance ties depth to force, the gel's shape follows from geometry."""
+"""The rigid pad: MuJoCo moves object or case, the contact's compliance ties depth to force, the gel's shape follows from geometry."""
 
 from __future__ import annotations
 

@@ -6,8 +6,10 @@ sensor towards the object, +x image right, +y image down. The camera and the LED
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -44,6 +46,16 @@ class GelpadSpec:
     """Mass density ρ [kg/m³]."""
     friction: float
     """Coulomb friction coefficient μ against the object."""
+
+    def sag(self, x: Any, y: Any) -> Any:
+        """How far the surface at rest lies below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays that broadcast.
+
+        s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
+        carried along one of radius Ry.
+        """
+        return sum(
+            u * u / (radius + (radius * radius - u * u) ** 0.5) for u, radius in zip((x, y), self.dome_radius, strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -148,6 +160,14 @@ class LedSpec:
     """Lobe exponent n >= 1; 1 is a Lambertian emitter."""
     power: Vec3
     """Intensity on the axis per camera channel (linear R, G, B) [W/sr, relative]: point-light equivalent at n and size."""
+
+    @property
+    def edges(self) -> tuple[Vec3, Vec3]:
+        """Unit directions u, v of the rectangle's edges, pad frame: u along z × axis, v = axis × u; (u, v, axis) right-handed."""
+        ax, ay, az = self.axis
+        flat = math.hypot(ax, ay)
+        ux, uy = (-ay / flat, ax / flat) if flat > 1e-9 else (1.0, 0.0)
+        return (ux, uy, 0.0), (-az * uy, az * ux, ax * uy - ay * ux)
 
 
 @dataclass(frozen=True)

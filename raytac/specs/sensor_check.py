@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from raytac.errors import SpecError
-from raytac.specs.sensor import GelpadSpec, LedSpec, SensorSpec, Vec3
+from raytac.specs.sensor import LedSpec, SensorSpec, Vec3
 
-__all__ = ["validate_sensor"]
+__all__ = ["check_slab", "validate_sensor"]
 
 _SLACK = 1e-9
 """Tolerance of geometric comparisons [m]: a part may touch the case or the gel."""
@@ -23,11 +23,32 @@ def validate_sensor(sensor: SensorSpec) -> None:
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
+    check_slab(sensor)
     _check_camera(sensor)
     _check_vignetting(sensor)
     _check_markers(sensor)
     for index, led in enumerate(sensor.lights.leds):
         _check_led(sensor, index, led)
+
+
+def check_slab(sensor: SensorSpec) -> None:
+    """Check what optics with ``refraction.model = "slab"`` cannot do without: camera and all of every LED in the air below the slab.
+
+    Raises:
+        SpecError: as ``validate_sensor``.
+    """
+    if sensor.refraction.model != "slab":
+        return
+    _check_camera_behind(sensor)
+    back = _back_face(sensor)
+    for index, led in enumerate(sensor.lights.leds):  # beside the pad too: the slab fills the case's cross-section
+        highest = max(corner[2] for corner in led_corners(led))
+        if highest >= -back:
+            rule = (
+                f"LED {led.name!r} reaches up to z = {highest * 1e3:.4g} mm: with refraction.model = 'slab' "
+                f"all of it must lie below the slab's air face, z < {-back * 1e3:.4g} mm (thickness plus plate)"
+            )
+            raise SpecError(rule, file=sensor.lights.source, key=f"led[{index}].position_mm", value=_mm(led.position))
 
 
 def _check_dome(sensor: SensorSpec) -> None:
@@ -36,19 +57,23 @@ def _check_dome(sensor: SensorSpec) -> None:
     if any(radius <= extent for radius, extent in zip(pad.dome_radius, half, strict=True)):
         rule = f"must be more than half the pad, {_mm(half)} mm; inf is flat"
         raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
-    depth = dome_depth(pad, *half)
+    depth = pad.sag(*half)
     if depth >= pad.thickness:
         rule = f"the dome falls {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
         raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
 
 
-def _check_camera(sensor: SensorSpec) -> None:
-    pad, case, camera = sensor.gelpad, sensor.case, sensor.camera
-    back = _back_face(sensor)
-    x, y, z = camera.position
-    if z >= -back:
+def _check_camera_behind(sensor: SensorSpec) -> None:
+    camera, back = sensor.camera, _back_face(sensor)
+    if camera.position[2] >= -back:
         rule = f"the camera must lie behind the gel, z < {-back * 1e3:.4g} mm, and look along +z"
         raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+
+
+def _check_camera(sensor: SensorSpec) -> None:
+    pad, case, camera = sensor.gelpad, sensor.case, sensor.camera
+    x, y, _ = camera.position
+    _check_camera_behind(sensor)
     if not _in_case(sensor, camera.position):
         rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
         raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
@@ -129,21 +154,13 @@ def _check_markers(sensor: SensorSpec) -> None:
 
 def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     pad, back = sensor.gelpad, _back_face(sensor)
-    slab = sensor.refraction.model == "slab"
     half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
     file, key, value = sensor.lights.source, f"led[{index}].position_mm", _mm(led.position)
     for x, y, z in (led.position, *led_corners(led)):
-        if slab and z >= -back:  # beside the pad too: the slab fills the case's cross-section
-            highest = max(corner[2] for corner in led_corners(led))
-            rule = (
-                f"LED {led.name!r} reaches up to z = {highest * 1e3:.4g} mm: with refraction.model = 'slab' "
-                f"all of it must lie below the slab's air face, z < {-back * 1e3:.4g} mm (thickness plus plate)"
-            )
-            raise SpecError(rule, file=file, key=key, value=value)
         if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
             rule = f"LED {led.name!r} lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
-        rest = -dome_depth(pad, min(abs(x), half_x), min(abs(y), half_y))
+        rest = -pad.sag(min(abs(x), half_x), min(abs(y), half_y))
         if z > rest + _SLACK:
             rule = f"LED {led.name!r} lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
             raise SpecError(rule, file=file, key=key, value=value)
@@ -154,10 +171,7 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
 
 def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     """Corners of the emitting rectangle, pad frame [m], by the convention of ``LedSpec.size``."""
-    ax, ay, az = led.axis
-    flat = math.hypot(ax, ay)
-    u = (-ay / flat, ax / flat, 0.0) if flat > 1e-9 else (1.0, 0.0, 0.0)
-    v = (ay * u[2] - az * u[1], az * u[0] - ax * u[2], ax * u[1] - ay * u[0])
+    u, v = led.edges
     a, b = led.size[0] / 2, led.size[1] / 2
     p = led.position
 
@@ -165,11 +179,6 @@ def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:
         return (p[0] + s * u[0] + t * v[0], p[1] + s * u[1] + t * v[1], p[2] + s * u[2] + t * v[2])
 
     return corner(-a, -b), corner(a, -b), corner(a, b), corner(-a, b)
-
-
-def dome_depth(pad: GelpadSpec, x: float, y: float) -> float:
-    """How far the surface at rest lies below the pad centre at x, y [m], as the sum of two circular arcs [m]."""
-    return sum(0.0 if math.isinf(r) else r - math.sqrt(r * r - at * at) for r, at in zip(pad.dome_radius, (x, y), strict=True))
 
 
 def _back_face(sensor: SensorSpec) -> float:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from raytac.optics.lamp import led_edges
 from raytac.optics.raytrace import total
 from raytac.specs.sensor import LedSpec, SensorSpec
 from tests.optics.conftest import Build
@@ -35,7 +34,7 @@ def radiance(spec: SensorSpec, resolution: tuple[int, int], nodes: int = 1) -> n
 
 def irradiance(lamp: LedSpec, p: np.ndarray, nodes: int) -> np.ndarray:
     """E (…) for unit power at points ``p`` (…, 3) of a plane that faces −z."""
-    u, v = led_edges(lamp)
+    u, v = np.array(lamp.edges)
     offsets = (np.arange(nodes) + 0.5) / nodes - 0.5
     e = np.zeros(p.shape[:-1])
     for a in offsets * lamp.size[0]:

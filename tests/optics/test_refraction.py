@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from raytac.errors import InputError
+from raytac.errors import SpecError
 from raytac.optics.camera import Pinhole
 from raytac.optics.raytrace import RayTracer, total
 from raytac.optics.refraction import Slab
@@ -281,13 +281,13 @@ def test_error_of_the_bounce_model_behind_the_slab(tracer: Build) -> None:
 
 def test_an_led_in_the_plate_is_named() -> None:
     spec = slabbed(sensor([led("fine", (12e-3, 0.0, -9e-3)), led("sunk", (12e-3, 0.0, -6e-3))]), plate=3e-3)
-    with pytest.raises(InputError, match=r"LED 'sunk'.*-5\.9.*below the slab's face at z = -7 mm"):
+    with pytest.raises(SpecError, match=r"led\[1\]\.position_mm = .*LED 'sunk' reaches up to z = -5\.9.*air face, z < -7 mm"):
         RayTracer(spec, device="cpu")
 
 
 def test_a_camera_in_the_plate_is_refused() -> None:
     spec = slabbed(sensor([led("one", (12e-3, 0.0, -29e-3))]), plate=24.5e-3)
-    with pytest.raises(InputError, match=r"camera.position z \[mm\] = -28.*below the slab's face at z = -28\.5 mm"):
+    with pytest.raises(SpecError, match=r"camera\.position_mm = \[0\.0, 0\.0, -28\.0\]: .*behind the gel, z < -28\.5 mm"):
         RayTracer(spec, device="cpu")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.optics.lamp import led_edges
 from raytac.optics.raytrace import RayTracer, total
 from raytac.specs.sensor import CameraSpec, SensorSpec
 from tests.optics.conftest import Build
@@ -35,7 +34,7 @@ def edge_node(spec: SensorSpec) -> float:
 def tip(spec: SensorSpec, height: float, across: float = 0.0) -> float:
     """x [m] where the line from the LED over the plateau's edge meets z = 0; ``across`` in [−1, 1] picks the LED's point."""
     lamp = spec.lights.leds[0]
-    source = np.asarray(lamp.position) + 0.5 * across * lamp.size[1] * led_edges(lamp)[1]
+    source = np.asarray(lamp.position) + 0.5 * across * lamp.size[1] * np.array(lamp.edges[1])
     return edge_node(spec) + height * (edge_node(spec) - source[0]) / (-source[2] - height)
 
 

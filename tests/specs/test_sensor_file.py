@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from raytac.errors import SpecError
 from raytac.specs import LedSpec, available, load_lights, load_sensor, validate_sensor, with_lights
-from raytac.specs.sensor_check import dome_depth, led_corners
+from raytac.specs.sensor_check import led_corners
 
 MakeSensor = Callable[..., Path]
 NAN, INF = math.nan, math.inf
@@ -49,10 +49,10 @@ def test_the_mini_in_si() -> None:
 def test_the_mini_dome_has_the_sag_of_its_source() -> None:
     """FEATS' gel mesh, source of the radii: 0.084 and 0.196 mm at 6 and 9 mm along x; 0.129 and 0.25 mm at 6 and 8 mm along y."""
     pad = load_sensor("gelsight_mini").gelpad
-    assert dome_depth(pad, 0.006, 0.0) == pytest.approx(0.084e-3, abs=0.01e-3)
-    assert dome_depth(pad, 0.009, 0.0) == pytest.approx(0.196e-3, abs=0.01e-3)
-    assert dome_depth(pad, 0.0, 0.006) == pytest.approx(0.129e-3, abs=0.01e-3)
-    assert dome_depth(pad, 0.0, 0.008) == pytest.approx(0.25e-3, abs=0.02e-3)
+    assert pad.sag(0.006, 0.0) == pytest.approx(0.084e-3, abs=0.01e-3)
+    assert pad.sag(0.009, 0.0) == pytest.approx(0.196e-3, abs=0.01e-3)
+    assert pad.sag(0.0, 0.006) == pytest.approx(0.129e-3, abs=0.01e-3)
+    assert pad.sag(0.0, 0.008) == pytest.approx(0.25e-3, abs=0.02e-3)
 
 
 def test_the_dome_boards_are_one_board_turned_by_120_degrees() -> None:
