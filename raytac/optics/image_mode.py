@@ -154,7 +154,7 @@ class ImageMode(ABC):
 
     @abstractmethod
     def _levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
-        """Three channels of B·H·W levels, neither rounded nor clipped, and counts (B·2, or one unused value)."""
+        """Three channels of B·H·W levels, neither rounded nor clipped, and flags (B·H·W, or one unused value)."""
 
     @abstractmethod
     def _floats_per_pixel(self) -> float:
@@ -216,10 +216,10 @@ class ImageMode(ABC):
             return images
         heights, contact, failed = self._upload(surface)
         width, height = self.camera.resolution
-        rgb, counts = self.render_device(heights, contact)
+        rgb, flags = self.render_device(heights, contact)
         image = np.array(rgb).reshape(surface.batch, height, width, 3)
         image[failed] = 0
-        return replace(images, rgb=image, uncovered=self._uncovered(np.array(counts), failed))
+        return replace(images, rgb=image, uncovered=self._uncovered(np.array(flags), failed))
 
     def render_levels(self, surface: GelSurface) -> np.ndarray:
         """The image before rounding and clipping [levels, 0-255], shape (B, H, W, 3), float32; NaN where an environment failed."""
@@ -242,7 +242,7 @@ class ImageMode(ABC):
         return found[0], found[1]
 
     def render_device(self, heights: Any, contact: Any = None) -> tuple[Any, Any]:
-        """On device arrays: heights (B·Ny·Nx) [m] and contact (B·Ny·Nx, UInt8, or None) to (image, counts).
+        """On device arrays: heights (B·Ny·Nx) [m] and contact (B·Ny·Nx, UInt8, or None) to (image, flags).
 
         The image is B·H·W·3, UInt8. Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
         replays them afterwards.
@@ -268,8 +268,8 @@ class ImageMode(ABC):
 
     def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any) -> tuple[Any, Any]:
         mi = self.mi
-        channels, counts = self._levels(self._see(heights, contact, rest), inputs)
-        return mi.UInt8(dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))), counts
+        channels, flags = self._levels(self._see(heights, contact, rest), inputs)
+        return mi.UInt8(dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))), flags
 
     def _see(self, heights: Any, contact: Any, rest: Any) -> ImageHeights:
         touched = contact if self.needs_contact else None
@@ -288,8 +288,8 @@ class ImageMode(ABC):
             contact = self.mi.UInt8(np.ascontiguousarray(touched).view(np.uint8).ravel())
         return self.mi.Float(heights.ravel()), contact, failed
 
-    def _uncovered(self, counts: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
-        """Share of the contact pixels with an uncovered bin, from the counts of ``_levels``; a mode without coverage has none."""
+    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        """Share of the contact pixels with an uncovered bin, from the flags of ``_levels``; a mode without coverage has none."""
         return None
 
     def _ray_cast(self, surface: GelSurface) -> OpticsImages:

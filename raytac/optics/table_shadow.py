@@ -29,10 +29,10 @@ class ShadowArrays:
 
     values: Any
     """Ordered integers (``ordered``) of the levels, 4 a (direction, depth, step), the last unused; +∞ where a list has ended."""
-    lengths: Any
-    """Longest of the three channels' lists, by (direction, depth)."""
-    offsets: Any
-    """Whole-pixel (column, row) offset by (direction, step, ray)."""
+    ends: Any
+    """End of a pixel's way within the direction's pixels, by (direction, depth): those of the longest of the three lists."""
+    ways: Any
+    """Pixels that the rays of a direction pass, (column offset, row offset, step, unused), by (direction, place on the way)."""
 
 
 class ShadowCaster:
@@ -61,17 +61,29 @@ class ShadowCaster:
         beyond = np.arange(length) >= t.lengths[..., None]
         values = np.full((n_dir, n_depth, length, 4), _NOTHING, dtype=np.float32)
         values[..., :3] = np.moveaxis(np.where(beyond, _NOTHING, t.values), 0, -1)
-        angle = t.rays()[:, None, :]
-        way = t.step * np.arange(length)[None, :, None]
+        ways, counts = self._ways()
+        ends = counts[np.arange(n_dir)[:, None], t.lengths.max(axis=0)]
+        return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(ways.ravel()))
+
+    def _ways(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ways (n_dir, n_places, 4) int32, and the number of places before step s, (n_dir, max_length + 1), that start at 1.
+
+        Rays of a fan pass the same pixels near their origin; each (step, pixel) is listed once, in the order of the steps.
+        """
+        t, length = self.table, self.table.values.shape[3]
+        angle, step = t.rays()[:, None, :], t.step * np.arange(length)[None, :, None]
         # Rounding first keeps cos and sin of right angles from moving a whole pixel; float64 elsewhere decides as upstream does.
-        offsets = [
-            np.floor(np.round(way * turn / s, 9)) for turn, s in zip((np.cos(angle), np.sin(angle)), self.scale, strict=True)
-        ]
-        return ShadowArrays(
-            mi.Int32(ordered(values).ravel()),
-            mi.UInt32(t.lengths.max(axis=0).astype(np.uint32).ravel()),
-            mi.Int32(np.stack(offsets, axis=-1).astype(np.int32).ravel()),
+        x, y = (
+            np.floor(np.round(step * turn / s, 9)) for turn, s in zip((np.cos(angle), np.sin(angle)), self.scale, strict=True)
         )
+        at = np.broadcast_to(np.arange(length)[None, :, None], x.shape)
+        places = np.stack([at, x, y], axis=-1).astype(np.int32)
+        found = [np.unique(one[1:].reshape(-1, 3), axis=0) for one in places]
+        ways = np.zeros((len(found), max(1, max(len(one) for one in found)), 4), dtype=np.int32)
+        for row, one in zip(ways, found, strict=True):
+            row[: len(one), :3] = one[:, [1, 2, 0]]
+        counts = [np.searchsorted(one[:, 0], np.arange(length + 1)) for one in found]
+        return ways, np.stack(counts)
 
     def cast(self, seen: ImageHeights, of: Any, direction: Any, change: list[Any], arrays: ShadowArrays) -> list[Any]:
         """``change`` (three channels of B·H·W levels) with shadows, blurred for the shadow and for the image.
@@ -88,31 +100,33 @@ class ShadowCaster:
         d = mi.Int32(dr.floor((seen.moved * self.pitch - t.first_depth) * (1 / t.depth_precision))) + t.depth_offset
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
+        # Only a few pixels cast: bring them together, so that no lane idles.
+        caster = dr.compress(casts)
+        a, d, x0, y0, first_of = (dr.gather(type(v), v, caster) for v in (a, d, mi.Int32(column), mi.Int32(row), first))
+        origin = dr.gather(mi.Float, of, caster)
         entry = a * n_depth + d
-        end = dr.gather(mi.UInt32, arrays.lengths, entry, casts)
+        end = dr.gather(mi.UInt32, arrays.ends, entry)
+        places = dr.width(arrays.ways) // (4 * n_dir)
         # Integers, since not every device has an atomic minimum of floats.
         least = dr.full(mi.Int32, int(ordered(np.array([_NOTHING]))[0]), 3 * dr.width(i))
-        x0, y0, origin = mi.Int32(column), mi.Int32(row), dr.gather(mi.Float, of, i, casts)
-        rays = t.rays().shape[1]
 
-        def unfinished(s: Any) -> Any:
-            return casts & (s < end)
+        def unfinished(k: Any) -> Any:
+            return k < end
 
-        def march(s: Any) -> tuple[Any]:
-            value = dr.gather(mi.Vector4i, arrays.values, entry * length + s)
-            for k in range(rays):
-                offset = dr.gather(mi.Vector2i, arrays.offsets, (a * length + s) * rays + k)
-                x, y = x0 + offset.x, y0 + offset.y
-                # Upstream truncates towards zero, so what falls just outside the first row or column is in it.
-                x, y = dr.select(x == -1, 0, x), dr.select(y == -1, 0, y)
-                inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-                at = first + mi.UInt32(y) * width + mi.UInt32(x)
-                shaded = inside & (origin > dr.gather(mi.Float, of, at, inside))
-                for c in range(3):
-                    dr.scatter_reduce(dr.ReduceOp.Min, least, value[c], at * 3 + c, shaded)
-            return (s + 1,)
+        def march(k: Any) -> tuple[Any]:
+            place = dr.gather(mi.Vector4i, arrays.ways, a * places + k)
+            value = dr.gather(mi.Vector4i, arrays.values, entry * length + mi.UInt32(place.z))
+            x, y = x0 + place.x, y0 + place.y
+            # Upstream truncates towards zero, so what falls just outside the first row or column is in it.
+            x, y = dr.select(x == -1, 0, x), dr.select(y == -1, 0, y)
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            at = first_of + mi.UInt32(y) * width + mi.UInt32(x)
+            shaded = inside & (origin > dr.gather(mi.Float, of, at, inside))
+            for c in range(3):
+                dr.scatter_reduce(dr.ReduceOp.Min, least, value[c], at * 3 + c, shaded, mode=dr.ReduceMode.Direct)
+            return (k + 1,)
 
-        dr.while_loop((mi.UInt32(1),), unfinished, march, label="table shadow")
+        dr.while_loop((dr.zeros(mi.UInt32, dr.width(caster)),), unfinished, march, label="table shadow")
         dark = [dr.minimum(change[c], unordered(mi, dr.gather(mi.Int32, least, i * 3 + c))) for c in range(3)]
         packed = dr.ravel(mi.Vector4f(*dark, 0))
         for axis, taps in enumerate(self._shadow_taps):

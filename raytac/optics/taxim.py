@@ -23,6 +23,8 @@ from raytac.specs.sensor import SensorSpec
 __all__ = ["TableArrays", "TableShader", "TaximMode"]
 
 _ASPECT_TOLERANCE = 0.01
+_UNCOVERED = 2
+"""Flag of a pixel in contact whose bin no calibration sample reached."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,9 @@ class TableShader:
         self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(_padded(background)), arrays)
 
     def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
-        """Three channels of B·H·W levels, and (pixels in contact, of them in uncovered bins) for each environment (B·2).
+        """Three channels of B·H·W levels, and flags of every pixel (UInt8): 1 in contact, ``_UNCOVERED`` more in an uncovered bin.
 
-        Counts are one unused value where there is no contact to count.
+        The flags are one unused value where coverage is not known.
         """
         mi, table = self.mi, self.table
         displaced = table.slopes_of == "displacement"
@@ -81,16 +83,13 @@ class TableShader:
         if displaced:
             still = (of == 0) & (near[0] == 0) & (near[1] == 0) & (near[2] == 0) & (near[3] == 0)
             change = [dr.select(still, 0, d) for d in change]
-        counts = mi.UInt32(0)
+        flags = mi.UInt8(0)
         if table.covered is not None and seen.contact is not None:
-            touched = seen.contact != 0
-            count = [dr.select(touched, mi.UInt32(1), 0), dr.select(touched & (c[18] == 0), mi.UInt32(1), 0)]
-            pixels = self.resolution[0] * self.resolution[1]
-            counts = dr.concat([dr.block_reduce(dr.ReduceOp.Add, one, pixels) for one in count])
+            flags = seen.contact | dr.select((seen.contact != 0) & (c[18] == 0), mi.UInt8(_UNCOVERED), 0)
         if self._caster is not None and inputs.shadow is not None:
             change = self._caster.cast(seen, of, direction, change, inputs.shadow)
         packed = dr.gather(mi.Vector4f, inputs.background, p)
-        return [d + packed[k] for k, d in enumerate(change)], counts
+        return [d + packed[k] for k, d in enumerate(change)], flags
 
 
 class TaximMode(ImageMode):
@@ -154,13 +153,13 @@ class TaximMode(ImageMode):
         # With shadows: differences, the least values found (both 3), two packed images of 4 for the blurs, direction and ring.
         return 3 + 3 + 8 + 2 if self.shadow else 0
 
-    def _uncovered(self, counts: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
-        if self.table.covered is None or not self.needs_contact:
+    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        if self.table.covered is None:
             return None
-        touched, uncovered = counts.reshape(2, -1).astype(float)
-        share = np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=touched > 0)
-        share[failed] = np.nan
-        return share
+        per_image = flags.reshape(len(failed), -1)
+        touched = np.count_nonzero(per_image, axis=1).astype(float)
+        uncovered = np.count_nonzero(per_image >= _UNCOVERED, axis=1)
+        return np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=(touched > 0) & ~failed)
 
 
 def resized(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
