@@ -20,10 +20,13 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["SLOPES_OF", "PolyTable", "ShadowTable", "TaximConstants", "polynomial_basis", "slope_bins"]
+__all__ = ["DEPTHS_OF", "SLOPES_OF", "PolyTable", "ShadowTable", "TaximConstants", "polynomial_basis", "slope_bins"]
 
 SLOPES_OF = ("height", "displacement")
 """What a table's slopes are taken of: the surface itself (upstream) or how far it has moved from rest (tables baked by raytac)."""
+
+DEPTHS_OF = ("origin", "drop")
+"""Which depth a shadow table is indexed by: that of the pixel that casts (upstream), or by how much the shaded one lies below it."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,9 @@ class ShadowTable:
     """Half the opening of the fan of rays about a direction [rad]."""
     fan_precision: float = 0.05
     """Angle between the rays of a fan [rad]."""
+    depth_of: str = "origin"
+    """What the depth bin is that of. ``"origin"``: the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: how much
+    less than the ring pixel the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
 
     def __post_init__(self) -> None:
         n_dir = len(self.directions)
@@ -92,6 +98,8 @@ class ShadowTable:
         for name in ("depth_precision", "direction_precision", "step", "fan_angle", "fan_precision"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"shadow.{name}", value=getattr(self, name), rule="must be finite and > 0")
+        if self.depth_of not in DEPTHS_OF:
+            raise InputError("shadow.depth_of", value=self.depth_of, rule="must be a known depth", choices=DEPTHS_OF)
         if self.fan_angle > 32 * self.fan_precision:
             raise InputError("shadow.fan_precision", value=self.fan_precision, rule="must make a fan of at most 64 rays")
 
