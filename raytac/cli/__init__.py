@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from raytac.cli.compare import CompareArgs
 from raytac.cli.doctor import DoctorArgs
 from raytac.cli.press import PressArgs
 from raytac.errors import RaytacError
@@ -16,6 +17,7 @@ __all__ = ["main"]
 
 _Command = (
     Annotated[PressArgs, tyro.conf.subcommand("press")]
+    | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
 

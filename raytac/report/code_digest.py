@@ -12,15 +12,15 @@ __all__ = ["code_digest", "module_sources"]
 
 
 def module_sources(roots: Iterable[str], within: str = "raytac.optics") -> dict[str, Path]:
-    """Source files of ``roots`` and of all that they import, also inside functions, in the package ``within``; missing ones are left out.
+    """Source files of ``roots`` and of all modules of the package ``within`` that they import, also inside functions.
 
-    Only imports are followed, nothing is run except the ``__init__`` of packages.
+    Roots that do not exist are left out. Imports are read from the sources; nothing is run except the ``__init__`` of packages.
     """
     found: dict[str, Path] = {}
     waiting = list(roots)
     while waiting:
         name = waiting.pop()
-        if name in found or not (name + ".").startswith(within + "."):
+        if name in found:
             continue
         try:
             spec = importlib.util.find_spec(name)
@@ -30,10 +30,12 @@ def module_sources(roots: Iterable[str], within: str = "raytac.optics") -> dict[
             continue
         found[name] = Path(spec.origin)
         for node in ast.walk(ast.parse(found[name].read_bytes())):
+            imported: list[str] = []
             if isinstance(node, ast.Import):
-                waiting += [alias.name for alias in node.names]
+                imported = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module:
-                waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+                imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            waiting += [name for name in imported if (name + ".").startswith(within + ".")]
     return found
 
 

@@ -1,0 +1,68 @@
+"""``raytac compare``: what each optical mode costs, and how far it is from the converged reference."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.report.compare import CompareSettings, run_comparison
+from raytac.report.compare_report import write_comparison
+
+__all__ = ["CompareArgs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareArgs(CommonOptions):
+    """Render the same gel surfaces with every optical mode, and report error beside time.
+
+    Writes report.html (one file), pareto.png, a sheet of images a scene, results.parquet and metrics.json. Interrupted, it keeps what
+    is finished in the folder's rows/ and references/: the same command goes on from there.
+    """
+
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+    scenes: str = "sphere,coin,pins"
+    """Shipped press scenes or scene files, joined by commas."""
+    resolutions: str = "320x240"
+    """WIDTHxHEIGHT in pixels, joined by commas, as in 320x240,640x480."""
+    spp: int = 1024
+    """Samples a pixel of the reference; two independent halves give its noise."""
+    frames: int = 60
+    """Timed frames a figure; fewer, at least three, for modes slower than 10 s together."""
+    batch: int | None = None
+    """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
+    quick: bool = False
+    """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
+
+    def run(self) -> int:
+        start = time.perf_counter()
+        out = self.out if self.out is not None else Path("runs") / "compare"
+        settings = self.settings()
+        settings.check()
+        try:
+            comparison = run_comparison(settings, out)
+        except KeyboardInterrupt:
+            print(f"raytac: interrupted; finished rows are kept in {out}, the same command goes on from there", file=sys.stderr)
+            return 130
+        for path in write_comparison(comparison, out, time.perf_counter() - start):
+            print(path)
+        return 0
+
+    def settings(self) -> CompareSettings:
+        """What the options mean. Raises InputError for names or numbers that cannot be read."""
+        scenes = parse_names(self.scenes, "scenes")
+        sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
+        chosen = CompareSettings(
+            sensor=self.sensor,
+            scenes=scenes,
+            resolutions=sizes,
+            device=self.device,
+            seed=self.seed,
+            reference_spp=self.spp,
+            frames=self.frames,
+            batch=self.batch,
+        )
+        return chosen.quickened() if self.quick else chosen
