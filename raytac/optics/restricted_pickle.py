@@ -1,0 +1,164 @@
+"""Read pickles of numbers, lists, tuples and NumPy arrays of those, and nothing else.
+
+A pickle is a program: ``pickle.load`` calls whatever it names. Upstream's shadow tables are pickled object arrays, so they are read by
+an unpickler that knows only what such an array needs, as stand-ins that check every argument; any other name ends the reading before
+anything is called. Arrays are built from the stand-ins afterwards, so that no state from the file reaches NumPy unchecked.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["load_restricted"]
+
+_NUMBERS = "biuf"
+"""Kinds of NumPy numbers that are admitted."""
+
+
+def load_restricted(data: bytes) -> Any:
+    """Object of the pickle ``data``: numbers, text, lists, tuples, and NumPy arrays and scalars of them.
+
+    Raises:
+        pickle.UnpicklingError: it names anything else, or is cut short or damaged. Nothing that it names has run.
+    """
+    try:
+        return _plain(_Unpickler(io.BytesIO(data)).load())
+    except pickle.UnpicklingError:
+        raise
+    except Exception as error:  # a damaged stream ends in errors of many types
+        raise pickle.UnpicklingError(f"the pickle is damaged: {type(error).__name__}: {error}") from error
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return _Admitted(_ADMITTED[module, name])
+        except KeyError:
+            message = f"it names {module}.{name}, and only numbers, lists, tuples and NumPy arrays of them are read"
+            raise pickle.UnpicklingError(message) from None
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError("it refers to an object outside of itself")
+
+
+class _Admitted:
+    """A callable that a pickle may call and may not change."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *args: Any) -> Any:
+        return self._function(*args)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("it changes what it names")
+
+
+class _Type:
+    """Stands in for a dtype: a number's, or ``O`` for objects."""
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, code: Any, align: Any = False, copy: Any = True) -> None:
+        self.dtype = np.dtype(code) if isinstance(code, str) else np.dtype("V")
+        if self.dtype.kind not in _NUMBERS + "O":
+            raise pickle.UnpicklingError(f"an array of {code!r}")
+
+    def __setstate__(self, state: Any) -> None:
+        order, *structure = state[1:5]
+        if order not in ("<", ">", "|", "=") or any(part is not None for part in structure):
+            raise pickle.UnpicklingError(f"an array of the structure {state[1:5]!r}")
+        if self.dtype.kind != "O":
+            self.dtype = self.dtype.newbyteorder(order)
+
+
+class _Array:
+    """Stands in for an array until its state has come and been checked."""
+
+    __slots__ = ("data", "fortran", "kind", "shape")
+
+    def __init__(self, *start: Any) -> None:
+        self.kind, self.shape, self.data, self.fortran = np.dtype("b"), (0,), b"", False
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, kind, fortran, data = state
+        self.kind, self.shape, self.fortran, self.data = _dtype_of(kind), shape, bool(fortran), data
+
+    def array(self) -> np.ndarray:
+        shape = tuple(int(n) for n in self.shape)
+        order = "F" if self.fortran else "C"
+        if self.kind.kind != "O":
+            return np.frombuffer(_bytes(self.data), dtype=self.kind).reshape(shape, order=order)
+        items = self.data
+        if not isinstance(items, list) or min(shape, default=0) < 0 or len(items) != math.prod(shape):
+            raise pickle.UnpicklingError(f"an array of shape {shape} without its items")
+        out = np.empty(len(items), dtype=object)
+        for k, item in enumerate(items):
+            out[k] = _plain(item)
+        return out.reshape(shape, order=order)
+
+
+def _plain(item: Any) -> Any:
+    """``item`` with every stand-in replaced by its array."""
+    if isinstance(item, _Array):
+        return item.array()
+    if isinstance(item, (list, tuple)):
+        return type(item)(_plain(one) for one in item)
+    if item is None or isinstance(item, (bool, int, float, str, bytes, np.number, np.bool_)):
+        return item
+    raise pickle.UnpicklingError(f"it holds a {type(item).__name__}")
+
+
+def _dtype_of(kind: Any) -> np.dtype:
+    if not isinstance(kind, _Type):
+        raise pickle.UnpicklingError("an array without a type")
+    return kind.dtype
+
+
+def _bytes(data: Any) -> bytes:
+    if not isinstance(data, (bytes, bytearray)):
+        raise pickle.UnpicklingError(f"numbers in a {type(data).__name__}")
+    return bytes(data)
+
+
+def _scalar(kind: Any, data: Any) -> Any:
+    dtype = _dtype_of(kind)
+    if dtype.kind not in _NUMBERS or len(_bytes(data)) != dtype.itemsize:
+        raise pickle.UnpicklingError(f"a scalar of {dtype}")
+    return np.frombuffer(_bytes(data), dtype=dtype)[0]
+
+
+def _from_buffer(data: Any, kind: Any, shape: Any, order: Any) -> _Array:
+    """An array as protocol 5 writes it."""
+    out = _Array()
+    out.__setstate__((1, shape, kind, order == "F", _bytes(data)))
+    return out
+
+
+def _encode(text: Any, encoding: Any = "latin1") -> bytes:
+    """Bytes as protocols before 3 write them."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError(f"text in encoding {encoding!r}")
+    return text.encode("latin1")
+
+
+def _never(*args: Any) -> Any:
+    raise pickle.UnpicklingError("it makes an array without _reconstruct")
+
+
+_ADMITTED: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy", "ndarray"): _never,  # named only, as the kind of array to make
+    ("numpy", "dtype"): _Type,
+    ("_codecs", "encode"): _encode,
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Array for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _scalar for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): _from_buffer for core in ("core", "_core")},
+}
