@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["AssetError", "BackendError", "InputError", "MeshError", "RaytacError", "SpecError"]
+__all__ = ["AssetError", "BackendError", "CalibrationError", "InputError", "MeshError", "RaytacError", "SpecError"]
 
 
 class RaytacError(Exception):
@@ -63,6 +63,10 @@ class SpecError(RaytacError, ValueError):
         where = f"{self.file}: " if self.file is not None else ""
         what = f"{key} = {short_repr(value)}: " if key and value is not None else f"{key}: " if key else ""
         super().__init__(f"{where}{what}{rule}{_choices_text(hint_for or value, self.choices)}")
+
+
+class CalibrationError(SpecError):
+    """A calibration folder cannot be used: a file is missing, damaged, or holds something of the wrong kind, shape or range."""
 
 
 class MeshError(SpecError):
