@@ -78,8 +78,8 @@ class ShadowTable:
     fan_precision: float = 0.05
     """Angle between the rays of a fan [rad]."""
     depth_of: str = "origin"
-    """What the depth bin is that of. ``"origin"``: the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: how much
-    less than the ring pixel the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
+    """``"origin"``: the depth bin is that of the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: that of how
+    much less than the ring pixel the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
 
     def __post_init__(self) -> None:
         n_dir = len(self.directions)

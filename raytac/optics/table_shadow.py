@@ -62,7 +62,10 @@ class ShadowCaster:
         values = np.full((n_dir, n_depth, length, 4), _NOTHING, dtype=np.float32)
         values[..., :3] = np.moveaxis(np.where(beyond, _NOTHING, t.values), 0, -1)
         ways, counts = self._ways()
-        ends = counts[np.arange(n_dir)[:, None], t.lengths.max(axis=0)]
+        lengths = t.lengths.max(axis=0)
+        if t.depth_of == "drop":  # a ray may need the list of any depth up to that of its origin
+            lengths = np.maximum.accumulate(lengths, axis=1)
+        ends = counts[np.arange(n_dir)[:, None], lengths]
         return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(ways.ravel()))
 
     def _ways(self) -> tuple[np.ndarray, np.ndarray]:
@@ -97,13 +100,20 @@ class ShadowCaster:
         first = i - row * width - column
         ring = self._dilated(seen) & (seen.contact == 0)
         a = mi.Int32(dr.floor((direction + np.pi) * (1 / t.direction_precision)))
-        d = mi.Int32(dr.floor((seen.moved * self.pitch - t.first_depth) * (1 / t.depth_precision))) + t.depth_offset
+        by_drop = t.depth_of == "drop"
+
+        def depth_bin(pixels: Any) -> Any:
+            d = mi.Int32(dr.floor((pixels * self.pitch - t.first_depth) * (1 / t.depth_precision))) + t.depth_offset
+            return dr.minimum(d, n_depth - 1) if by_drop else d
+
+        d = depth_bin(seen.moved)
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
         # Only a few pixels cast: bring them together, so that no lane idles.
         caster = dr.compress(casts)
         a, d, x0, y0, first_of = (dr.gather(type(v), v, caster) for v in (a, d, mi.Int32(column), mi.Int32(row), first))
         origin = dr.gather(mi.Float, of, caster)
+        moved = dr.gather(mi.Float, seen.moved, caster)
         entry = a * n_depth + d
         end = dr.gather(mi.UInt32, arrays.ends, entry)
         places = dr.width(arrays.ways) // (4 * n_dir)
@@ -115,13 +125,18 @@ class ShadowCaster:
 
         def march(k: Any) -> tuple[Any]:
             place = dr.gather(mi.Vector4i, arrays.ways, a * places + k)
-            value = dr.gather(mi.Vector4i, arrays.values, entry * length + mi.UInt32(place.z))
             x, y = x0 + place.x, y0 + place.y
             # Upstream truncates towards zero, so what falls just outside the first row or column is in it.
             x, y = dr.select(x == -1, 0, x), dr.select(y == -1, 0, y)
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
             at = first_of + mi.UInt32(y) * width + mi.UInt32(x)
             shaded = inside & (origin > dr.gather(mi.Float, of, at, inside))
+            row_of = entry
+            if by_drop:
+                drop = depth_bin(moved - dr.gather(mi.Float, seen.moved, at, inside))
+                shaded &= drop >= 0
+                row_of = a * n_depth + mi.UInt32(dr.maximum(drop, 0))
+            value = dr.gather(mi.Vector4i, arrays.values, row_of * length + mi.UInt32(place.z), shaded)
             for c in range(3):
                 dr.scatter_reduce(dr.ReduceOp.Min, least, value[c], at * 3 + c, shaded, mode=dr.ReduceMode.Direct)
             return (k + 1,)
@@ -186,8 +201,10 @@ class ShadowCaster:
 
 
 def gaussian_taps(sigma: float, radius: int) -> np.ndarray:
-    """Weights exp(−k² / 2σ²), k = −radius … radius, that sum to 1."""
+    """Weights exp(−k² / 2σ²), k = −radius … radius, that sum to 1; one at k = 0 for σ = 0."""
     k = np.arange(-radius, radius + 1)
+    if sigma == 0:
+        return (k == 0).astype(np.float64)
     weights = np.exp(-0.5 * (k / sigma) ** 2)
     return weights / weights.sum()
 

@@ -1,0 +1,67 @@
+"""How a table is baked: numbers of presses and their ranges. They are part of what a cached table is kept under."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError
+
+__all__ = ["BakeSettings"]
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """Presses of the virtual calibration and how they are fitted."""
+
+    images: int = 400
+    """Images with balls."""
+    balls: int = 4
+    """Most balls in one image."""
+    radius: tuple[float, float] = (1e-3, 6e-3)
+    """Smallest and largest ball [m]."""
+    depth: tuple[float, float] = (0.3e-3, 1.1e-3)
+    """Shallowest and deepest press [m]; at most ``deepest_share`` of the pad's thickness."""
+    deepest_share: float = 0.3
+    """Deepest press as a share of the pad's thickness."""
+    bare_share: float = 0.4
+    """Share of images whose balls press without the gel around them giving way."""
+    n_bins: int = 125
+    """Bins of the slope's magnitude, and of its direction (upstream: 125)."""
+    neighbours: float = 0.3
+    """Weight of the samples of each of the eight bins around a bin in its fit."""
+    ridge: float = 1e-4
+    """Pull of the polynomial's terms, the constant left out, to 0, relative to the number of samples, over positions in [−1, 1]."""
+    pins: int = 96
+    """Presses of a pin, and as many of a single ball, from which the shadows are read; 0 bakes none."""
+    pin_radius: tuple[float, float] = (0.4e-3, 2e-3)
+    """Thinnest and thickest pin [m]."""
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("images", 1), ("balls", 1), ("n_bins", 3), ("pins", 0)):
+            value = getattr(self, name)
+            if int(value) != value or value < lowest:
+                raise InputError(f"bake.{name}", value=value, rule=f"must be a whole number >= {lowest}")
+        for name in ("radius", "depth", "pin_radius"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < np.inf:
+                raise InputError(f"bake.{name}", value=(low, high), rule="must be (low, high) with 0 < low <= high [m]")
+        for name, low, high in (
+            ("deepest_share", 0.0, 1.0),
+            ("bare_share", 0.0, 1.0),
+            ("neighbours", 0.0, 1.0),
+            ("ridge", 0.0, 1.0),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"bake.{name}", value=getattr(self, name), rule=f"must be in [{low:g}, {high:g}]")
+
+    @classmethod
+    def quick(cls) -> BakeSettings:
+        """Coarse and in seconds, to see that all works."""
+        return cls(images=40, n_bins=45, pins=12)
+
+    def depth_range(self, thickness: float) -> tuple[float, float]:
+        """Shallowest and deepest press [m] on a pad of this ``thickness`` [m]."""
+        deepest = min(self.depth[1], self.deepest_share * thickness)
+        return min(self.depth[0], deepest), deepest

@@ -1,0 +1,88 @@
+"""The camera's view of calibration presses: what the ray tracer shows of them and where they slope."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import drjit as dr
+import numpy as np
+
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.image_mode import see_heights
+from raytac.optics.raytrace import RayTracer
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["Calibration", "Views"]
+
+COARSEST_PITCH = 0.1e-3
+"""Spacing of the pad's grid where the image does not ask for a finer one [m], as in ``TactileSensor``."""
+_BATCH = {"cpu": 8, "cuda": 32}
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the camera sees of a batch of presses, and where; all NumPy, first axis B."""
+
+    rgb: np.ndarray
+    """(B, H, W, 3) uint8."""
+    slope_x: np.ndarray
+    """∂(rest − z)/∂x, (B, H, W) float32."""
+    slope_y: np.ndarray
+    moved: np.ndarray
+    """rest − z [m], (B, H, W) float32."""
+    contact: np.ndarray
+    """(B, H, W) bool."""
+
+
+class Calibration:
+    """The ray tracer of one sensor set up for calibration presses."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        device: str = "auto",
+        resolution: tuple[int, int] | None = None,
+        seed: int = 0,
+        shadows: bool = True,
+    ) -> None:
+        """``shadows``: whether the images have cast shadows. Raises as ``RayTracer``."""
+        self.tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb",), device=device, seed=seed, shadows=shadows)
+        camera, native = self.tracer.camera, sensor.camera
+        px, py = (p * n / m for p, n, m in zip(native.pixel_pitch, native.resolution, camera.resolution, strict=True))
+        self.pitch = (px, py)
+        """Size of an image pixel on the plane z = 0 along x and y [m]."""
+        self.grid: PadGrid = make_grid(sensor.gelpad, min(COARSEST_PITCH, px, py))
+        """Nodes of the presses, as fine as the image."""
+        rest = self.grid.rest[None].astype(np.float32)
+        surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan))
+        rgb = self.tracer.render(surface).rgb
+        assert rgb is not None
+        self.rest_image: np.ndarray = rgb[0]
+        """(H, W, 3) uint8."""
+        self._rest = self.tracer.mi.Float(rest.ravel())
+
+    def views(self, presses: Iterable[GelSurface]) -> Iterator[Views]:
+        """Render ``presses`` (one environment each, on ``grid``) in batches and see their slopes as the table mode does."""
+        presses = iter(presses)
+        while some := list(islice(presses, _BATCH[self.tracer.device])):
+            height, contact, centre = (
+                np.concatenate([getattr(s, a) for s in some]) for a in ("height", "contact", "contact_centre")
+            )
+            yield self._view(GelSurface(self.grid, height, contact, centre))
+
+    def _view(self, surface: GelSurface) -> Views:
+        tracer, mi = self.tracer, self.tracer.mi
+        rgb = tracer.render(surface).rgb
+        assert rgb is not None
+        heights = mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+        contact = mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+        seen = see_heights(mi, tracer.layout, tracer.camera, self.pitch, self._rest, heights, contact)
+        dr.eval(seen.height, seen.moved, seen.contact)
+        slope_x, slope_y, _ = seen.slopes(mi, seen.moved)
+        dr.eval(slope_x, slope_y)
+        x, y, moved, touched = (np.array(v).reshape(rgb.shape[:3]) for v in (slope_x, slope_y, seen.moved, seen.contact))
+        return Views(rgb, x, y, moved * np.float32(self.pitch[0]), touched.astype(bool))
