@@ -15,11 +15,24 @@ from pathlib import Path
 
 from raytac.errors import BackendError, InputError
 
-__all__ = ["DEVICES", "cuda_device_count", "llvm_library", "optix_library", "resolve_device", "total_memory"]
+__all__ = [
+    "DEVICES",
+    "cuda_device_count",
+    "cuda_driver_version",
+    "cuda_missing",
+    "llvm_library",
+    "optix_library",
+    "resolve_device",
+    "total_memory",
+]
 
 DEVICES = ("auto", "cpu", "cuda")
 """Names that every ``device`` option accepts."""
 
+CUDA_MINIMUM = (12, 2)
+"""Oldest CUDA that Dr.Jit 1.5 takes: it switches its CUDA backend off below, and says so in its log only."""
+CUDA_REFUSED = (12, 7)
+"""CUDA whose OptiX Dr.Jit 1.5 refuses."""
 LLVM_MINIMUM = 16
 """Oldest LLVM looked for on the system: 14 is refused by Dr.Jit 1.5, and 15 was seen to abort the process."""
 
@@ -27,7 +40,8 @@ LLVM_MINIMUM = 16
 def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
     """Return ``"cuda"`` or ``"cpu"`` for a ``device`` option.
 
-    ``"auto"`` is CUDA when a device answers (and, for ``ray_tracing``, the driver brings OptiX), else the CPU.
+    ``"auto"`` is CUDA when a device answers (and, for ``ray_tracing``, the driver brings OptiX and is new enough), else the CPU. This
+    loads the driver and runs nothing on it; the ray tracer traces a ray before it commits itself (``raytac.optics.variant``).
 
     Raises:
         InputError: ``device`` is not one of ``DEVICES``.
@@ -37,7 +51,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
         raise InputError("device", value=device, rule="must be a known device", choices=DEVICES)
     if device == "cpu":
         return "cpu"
-    missing = _cuda_missing(ray_tracing)
+    missing = cuda_missing(ray_tracing)
     if not missing:
         return "cuda"
     if device == "cuda":
@@ -45,11 +59,20 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
     return "cpu"
 
 
-def _cuda_missing(ray_tracing: bool) -> str:
+def cuda_missing(ray_tracing: bool = True) -> str:
+    """What CUDA lacks here, found without running anything on a device; nothing if it should work."""
     if cuda_device_count() == 0:
-        return "no NVIDIA driver or no visible CUDA device"
-    if ray_tracing and optix_library() is None:
+        return "no NVIDIA driver, or no CUDA device that this process may see"
+    if not ray_tracing:
+        return ""
+    if optix_library() is None:
         return "the NVIDIA driver brings no OptiX (libnvoptix.so.1; in a container ask for the 'graphics' capability)"
+    version = cuda_driver_version()
+    if version < CUDA_MINIMUM:
+        found, least = (".".join(map(str, v)) for v in (version, CUDA_MINIMUM))
+        return f"the NVIDIA driver speaks CUDA {found}, and Dr.Jit needs {least} (driver R535 or newer)"
+    if version == CUDA_REFUSED:
+        return "the NVIDIA driver speaks CUDA 12.7 (R565), whose OptiX Dr.Jit refuses as prone to miscompile; older and newer ones work"
     return ""
 
 
@@ -61,6 +84,15 @@ def cuda_device_count() -> int:
         return 0
     count = ctypes.c_int(0)
     return count.value if driver.cuDeviceGetCount(ctypes.byref(count)) == 0 else 0
+
+
+@functools.cache
+def cuda_driver_version() -> tuple[int, int]:
+    """Newest CUDA (major, minor) that the driver speaks; (0, 0) without a driver."""
+    driver, version = _load(("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so")), ctypes.c_int(0)
+    if driver is None or driver.cuDriverGetVersion(ctypes.byref(version)) != 0:
+        return 0, 0
+    return version.value // 1000, version.value % 1000 // 10
 
 
 @functools.cache

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from raytac import foreign_ipc
-from raytac.device import cuda_device_count, llvm_library, optix_library
+from raytac.device import cuda_missing, llvm_library
 from raytac.io.metrics import versions
 
 __all__ = ["PROBES", "Check", "Probe", "Report", "diagnose", "run_probe"]
@@ -149,12 +149,6 @@ class Report:
         return "\n".join([*lines, "", verdict])
 
 
-def _no_cuda() -> str:
-    if cuda_device_count() == 0:
-        return "no NVIDIA driver, or no CUDA device that this process may see"
-    return "" if optix_library() else "the NVIDIA driver brings no OptiX (libnvoptix.so.1)"
-
-
 def _no_warp() -> str:
     return "" if importlib.util.find_spec("warp") else "not installed: only the soft pad will need it"
 
@@ -167,7 +161,7 @@ PROBES = (
     Probe(
         "mitsuba-cuda", _TRACE.format(device="cuda"), False,
         "needs an NVIDIA GPU and driver with OptiX (in a container: the 'graphics' driver capability); the CPU does without",
-        _no_cuda,
+        cuda_missing,
     ),
     Probe(
         "mitsuba-llvm", _TRACE.format(device="cpu"), False,

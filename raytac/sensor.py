@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS, TactileFrame
 from raytac.gel.object_height import object_height
@@ -90,12 +91,13 @@ class TactileSensor:
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
             SpecError: the sensor or light file breaks a rule.
+            BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
         _check_name("physics", physics, PHYSICS)
         if isinstance(optics, str):
             _check_name("optics", optics, OPTICS)
         _check_name("integrator", integrator, INTEGRATORS)
-        _check_name("device", device, ("auto", "cpu", "cuda"))
+        resolve_device(device)
         if not isinstance(outputs, (str, Sequence)):
             raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
         outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)

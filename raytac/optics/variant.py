@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 from raytac.device import llvm_library, resolve_device
@@ -15,32 +16,68 @@ VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
 def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     """Import Mitsuba with the variant for ``device`` (``auto``, ``cpu``, ``cuda``).
 
-    Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first.
+    Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first, and
+    ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
 
     Raises:
-        BackendError: no LLVM library (CPU), no CUDA device, or a process that already uses the other variant.
+        BackendError: no LLVM library (CPU), no CUDA that works, or a process that already uses the other variant.
     """
-    name = resolve_device(device)
-    if name == "cpu" and llvm_library() is None:
+    resolved = resolve_device(device)
+    if resolved == "cpu":
+        _require_llvm()
+    import mitsuba as mi
+
+    name = _started(mi, device, resolved)
+    from raytac.optics import led
+
+    led.register(mi)
+    return mi, name
+
+
+def _started(mi: Any, device: str, name: str) -> str:
+    """The device whose variant is set in ``mi``: ``name``, or another one that ``device = "auto"`` may fall back to."""
+    active = next((known for known, variant in VARIANTS.items() if variant == mi.variant()), None)
+    if active is not None and device == "auto":
+        return active
+    if mi.variant() not in (None, VARIANTS[name]):
+        raise BackendError(
+            f"this process already renders with {mi.variant()}, so {VARIANTS[name]} (device {name!r}) cannot be used; "
+            "keep one device per process"
+        )
+    if active is not None:
+        return name
+    failure = _try_variant(mi, VARIANTS[name], trace=name == "cuda")
+    if failure and name == "cuda" and device == "auto":
+        warnings.warn(
+            f"CUDA does not trace here, so the CPU does: {failure} (`raytac doctor` tells more)", RuntimeWarning, stacklevel=4
+        )
+        _require_llvm()
+        name, failure = "cpu", _try_variant(mi, VARIANTS["cpu"])
+    if failure:
+        raise BackendError(f"Mitsuba variant {VARIANTS[name]} does not work here: {failure}; run `raytac doctor`")
+    return name
+
+
+def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
+    """Set the variant, trace one ray if asked, and return why that failed, or nothing.
+
+    A CUDA whose libraries load may still not trace: no kernel image for the card, no OptiX in a container, a driver that is too old.
+    """
+    try:
+        mi.set_variant(variant)
+        if trace:
+            scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+            if not scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]:
+                return "a ray missed what it must hit"
+    except (ImportError, RuntimeError) as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+def _require_llvm() -> None:
+    if llvm_library() is None:
         raise BackendError(
             "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
             "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
             "`raytac doctor` tells what was tried"
         )
-    import mitsuba as mi
-
-    variant = VARIANTS[name]
-    if mi.variant() not in (None, variant):
-        raise BackendError(
-            f"this process already renders with {mi.variant()}, so {variant} (device {name!r}) cannot be used; "
-            "keep one device per process"
-        )
-    if mi.variant() is None:
-        try:
-            mi.set_variant(variant)
-        except (ImportError, RuntimeError) as error:
-            raise BackendError(f"Mitsuba variant {variant} does not start: {error}; run `raytac doctor`") from error
-    from raytac.optics import led
-
-    led.register(mi)
-    return mi, name
