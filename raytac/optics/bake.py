@@ -19,15 +19,17 @@ from raytac.optics.bake_presses import ball_presses, pin_presses
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.bake_shadow import ShadowSums
 from raytac.optics.bake_views import Calibration, Views
+from raytac.optics.calib_folder import load_calibration
 from raytac.optics.table import PolyTable, TaximConstants, slope_bins
+from raytac.optics.table_cache import cache_root, cached, keep, table_key
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Baked", "bake", "bake_table"]
+__all__ = ["Baked", "bake", "bake_table", "baked_table"]
 
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
 
-_PLAIN = TaximConstants(background_share=0.0, background_threshold=np.inf, shadow_sigma=0.0, final_sigma=0.0)
+_PLAIN = TaximConstants(background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
 """The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
 
 
@@ -52,6 +54,35 @@ def bake_table(
 ) -> PolyTable:
     """Calibrate a table on the ray tracer; ``bake`` says how the bins were sampled, ``baked_table`` keeps the result on disk."""
     return bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress).table
+
+
+def baked_table(
+    sensor: SensorSpec,
+    *,
+    device: str = "auto",
+    seed: int = 0,
+    resolution: tuple[int, int] | None = None,
+    settings: BakeSettings | None = None,
+    progress: bool = True,
+) -> PolyTable:
+    """The table of ``bake_table``, baked once and kept on disk under a digest of sensor, lights, settings and code.
+
+    It is kept in ``cache_root()``, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
+    nothing there. A cached table may come from the other device, whose images differ by rounding.
+
+    Raises:
+        InputError: a value out of its choices, or a cache that cannot be written.
+        BackendError: the table is not cached, and the ray tracer cannot run on ``device``.
+    """
+    settings = BakeSettings() if settings is None else settings
+    key = table_key(sensor, settings, seed, resolution or sensor.camera.resolution)
+    folder = cache_root() / "tables" / f"{sensor.name}-{key}"
+    table = cached(folder)
+    if table is None:
+        keep(bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress), folder)
+        # What later processes will read, to the last bit.
+        table = load_calibration(folder)
+    return table
 
 
 def bake(

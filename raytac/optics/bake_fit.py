@@ -1,7 +1,8 @@
 """From samples to polynomials: normal equations of every slope bin, summed over all presses and solved at once.
 
 A bin's model is dI(x, y) = g · [x², y², x y, x, y, 1] (Si and Yuan, RA-L 2022, section III). All bins' 6 × 6 normal equations
-Σ a aᵀ g = Σ a dI are kept in float64, so a million samples cost no memory and their order hardly matters. Positions are scaled to [−1, 1] inside and the coefficients rewritten for pixels at the end.
+Σ a aᵀ g = Σ a dI are kept in float64, so a million samples cost no memory and their order hardly matters.
+Positions are scaled to [−1, 1] inside and the coefficients rewritten for pixels at the end.
 """
 
 from __future__ import annotations
@@ -89,8 +90,9 @@ class BinSums:
         for step, terms in ((0, _CONSTANT), (1, _LINEAR), (2, _QUADRATIC)):
             chosen = np.flatnonzero(degree == step)
             pull = np.diag([1.0] * (len(terms) - 1) + [0.0])
-            lhs = gram[np.ix_(chosen, terms, terms)] + (ridge * gram[chosen, 5, 5] + _PULL)[:, None, None] * pull
-            solution[np.ix_(chosen, terms)] = np.linalg.solve(lhs, moment[np.ix_(chosen, terms)])
+            least = terms[0]  # a degree's terms are the last ones
+            lhs = gram[chosen, least:, least:] + (ridge * gram[chosen, 5, 5] + _PULL)[:, None, None] * pull
+            solution[chosen, least:] = np.linalg.solve(lhs, moment[chosen, least:])
         source = _fill_from(own.reshape(n, m))
         pixels = np.einsum("ab,nac->cnb", self._pixels_from_scaled(), solution[source.ravel()]).reshape(3, n, m, 6)
         return BinFit(

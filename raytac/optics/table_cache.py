@@ -1,0 +1,86 @@
+"""Baked tables on disk, each under a digest of all that shapes it, so that a table is never taken for that of another sensor or code."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import raytac.gel
+import raytac.optics
+from raytac.errors import CalibrationError, InputError
+from raytac.optics.bake_settings import BakeSettings
+from raytac.optics.calib_folder import load_calibration, save_calibration
+from raytac.optics.table import PolyTable
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["cache_root", "cached", "keep", "table_key"]
+
+_NOT_IN_TABLE = (
+    "phong",
+    "reference",
+    "denoise",
+    "memory",
+    "taxim",
+    "table_shadow",
+    "table_cache",
+    "calib_folder",
+    "restricted_pickle",
+)
+"""Modules of raytac.optics on which no baked table depends: other modes, and what reads a table."""
+
+
+def cache_root() -> Path:
+    """``RAYTAC_CACHE`` if set, else ``raytac`` in ``XDG_CACHE_HOME`` or in ``~/.cache``."""
+    if chosen := os.environ.get("RAYTAC_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "raytac"
+
+
+def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
+    """Digest of sensor and lights (not of where their files lie), settings, and the code of gel and ray tracer; the device is not in it."""
+    plain = replace(sensor, source=None, lights=replace(sensor.lights, source=None))
+    digest = hashlib.sha256(repr((plain, settings, seed, resolution)).encode())
+    for package in (raytac.gel, raytac.optics):
+        for path in sorted(Path(str(package.__file__)).parent.glob("*.py")):
+            if path.stem not in _NOT_IN_TABLE:
+                digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:24]
+
+
+def cached(folder: Path) -> PolyTable | None:
+    """The table kept in ``folder``; None if there is none, or, with a warning, if it is damaged."""
+    if not folder.is_dir():
+        return None
+    try:
+        return load_calibration(folder)
+    except CalibrationError as error:
+        warnings.warn(f"the baked table in {folder} is damaged and is baked again: {error}", RuntimeWarning, stacklevel=3)
+        return None
+
+
+def keep(table: PolyTable, folder: Path) -> None:
+    """Write the table to ``folder`` as a whole: it is written beside it and then renamed, in place of a damaged one.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    work = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
+        save_calibration(table, work / folder.name)
+        shutil.rmtree(folder, ignore_errors=True)
+        # Another process may have been faster; its table is the same.
+        if not folder.exists():
+            os.replace(work / folder.name, folder)
+    except OSError as error:
+        rule = f"must be a folder that can be written ({error.strerror}); RAYTAC_CACHE names another"
+        raise InputError("cache", value=folder, rule=rule) from error
+    finally:
+        if work is not None:
+            shutil.rmtree(work, ignore_errors=True)
