@@ -1,0 +1,53 @@
+"""Rows come back as they were kept, or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.report.code_digest import code_digest, module_sources
+from raytac.report.row_store import Row, RowStore, row_key
+
+
+def test_a_row_comes_back_as_it_was_kept(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    figures = {"ms": 1.25, "label": "fast", "spp": None, "at_noise": True, "frames": 3}
+    store = RowStore(tmp_path / "rows", pytest.fail)
+    store.write("sphere-fast", "k", Row(dict(figures), image))
+    kept = store.read("sphere-fast", "k")
+    assert kept is not None and kept.figures == figures
+    np.testing.assert_array_equal(kept.image, image)
+    assert store.read("sphere-fast", "other") is None and store.read("coin-fast", "k") is None
+
+
+def test_a_row_that_is_not_finite_is_never_kept(tmp_path: Path) -> None:
+    with pytest.raises(ValueError):
+        RowStore(tmp_path).write("a", "k", Row({"ms": float("nan")}, np.zeros((2, 2, 3), np.uint8)))
+    assert RowStore(tmp_path, pytest.fail).read("a", "k") is None
+
+
+def test_keys_depend_on_every_part_and_on_nothing_else() -> None:
+    basis = {"seed": 0, "mode": ["fast", {"spp": 4}]}
+    assert row_key(basis) == row_key({"mode": ["fast", {"spp": 4}], "seed": 0})
+    assert len({row_key(basis), row_key(basis | {"seed": 1}), row_key(basis | {"mode": ["fast", {}]})}) == 3
+
+
+def test_code_of_a_mode_is_all_that_it_imports() -> None:
+    names = set(module_sources(["raytac.optics.raytrace"]))
+    assert {"raytac.optics.fast", "raytac.optics.reference", "raytac.optics.response", "raytac.optics.camera"} <= names
+    assert all(name.startswith("raytac.optics") for name in names)
+    assert "raytac.optics.fast" not in module_sources(["raytac.optics.reference"])
+    assert not module_sources(["raytac.optics.no_such_module"])
+
+
+def test_digest_changes_with_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = code_digest("raytac.optics.camera")
+    assert before == code_digest("raytac.optics.camera") != code_digest("raytac.optics.response")
+    changed = tmp_path / "camera.py"
+    changed.write_text("x = 1\n")
+    monkeypatch.setattr("raytac.report.code_digest.module_sources", lambda roots: {"raytac.optics.camera": changed})
+    one = code_digest("raytac.optics.camera")
+    changed.write_text("x = 2\n")
+    assert one != code_digest("raytac.optics.camera")
