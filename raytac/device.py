@@ -111,8 +111,8 @@ def total_memory(device: str) -> int:
 @functools.cache
 def optix_library() -> str | None:
     """Name of the OptiX library that can be loaded (``DRJIT_LIBOPTIX_PATH`` wins, as in Dr.Jit), or None."""
-    names = [os.environ.get("DRJIT_LIBOPTIX_PATH", ""), "nvoptix.dll" if sys.platform == "win32" else "libnvoptix.so.1"]
-    return next((name for name in names if name and _load((name,)) is not None), None)
+    name = os.environ.get("DRJIT_LIBOPTIX_PATH") or ("nvoptix.dll" if sys.platform == "win32" else "libnvoptix.so.1")
+    return name if _load((name,)) is not None else None
 
 
 def llvm_library() -> Path | None:

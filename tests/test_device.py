@@ -98,6 +98,17 @@ def test_cuda_that_loads_and_does_not_trace(asked: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_an_optix_that_the_user_named_is_the_only_one_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+    monkeypatch.setattr(device, "_load", lambda names: tried.append(names))
+    monkeypatch.setenv("DRJIT_LIBOPTIX_PATH", "/nowhere/libnvoptix.so")
+    device.optix_library.cache_clear()
+    try:
+        assert device.optix_library() is None and tried == [("/nowhere/libnvoptix.so",)]  # as Dr.Jit does
+    finally:
+        device.optix_library.cache_clear()
+
+
 def test_auto_stays_with_the_device_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     from raytac.optics.variant import load_mitsuba
 

@@ -94,6 +94,29 @@ def test_metrics_tell_time_contact_and_versions(folder: Path) -> None:
     assert float(metrics["image.change_from_rest_mean_u8"]) > 2
 
 
+def test_another_sensor_needs_no_python(tmp_path: Path) -> None:
+    """Three boards of LEDs on a dome, from its files alone: each board is a layer and lights the side that faces it."""
+    size = "128x96"
+    out = tmp_path / "dome"
+    command = ["press", "sphere", "--sensor", "gelsight_dome", "--resolution", size, "--device", "cpu", "--out", str(out)]
+    assert main(command) == 0
+    assert {path.name for path in out.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    sensor = load_sensor("gelsight_dome")
+    channels, header = read_exr(out / "frame.exr")
+    assert header["sensor"] == "gelsight_dome" and header["layers"].split() == [f"led_{name}" for name in sensor.lights.layers]
+    rgb = read_png(out / "rgb.png")
+    assert rgb.shape == (96, 128, 3) and rgb.std() > 5 and 20 < rgb.mean() < 235
+    metrics = read_metrics(out / "metrics.json")
+    assert float(metrics["contact.max_indentation_mm"]) == pytest.approx(0.8, abs=0.05)
+    assert float(metrics["image.change_from_rest_max_u8"]) > 20
+    # Light comes from the side of its board: the image's brightest half lies there.
+    for name in sensor.lights.layers:
+        x, y = np.mean([led.position[:2] for led in sensor.lights.leds if led.layer == name], axis=0)
+        layer = np.sum([channels[f"led_{name}.{c}"] for c in "RGB"], axis=0)
+        towards = channels["P.X"] * x + channels["P.Y"] * y
+        assert layer[towards > 0].mean() > 1.2 * layer[towards < 0].mean(), name
+
+
 def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)
     monkeypatch.chdir(tmp_path)  # shipped scenes are found from anywhere
