@@ -197,11 +197,11 @@ def save_calibration(table: PolyTable, folder: str | Path) -> None:
     if rest is None:
         rest = np.clip(np.rint(table.background), 0, 255).astype(np.uint8)
     with result_folder(Path(folder), CALIBRATION_FILES) as work:
-        gradients = {f"grad_{c}": table.gradients[k] for k, c in enumerate(_BGR)}
+        gradients: dict[str, Any] = {f"grad_{c}": table.gradients[k] for k, c in enumerate(_BGR)}
         np.savez(work / "polycalib.npz", bins=np.int64(table.n_bins), **gradients)
         np.savez(work / "dataPack.npz", f0=rest[..., ::-1], img_size=np.array(rest.shape))
         np.save(work / "gelmap.npy", np.zeros((height, width)) if table.gel_map is None else table.gel_map)
-        covered = {} if table.covered is None else {"covered": table.covered}
+        covered: dict[str, Any] = {} if table.covered is None else {"covered": table.covered}
         np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **covered)
         if table.shadow is not None:
             _save_shadow(work / "shadowTable.npz", table.shadow)

@@ -151,9 +151,7 @@ def params_of(table: PolyTable) -> dict[str, Any]:
             "fan_angle": shadow.fan_angle,
             "fan_precision": shadow.fan_precision,
             "contact_scale": CONTACT_SCALE,
-            "deform_pyramid_sigma_rel": [
-                [s / p / n for s in PYRAMID_SIGMAS] for p, n in zip(table.pixel_pitch, table.resolution, strict=True)
-            ],
+            "deform_pyramid_sigma_rel": pyramid,
             "deform_final_sigma_rel": relative(constants.final_sigma),
             "shadow_blur_sigma_rel": relative(constants.shadow_sigma),
             "shadow_attachment_kernel_size_rel": relative(5.0),
