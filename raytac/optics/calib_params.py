@@ -49,8 +49,8 @@ _OWN: dict[str, Callable[[Any], bool]] = {
     "first_depth": lambda v: _is_number(v),
     "depth_offset": lambda v: isinstance(v, int) and not isinstance(v, bool) and abs(v) < 10**6,
     "ring_dilations": lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 1000,
-    "shadow_sigma": lambda v: _is_number(v) and 0 < v < 1000,
-    "final_sigma": lambda v: _is_number(v) and 0 < v < 1000,
+    "shadow_sigma": lambda v: _is_number(v) and 0 <= v < 1000,
+    "final_sigma": lambda v: _is_number(v) and 0 <= v < 1000,
     "provenance": lambda v: isinstance(v, dict) and all(isinstance(one, str) for one in v.values()),
 }
 
