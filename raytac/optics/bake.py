@@ -21,7 +21,7 @@ from raytac.optics.bake_shadow import ShadowSums
 from raytac.optics.bake_views import Calibration, Views
 from raytac.optics.calib_folder import load_calibration
 from raytac.optics.table import PolyTable, TaximConstants, slope_bins
-from raytac.optics.table_cache import cache_root, cached, keep, table_key
+from raytac.optics.table_cache import cached, keep, table_folder
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Baked", "bake", "bake_table", "baked_table"]
@@ -41,6 +41,8 @@ class Baked:
     fit: BinFit
     images: int
     """Images that were rendered for it, those of the shadows included."""
+    device: str
+    """``cpu`` or ``cuda``: where they were rendered."""
 
 
 def bake_table(
@@ -75,8 +77,7 @@ def baked_table(
         BackendError: the table is not cached, and the ray tracer cannot run on ``device``.
     """
     settings = BakeSettings() if settings is None else settings
-    key = table_key(sensor, settings, seed, resolution or sensor.camera.resolution)
-    folder = cache_root() / "tables" / f"{sensor.name}-{key}"
+    folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
     table = cached(folder)
     if table is None:
         keep(bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress), folder)
@@ -150,7 +151,7 @@ def bake(
             "fill": "nearest covered magnitude of the same direction, else the nearest direction",
         },
     )
-    return Baked(table, fit, settings.images + 4 * settings.pins)
+    return Baked(table, fit, settings.images + 4 * settings.pins, lit.tracer.device)
 
 
 def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray) -> None:

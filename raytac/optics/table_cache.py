@@ -18,7 +18,7 @@ from raytac.optics.calib_folder import load_calibration, save_calibration
 from raytac.optics.table import PolyTable
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["cache_root", "cached", "keep", "table_key"]
+__all__ = ["cache_root", "cached", "keep", "table_folder", "table_key"]
 
 _NOT_IN_TABLE = (
     "phong",
@@ -50,6 +50,11 @@ def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution:
             if path.stem not in _NOT_IN_TABLE:
                 digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:24]
+
+
+def table_folder(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> Path:
+    """Where the table of ``table_key`` is kept."""
+    return cache_root() / "tables" / f"{sensor.name}-{table_key(sensor, settings, seed, resolution)}"
 
 
 def cached(folder: Path) -> PolyTable | None:

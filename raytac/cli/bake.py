@@ -1,0 +1,55 @@
+"""``raytac bake``: a Taxim table from the ray tracer of a sensor."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.report.bake import run_bake
+from raytac.specs import load_sensor
+
+__all__ = ["BakeArgs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeArgs(CommonOptions):
+    """Calibrate a Taxim table on the ray tracer of a sensor: virtual presses of balls and pins, fitted by slope.
+
+    Writes the table as a calibration folder that the package taxim reads too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz,
+    params.json, raytac.npz), coverage.png, sheet.png and metrics.json, and keeps it in the cache, from where optics taxim takes it.
+    An error or Ctrl-C leaves folder and cache as they were.
+    """
+
+    sensor: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SENSOR")] = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+    resolution: str | None = None
+    """WIDTHxHEIGHT of the calibration images in pixels, as in 320x240; the sensor's own if not given."""
+    scenes: str = "sphere,coin,pins"
+    """Shipped press scenes or scene files, joined by commas, on which the table is compared with the ray tracer."""
+    quick: bool = False
+    """Few presses and coarse bins, in seconds: shows that all runs; a poor table."""
+
+    def run(self) -> int:
+        from raytac.optics.bake_settings import BakeSettings
+
+        start = time.perf_counter()
+        resolution = None if self.resolution is None else parse_resolution(self.resolution)
+        sensor = load_sensor(self.sensor)
+        paths = run_bake(
+            sensor,
+            self.out if self.out is not None else Path("runs") / "bake" / sensor.name,
+            settings=BakeSettings.quick() if self.quick else BakeSettings(),
+            scenes=parse_names(self.scenes, "scenes"),
+            device=self.device,
+            seed=self.seed,
+            resolution=resolution,
+            start=start,
+        )
+        for path in paths:
+            print(path)
+        return 0

@@ -1,0 +1,101 @@
+"""How far a Taxim table is from the ray tracer it was baked from, press scene by press scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+from raytac.report.image_error import mae, psnr, rmse
+from raytac.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from raytac.optics.table import PolyTable
+
+__all__ = ["BOX_MARGIN", "SceneError", "contact_box", "table_errors"]
+
+BOX_MARGIN = 15 / 320
+"""Margin of the box round the contact as a share of the image's width: 15 px at 320 × 240."""
+
+
+@dataclass(frozen=True)
+class SceneError:
+    """One press: the images and how far the table's is from the ray tracer's."""
+
+    traced: np.ndarray
+    """(H, W, 3) uint8."""
+    table: np.ndarray
+    """(H, W, 3) uint8."""
+    contact: np.ndarray
+    """(H, W) bool; nothing but False if nothing touches."""
+    uncovered: float
+    """Share of the contact's pixels whose bin no sample reached; NaN without contact."""
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of ``contact_box``."""
+        return contact_box(self.contact)
+
+    @property
+    def contact_mae(self) -> float:
+        """Mean absolute error over the contact's pixels [levels], over the image if nothing touches."""
+        where = self.contact if self.contact.any() else np.ones_like(self.contact)
+        return mae(self.table[where], self.traced[where])
+
+    @property
+    def box_psnr(self) -> float:
+        """PSNR in the box [dB]."""
+        return psnr(rmse(self.table[self.box], self.traced[self.box]))
+
+    @property
+    def frame_psnr(self) -> float:
+        """PSNR over the image [dB]."""
+        return psnr(rmse(self.table, self.traced))
+
+
+def contact_box(contact: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of the contact's bounding box with ``BOX_MARGIN`` on each side, within the image; all of it without contact."""
+    height, width = contact.shape
+    if not contact.any():
+        return slice(0, height), slice(0, width)
+    margin = round(BOX_MARGIN * width)
+    rows, columns = (np.flatnonzero(contact.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+
+
+def table_errors(
+    sensor: SensorSpec,
+    surfaces: Mapping[str, GelSurface],
+    table: PolyTable,
+    *,
+    device: str = "auto",
+    resolution: tuple[int, int] | None = None,
+    seed: int = 0,
+) -> dict[str, dict[str, SceneError]]:
+    """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against ``fast`` by scene.
+
+    ``surfaces`` (B = 1 each) share one grid; ``resolution`` (width, height) [px], None is the sensor's own.
+    """
+    from raytac.optics.raytrace import RayTracer
+    from raytac.optics.taxim import TaximMode
+
+    tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb", "depth"), device=device, seed=seed)
+    traced = {name: tracer.render(surface) for name, surface in surfaces.items()}
+    errors: dict[str, dict[str, SceneError]] = {}
+    for family, shadow in (("taxim", False), ("taxim_shadow", True)):
+        if shadow and table.shadow is None:
+            continue
+        mode = TaximMode(sensor, calibration=table, shadow=shadow, resolution=resolution, device=device)
+        errors[family] = {}
+        for name, surface in surfaces.items():
+            image, truth = mode.render(surface), traced[name]
+            assert image.rgb is not None and truth.rgb is not None and truth.contact is not None
+            uncovered = float("nan") if image.uncovered is None else float(image.uncovered[0])
+            errors[family][name] = SceneError(truth.rgb[0], image.rgb[0], truth.contact[0], uncovered)
+    return errors
