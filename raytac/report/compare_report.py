@@ -107,9 +107,11 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
             {
                 "scene": scene,
                 "resolution": size.replace("x", " × "),
-                "rows": [row.figures for row in select(rows, scene=scene, resolution=size)],
+                "rows": [row.figures for row in chosen],
+                "notes": [(row.figures["label"], row.figures["note"]) for row in chosen if row.figures["note"]],
             }
             for scene, size in comparison.references
+            for chosen in [select(rows, scene=scene, resolution=size)]
         ],
         regions=REGIONS,
         terms=_terms(comparison),
