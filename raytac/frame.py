@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from raytac.gel.surface import GelSurface
+from raytac.gel.surface import GelSurface, summary
 
 __all__ = ["OUTPUTS", "TactileFrame"]
 
@@ -14,7 +14,7 @@ OUTPUTS = ("rgb", "layers", "normals", "depth", "height")
 """Names that ``TactileSensor(outputs=…)`` and ``raytac press --outputs`` accept."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TactileFrame:
     """Images of B sensors at one instant; an output that was not asked for is None.
 
@@ -38,7 +38,12 @@ class TactileFrame:
     """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
     force: np.ndarray | None = None
     """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
+    force_law_area: np.ndarray | None = None
+    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. None as for ``force``."""
     failed: np.ndarray | None = None
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
     """Wall time of ``physics``, ``surface`` and ``optics`` for the whole batch [ms]."""
+
+    def __repr__(self) -> str:
+        return summary(self)

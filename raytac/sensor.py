@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,8 @@ OPTICS = ("raytrace",)
 """Names that ``optics=`` accepts."""
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
+SHAPE_TOLERANCE = 0.02
+"""How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
 COARSEST_PITCH = 0.1e-3
 """Spacing of the pad's grid where the image does not ask for a finer one [m]."""
 
@@ -79,7 +82,8 @@ class TactileSensor:
             optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
                 outputs and device).
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
-            resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own.
+            resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own. The field of view stays
+                the sensor's: another shape squeezes it, with a warning.
             integrator: one of ``INTEGRATORS``.
             spp: ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
@@ -114,6 +118,7 @@ class TactileSensor:
         self.physics, self.integrator, self.spp = physics, integrator, spp
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
         self.resolution = size if size is not None else self.spec.camera.resolution
+        _warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
         self._pitch = self._pixel_pitch() if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
@@ -205,15 +210,15 @@ class TactileSensor:
         """
         start = time.perf_counter()
         if isinstance(state, GelSurface):
-            surface, force, failed = state, None, None
+            surface, force, area, failed = state, None, None, None
         else:
-            surface, failed = self._surface(state), state.failed
+            surface, area, failed = self._surface(state), state.force_law_area, state.failed
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         height = surface.height if "height" in self.outputs else None
         if not self._optical_outputs:
-            return TactileFrame(surface=surface, height=height, force=force, failed=failed, time_ms=time_ms)
+            return TactileFrame(surface, height=height, force=force, force_law_area=area, failed=failed, time_ms=time_ms)
         images = self.optical_mode.render(surface)
         time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(
@@ -226,6 +231,7 @@ class TactileSensor:
             height=height,
             contact=images.contact,
             force=force,
+            force_law_area=area,
             failed=failed,
             time_ms=time_ms,
         )
@@ -294,6 +300,19 @@ def _checked_resolution(resolution: object) -> tuple[int, int] | None:
         if side > LARGEST_SIDE:
             raise InputError("resolution", value=side, rule=f"must be at most {LARGEST_SIDE} pixels a side")
     return int(resolution[0]), int(resolution[1])
+
+
+def _warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) -> None:
+    """The field of view is the sensor's, so an image of another shape has pixels that are not as wide as high on the gel."""
+    stretch = (resolution[0] / native[0]) / (resolution[1] / native[1])
+    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        (width, height), (w, h) = resolution, native
+        warnings.warn(
+            f"resolution {width}x{height} squeezes the sensor's view of {w}x{h}: against the sensor's pixels these are "
+            f"{max(stretch, 1 / stretch):.3g} times as {'high as wide' if stretch > 1 else 'wide as high'}; "
+            f"{width}x{max(round(width * h / w), 1)} keeps their shape",
+            stacklevel=3,
+        )
 
 
 def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -56,6 +57,50 @@ def test_a_sensor_or_scene_of_another_type_is_named(sensor_spec: SensorSpec) -> 
 def test_one_output_and_resolution_as_text(sensor_spec: SensorSpec) -> None:
     sensor = TactileSensor(sensor_spec, outputs="depth", resolution="32x24")
     assert sensor.outputs == ("depth",) and sensor.resolution == (32, 24)
+
+
+@pytest.mark.parametrize("resolution", ["320x240", "640x480", "100x75", "86x64", "81x61"])
+def test_the_sensors_shape_up_to_rounding_is_no_squeeze(resolution: str, sensor_spec: SensorSpec) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        TactileSensor(sensor_spec, resolution=resolution)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "message"),
+    [
+        ("640x240", r"640x240 squeezes the sensor's view of 320x240: .*2 times as high as wide; 640x480 keeps"),
+        ("240x240", r"1\.33 times as wide as high; 240x180 keeps"),
+    ],
+)
+def test_another_shape_is_told(resolution: str, message: str, sensor_spec: SensorSpec) -> None:
+    with pytest.warns(UserWarning, match=message):
+        TactileSensor(sensor_spec, resolution=resolution)
+
+
+def test_a_frame_prints_on_one_line(sensor_spec: SensorSpec) -> None:
+    sensor = TactileSensor(sensor_spec, optics=Shader(sensor_spec), outputs=OUTPUTS, pitch=0.2e-3)
+    text = repr(sensor.press("sphere"))
+    assert text.startswith(
+        "TactileFrame(surface=GelSurface(grid=PadGrid(x=float64 (127,), y=float64 (105,), rest=float64 (105, 127))"
+    )
+    assert "rgb=uint8 (1, 48, 64, 3)" in text and "layers={red: float32 (1, 48, 64, 3), green: " in text
+    assert "force=float64 (1, 3)" in text and "time_ms={physics: " in text and "array(" not in text
+    assert "\n" not in text and len(text) < 1500
+    bare = repr(TactileSensor(sensor_spec, outputs="height", pitch=0.5e-3).rest())
+    assert "rgb" not in bare and "force" not in bare and "height=float32 (1, " in bare
+
+
+def test_the_area_of_the_force_law_is_told_beside_that_of_the_surface(sensor_spec: SensorSpec) -> None:
+    """A ball on a flat pad: π R δ in the law (Hertz), and less in the surface, whose Gaussians hold the gel off the ball."""
+    sensor = TactileSensor(sensor_spec, outputs="height", num_envs=2)
+    frame = sensor.press("sphere", depths=np.array([0.3e-3, 0.5e-3]))
+    assert frame.force_law_area is not None
+    np.testing.assert_allclose(frame.force_law_area, np.pi * 3.155e-3 * np.array([0.3e-3, 0.5e-3]), rtol=0.05)
+    pitch = sensor.grid.pitch
+    area = frame.surface.contact.sum(axis=(1, 2)) * pitch[0] * pitch[1]
+    assert (area > 0).all() and not np.allclose(area, frame.force_law_area, rtol=0.05)
+    assert sensor.rest().force_law_area is None
 
 
 def test_a_state_of_another_scene_is_refused(sensor_spec: SensorSpec) -> None:

@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-__all__ = ["GelSurface", "PadGrid"]
+__all__ = ["GelSurface", "PadGrid", "summary"]
 
 
-@dataclass(frozen=True)
+def summary(record: Any) -> str:
+    """A dataclass on one line: arrays by type and shape instead of their values, and without the fields that are None or empty."""
+    shown = []
+    for name, value in ((f.name, getattr(record, f.name)) for f in fields(record)):
+        if isinstance(value, dict):
+            value = {key: _brief(v) for key, v in value.items()}
+            text = "{" + ", ".join(f"{key}: {v}" for key, v in value.items()) + "}" if value else ""
+        else:
+            text = "" if value is None else _brief(value)
+        shown += [f"{name}={text}"] if text else []
+    return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    return f"{value:.3g}" if isinstance(value, float) else repr(value)
+
+
+@dataclass(frozen=True, repr=False)
 class PadGrid:
     """Nodes of a regular grid over the whole pad, pad frame.
 
@@ -21,6 +41,9 @@ class PadGrid:
     y: np.ndarray
     rest: np.ndarray
 
+    def __repr__(self) -> str:
+        return summary(self)
+
     @property
     def pitch(self) -> tuple[float, float]:
         """Node spacing along x and y [m]."""
@@ -31,7 +54,7 @@ class PadGrid:
         return self.rest.shape  # type: ignore[return-value]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GelSurface:
     """Coat surface of B pads on one grid.
 
@@ -46,6 +69,9 @@ class GelSurface:
     contact: np.ndarray
     contact_centre: np.ndarray
     pad_from_object: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return summary(self)
 
     @property
     def batch(self) -> int:

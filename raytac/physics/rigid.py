@@ -34,7 +34,8 @@ class ContactState:
     pad_from_object, shape (B, 4, 4): pose of the object. world_from_pad, shape (B, 4, 4): pose of the case; the identity unless the
     scene moves it (world and pad frame are one at first touch). depth [m], (B,): travel below first touch at zero shear and twist;
     negative when lifted. normal_force [N], (B,): towards −z, >= 0. shear_force [N], (B, 2): along x and y. twist_torque [N m],
-    (B,): about +z. failed, (B,) bool: the state of this environment is not finite or did not settle (its pose is then NaN).
+    (B,): about +z. force_law_area [m²], (B,): area of contact by the load law, which the forces follow. failed, (B,) bool: the
+    state of this environment is not finite or did not settle (its pose is then NaN).
     """
 
     stage: int
@@ -49,6 +50,7 @@ class ContactState:
     normal_force: np.ndarray
     shear_force: np.ndarray
     twist_torque: np.ndarray
+    force_law_area: np.ndarray
     failed: np.ndarray
     scene: PressScene | None = None
     """Scene that the object belongs to; None if it is not known."""
@@ -306,7 +308,8 @@ class RigidPad:
     def _state(self, stage: int, kind: str, fraction: float, environments: list[_Environment]) -> ContactState:
         batch = self.num_envs
         pose, case = np.tile(np.eye(4), (2, batch, 1, 1))
-        depth, force, shear, torque = np.zeros(batch), np.zeros(batch), np.zeros((batch, 2)), np.zeros(batch)
+        depth, force, torque, area = np.zeros((4, batch))
+        shear = np.zeros((batch, 2))
         failed = np.zeros(batch, bool)
         turn = np.eye(4)
         turn[:3, :3] = self._rotation
@@ -316,12 +319,13 @@ class RigidPad:
             if e.stuck_shear is not None and e.shear is not None:
                 _, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
                 shear[b] = law.shear_stiffness(e.rig.depth) * (e.shear - e.stuck_shear)
+                area[b] = np.pi * law.contact_radius(e.rig.depth) ** 2
                 torque[b] = law.twist_stiffness(e.rig.depth) * (e.twist - e.stuck_twist)
             if e.failed:
                 failed[b] = True
-                for array in (pose, case, depth, force, shear, torque):
+                for array in (pose, case, depth, force, shear, torque, area):
                     array[b] = np.nan
-        return ContactState(stage, kind, fraction, pose, case, depth, force, shear, torque, failed, self.scene)
+        return ContactState(stage, kind, fraction, pose, case, depth, force, shear, torque, area, failed, self.scene)
 
 
 def _per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

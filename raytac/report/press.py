@@ -114,13 +114,18 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         "machine.cpus": os.cpu_count() or 1,
         **{f"image.{key}": value for key, value in sensor.sampling.items()},
         "contact.max_indentation_mm": 1e3 * float(surface.indentation[0].max()),
-        "contact.area_mm2": 1e6 * dx * dy * int(surface.contact[0].sum()),
+        "contact.surface_area_mm2": 1e6 * dx * dy * int(surface.contact[0].sum()),
     }
     size = _image_size(frame)
     if size is not None:
         metrics["image.width_px"], metrics["image.height_px"] = size
+        camera = sensor.spec.camera
+        for axis, pitch, native, pixels in zip("xy", camera.pixel_pitch, camera.resolution, size, strict=True):
+            metrics[f"image.pixel_{axis}_mm"] = 1e3 * pitch * native / pixels
     if np.isfinite(surface.contact_centre[0]).all():
         metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"] = (1e3 * float(v) for v in surface.contact_centre[0])
+    if frame.force_law_area is not None:
+        metrics["contact.force_law_area_mm2"] = 1e6 * float(frame.force_law_area[0])
     if frame.force is not None:
         for axis, value in zip("xyz", frame.force[0], strict=True):
             metrics[f"contact.force_{axis}_n"] = float(value)

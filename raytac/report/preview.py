@@ -235,11 +235,12 @@ def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
     axes.plot(x, rest, color=_REST, linewidth=0.7, linestyle=(0, (4, 2)))
     axes.plot(x, surface, color=_REST, linewidth=1.0)
     left, right = data.extent_mm[:2]
-    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="z [mm]")
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]")
     axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
     stretch = abs((data.extent_mm[2] - data.extent_mm[3]) / (high - low))
     y_mm = round(y_mm, 1) + 0.0  # no "−0.0"
-    axes.set_title(f"section y = {y_mm:.1f} mm (z × {stretch:.1f})".replace("-", "−"), loc="left")
+    axes.set_title(f"section y = {y_mm:.1f} mm".replace("-", "−"), loc="left")
+    axes.set_ylabel(f"z [mm], stretched {stretch:.1f} ×")
     handles = [
         Patch(facecolor=_GEL, edgecolor=_REST, linewidth=0.6, label="gel"),
         Patch(facecolor=_OBJECT, label="object"),

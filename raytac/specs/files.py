@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +28,7 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
 
     A bare word (``coin``) is a shipped file. Anything with a folder or the suffix ``.toml`` is a path: relative to ``base``, or,
     with no ``base``, to the working directory first and then to the folder that holds the shipped ``scenes/`` and ``lights/``, so
-    that ``scenes/press/coin.toml`` means the same inside and outside a checkout.
+    that ``scenes/press/coin.toml`` means the same inside and outside a checkout; a warning says when the shipped file was taken.
 
     Raises:
         SpecError: no such name (the message lists those there are), or no such file.
@@ -45,8 +46,13 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
     candidates = [base / path] if base is not None else [Path.cwd() / path, asset_root(_FOLDERS[what][0]).parent / path]
     for candidate in candidates:
         if is_file(candidate):
+            if candidate is not candidates[0]:
+                warnings.warn(
+                    f"{text} is not in {Path.cwd()}: taking the {what} that comes with raytac, {candidate}", stacklevel=3
+                )
             return candidate.resolve()
-    raise SpecError("the file does not exist", file=candidates[0], key=what, value=text)
+    shipped = ", and none of this path comes with raytac" if base is None and not path.is_absolute() else ""
+    raise SpecError(f"the file does not exist{shipped}", file=candidates[0], key=what, value=text)
 
 
 def is_file(path: Path) -> bool:

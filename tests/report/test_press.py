@@ -56,6 +56,8 @@ def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: Pr
     metrics = read_metrics(tmp_path / "out" / "metrics.json")
     assert metrics["contact.max_indentation_mm"] == pytest.approx(1e3 * float((sensor.grid.rest - height).max()), rel=1e-5)
     assert float(metrics["contact.force_z_n"]) < 0.0
+    assert float(metrics["contact.surface_area_mm2"]) > 0.0 and float(metrics["contact.force_law_area_mm2"]) > 0.0
+    assert metrics["image.pixel_x_mm"] == pytest.approx(0.0634 * 320 / 64) == metrics["image.pixel_y_mm"]
     assert {"time.physics_ms", "time.surface_ms", "time.optics_ms", "wall_s", "device"} <= set(metrics)
 
 

@@ -76,6 +76,14 @@ def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: Sens
     assert "y = 0.0 mm" in title
 
 
+def test_the_axis_of_the_section_says_how_far_it_is_stretched(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    (axes,) = (axes for axes in draw_preview(data, sensor_spec).axes if "section" in axes.get_title(loc="left"))
+    box, (left, right), (low, high) = axes.get_position(), axes.get_xlim(), axes.get_ylim()
+    width, height = axes.figure.get_size_inches()  # type: ignore[union-attr]
+    stretch = (box.height * height / (high - low)) / (box.width * width / (right - left))
+    assert axes.get_ylabel() == f"z [mm], stretched {stretch:.1f} ×"
+
+
 def test_the_key_of_the_normals_lies_beside_the_image(data: PreviewData, sensor_spec: SensorSpec) -> None:
     figure = draw_preview(data, sensor_spec)
     (panel,) = (axes for axes in figure.axes if "normals" in axes.get_title(loc="left"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,22 @@ def test_shipped_scenes_load_and_fit_every_sensor(name: str) -> None:
     else:
         assert scene.trajectory[-1].kind == "release"
         assert scene.peak_stage == len(scene.trajectory) - 2
+
+
+def test_a_shipped_file_taken_for_a_path_that_is_not_here_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.warns(UserWarning, match=r"scenes/press/coin\.toml is not in .*taking the press scene that comes with raytac"):
+        scene = load_press("scenes/press/coin.toml")
+    assert scene == load_press("coin")
+    own = tmp_path / "scenes" / "press" / "coin.toml"
+    own.parent.mkdir(parents=True)
+    shutil.copy(load_press("sphere").source or "", own)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_press("scenes/press/coin.toml").object.kind == "sphere"
+        load_press(own)
+    with pytest.raises(SpecError, match=r"scenes/press/coins\.toml.*does not exist, and none of this path comes with raytac"):
+        load_press("scenes/press/coins.toml")
 
 
 def test_the_scenes_cover_force_shear_and_twist() -> None:
