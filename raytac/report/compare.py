@@ -296,7 +296,7 @@ class _Run:
             "batch_calls": None,
             "batch_note": "",
         }
-        if 4 * self.batch * float(np.median(ms)) > 3e3 * settings.budget_s:
+        if 4 * self.batch * float(np.median(ms)) > 1e3 * settings.budget_s:
             figures["batch_note"] = f"too slow to be timed at batch {self.batch}"
             return figures
         try:

@@ -152,4 +152,4 @@ def _peer(family: str, *, shadow: bool) -> Mode:
         "its own sensor (GelSight with a dome), background and colours: no error against our reference is defined. "
         "Its time includes its own deformation of the gel, which the other modes are given."
     )
-    return Mode(family, build, (), options={"shadow": shadow}, has_reference=False, note=note)
+    return Mode(family, build, ("raytac.report.peer_taxim",), options={"shadow": shadow}, has_reference=False, note=note)

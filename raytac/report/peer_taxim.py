@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import os
 
 import numpy as np
 
@@ -57,6 +58,8 @@ class PeerTaxim:
         """
         if importlib.util.find_spec("taxim") is None:
             raise BackendError("the package taxim is not installed (`pip install taxim[jax-cpu]` adds it as a peer)")
+        # JAX would otherwise take most of the GPU's memory for itself, and this process renders with Dr.Jit too.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         try:
             package = importlib.import_module("taxim")
             self.taxim = package.Taxim(calib_folder=package.CALIB_GELSIGHT, backend="jax", device=device)
