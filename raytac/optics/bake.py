@@ -24,12 +24,12 @@ from raytac.optics.table import PolyTable, TaximConstants, slope_bins
 from raytac.optics.table_cache import cached, keep, table_folder
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Baked", "bake", "bake_table", "baked_table"]
+__all__ = ["Baked", "bake", "bake_table", "baked_table", "calibrate"]
 
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
 
-_PLAIN = TaximConstants(background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+_PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
 """The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
 
 
@@ -41,8 +41,8 @@ class Baked:
     fit: BinFit
     images: int
     """Images that were rendered for it, those of the shadows included."""
-    device: str
-    """``cpu`` or ``cuda``: where they were rendered."""
+    calibration: Calibration
+    """The ray tracer that it was baked from, and its images at rest."""
 
 
 def bake_table(
@@ -111,47 +111,60 @@ def bake(
         InputError: a value out of its choices.
         BackendError: the ray tracer cannot run on ``device``.
     """
+    return calibrate(
+        Calibration(sensor, device=device, resolution=resolution, seed=seed), settings=settings, seed=seed, progress=progress
+    )
+
+
+def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: int = 0, progress: bool = False) -> Baked:
+    """``bake`` with a ray tracer that is set up already."""
     from tqdm import tqdm
 
     settings = BakeSettings() if settings is None else settings
-    with tqdm(total=settings.images + 4 * settings.pins, desc=f"bake {sensor.name}", unit="image", disable=not progress) as bar:
-        lit = Calibration(sensor, device=device, resolution=resolution, seed=seed)
-        sums = BinSums(settings.n_bins, lit.tracer.camera.resolution)
-        for views in lit.views(ball_presses(sensor.gelpad, lit.grid, lit.tracer.camera, settings, seed)):
-            add_samples(sums, views, lit.rest_image)
+    sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
+    images = settings.images + 6 * settings.pins
+    with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=not progress) as bar:
+        sums = BinSums(settings.n_bins, camera.resolution)
+        for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
+            add_samples(sums, views, at.rest_image)
             bar.update(len(views.rgb))
         fit = sums.solve(neighbours=settings.neighbours, ridge=settings.ridge)
         shadow = None
         if settings.pins:
-            constants = TaximConstants()
-            dark = Calibration(sensor, device=device, resolution=resolution, seed=seed, shadows=False)
             _, deepest = settings.depth_range(sensor.gelpad.thickness)
-            shades = ShadowSums(2 * constants.ring_dilations, deepest, lit.tracer.camera.resolution)
-            for on, off in zip(*(each.views(_shadow_presses(sensor, each, settings, seed)) for each in (lit, dark)), strict=True):
-                shades.add(on, off.rgb, lit.rest_image, dark.rest_image)
-                bar.update(2 * len(on.rgb))
+            shades = ShadowSums(2 * _PLAIN.ring_dilations, deepest, camera.resolution)
+            for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
+                shades.add(views, cast, at.rest_image)
+                bar.update(3 * len(views.rgb))
             shadow = shades.table()
-    width, height = lit.tracer.camera.resolution
+    width, height = camera.resolution
     table = PolyTable(
         gradients=fit.gradients,
         covered=fit.covered,
-        background=lit.rest_image.astype(np.float32),
-        pixel_pitch=lit.pitch,
+        background=at.rest_image.astype(np.float32),
+        pixel_pitch=at.pitch,
         shadow=shadow,
         slopes_of="displacement",
-        rest_image=lit.rest_image,
+        rest_image=at.rest_image,
         constants=_PLAIN,
         provenance={
             "source": "baked from the ray tracer",
             "sensor": sensor.name,
-            "mode": lit.tracer.label,
+            "mode": at.tracer.label,
             "settings": repr(settings),
             "seed": str(seed),
             "resolution": f"{width}x{height}",
             "fill": "nearest covered magnitude of the same direction, else the nearest direction",
         },
     )
-    return Baked(table, fit, settings.images + 4 * settings.pins, lit.tracer.device)
+    return Baked(table, fit, images, at)
+
+
+def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
+    """Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little."""
+    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
+    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
+    return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
 
 
 def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray) -> None:
@@ -161,10 +174,3 @@ def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray) -> None:
         at = b, row, column
         i, j = slope_bins(views.slope_x[at].astype(np.float64), views.slope_y[at].astype(np.float64), sums.n_bins)
         sums.add(i, j, column, row, views.rgb[at].astype(np.float32) - rest_image[row, column])
-
-
-def _shadow_presses(sensor: SensorSpec, at: Calibration, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little."""
-    pad, grid, camera = sensor.gelpad, at.grid, at.tracer.camera
-    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
-    return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))

@@ -44,12 +44,11 @@ class ShadowSums:
         self._shaded = np.zeros((3, *self.shape))
         self._levels = np.zeros((3, *self.shape))
 
-    def add(self, lit: Views, unshadowed: np.ndarray, rest: np.ndarray, rest_unshadowed: np.ndarray) -> None:
-        """Presses rendered with cast shadows, and the same without: (B, H, W, 3) uint8, with their images at rest (H, W, 3)."""
-        for b in range(len(lit.rgb)):
-            change = lit.rgb[b].astype(np.float32) - rest
-            cast = change - (unshadowed[b].astype(np.float32) - rest_unshadowed)
-            self._add_one(lit.contact[b], lit.slope_x[b], lit.slope_y[b], lit.moved[b], change, cast)
+    def add(self, views: Views, cast: np.ndarray, rest: np.ndarray) -> None:
+        """Presses, what cast shadows add to them [levels], (B, H, W, 3), and the image at rest, (H, W, 3) uint8."""
+        for b in range(len(views.rgb)):
+            change = views.rgb[b].astype(np.float32) - rest
+            self._add_one(views.contact[b], views.slope_x[b], views.slope_y[b], views.moved[b], change, cast[b])
 
     def _add_one(
         self,

@@ -49,8 +49,12 @@ class Calibration:
         seed: int = 0,
         shadows: bool = True,
     ) -> None:
-        """``shadows``: whether the images have cast shadows. Raises as ``RayTracer``."""
-        self.tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb",), device=device, seed=seed, shadows=shadows)
+        """Raises as ``RayTracer``."""
+        self.sensor = sensor
+        self.tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb",), device=device, seed=seed)
+        # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
+        options = {"resolution": resolution, "outputs": ("rgb",), "device": device, "bounce": False}
+        self._direct = [RayTracer(sensor, shadows=shadows, **options) for shadows in (True, False)]
         camera, native = self.tracer.camera, sensor.camera
         px, py = (p * n / m for p, n, m in zip(native.pixel_pitch, native.resolution, camera.resolution, strict=True))
         self.pitch = (px, py)
@@ -67,12 +71,23 @@ class Calibration:
 
     def views(self, presses: Iterable[GelSurface]) -> Iterator[Views]:
         """Render ``presses`` (one environment each, on ``grid``) in batches and see their slopes as the table mode does."""
+        for surface in self._batches(presses):
+            yield self._view(surface)
+
+    def shadow_views(self, presses: Iterable[GelSurface]) -> Iterator[tuple[Views, np.ndarray]]:
+        """As ``views``, with what cast shadows add to direct light [levels], (B, H, W, 3) int16, negative in a shadow."""
+        for surface in self._batches(presses):
+            with_shadows, without = (tracer.render(surface).rgb for tracer in self._direct)
+            assert with_shadows is not None and without is not None
+            yield self._view(surface), with_shadows.astype(np.int16) - without
+
+    def _batches(self, presses: Iterable[GelSurface]) -> Iterator[GelSurface]:
         presses = iter(presses)
         while some := list(islice(presses, _BATCH[self.tracer.device])):
             height, contact, centre = (
                 np.concatenate([getattr(s, a) for s in some]) for a in ("height", "contact", "contact_centre")
             )
-            yield self._view(GelSurface(self.grid, height, contact, centre))
+            yield GelSurface(self.grid, height, contact, centre)
 
     def _view(self, surface: GelSurface) -> Views:
         tracer, mi = self.tracer, self.tracer.mi

@@ -110,12 +110,12 @@ class ShadowCaster:
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
         # Only a few pixels cast: bring them together, so that no lane idles.
-        caster = dr.compress(casts)
+        caster = dr.compress(casts | (i == 0))  # never none, which no kernel may have; pixel 0 goes no way unless it casts
         a, d, x0, y0, first_of = (dr.gather(type(v), v, caster) for v in (a, d, mi.Int32(column), mi.Int32(row), first))
         origin = dr.gather(mi.Float, of, caster)
         moved = dr.gather(mi.Float, seen.moved, caster)
         entry = a * n_depth + d
-        end = dr.gather(mi.UInt32, arrays.ends, entry)
+        end = dr.gather(mi.UInt32, arrays.ends, entry, dr.gather(mi.Bool, casts, caster))
         places = dr.width(arrays.ways) // (4 * n_dir)
         # Integers, since not every device has an atomic minimum of floats.
         least = dr.full(mi.Int32, int(ordered(np.array([_NOTHING]))[0]), 3 * dr.width(i))

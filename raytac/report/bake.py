@@ -55,11 +55,15 @@ def run_bake(
         began = time.perf_counter()
         baked = bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=True)
         bake_s = time.perf_counter() - began
-        errors = table_errors(sensor, surfaces, baked.table, device=device, resolution=resolution, seed=seed)
+        errors = table_errors(sensor, surfaces, baked.table, baked.calibration.tracer)
         save_calibration(baked.table, folder)
         write_coverage(folder / "coverage.png", baked.fit, sensor.name)
         write_table_sheet(folder / "sheet.png", errors)
-        metrics = bake_metrics(baked, errors, bake_s) | {"device": baked.device, "seed": seed, "sensor": sensor.name}
+        metrics = bake_metrics(baked, errors, bake_s) | {
+            "device": baked.calibration.tracer.device,
+            "seed": seed,
+            "sensor": sensor.name,
+        }
         keep(baked.table, table_folder(sensor, settings, seed, size))
         write_metrics(folder / "metrics.json", metrics | versions() | machine() | {"wall_s": time.perf_counter() - start})
         names = sorted(path.name for path in folder.iterdir())

@@ -83,7 +83,7 @@ def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> N
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    names = {"taxim": "table", "taxim_shadow": "table with shadows"}
+    names = {"taxim": "table", "taxim_shadow": "with shadows"}
     scenes = list(errors["taxim"])
     columns = 1 + 2 * len(errors)
     first = errors["taxim"][scenes[0]].traced
@@ -103,11 +103,11 @@ def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> N
                 error = by_scene[scene]
                 off = (error.table.astype(float) - error.traced).mean(axis=-1)
                 shown = axes.imshow(off, cmap="RdBu_r", vmin=-ERROR_RANGE, vmax=ERROR_RANGE, interpolation="nearest")
-                axes.set_title(f"{names[family]} − ray tracer")
+                axes.set_title(f"error, {names[family]}")
             for axes in grid[row]:
                 axes.set_xticks(())
                 axes.set_yticks(())
         assert shown is not None
-        figure.colorbar(shown, ax=grid[:, -1], shrink=0.8, pad=0.02, label="error [levels]")
+        figure.colorbar(shown, ax=grid, shrink=0.8, pad=0.01, aspect=40, label="table − ray tracer [levels]")
         figure.savefig(path, dpi=200)
         plt.close(figure)

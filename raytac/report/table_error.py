@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from raytac.report.image_error import mae, psnr, rmse
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
+    from raytac.optics.raytrace import RayTracer
     from raytac.optics.table import PolyTable
 
 __all__ = ["BOX_MARGIN", "SceneError", "contact_box", "table_errors"]
@@ -73,29 +74,27 @@ def table_errors(
     sensor: SensorSpec,
     surfaces: Mapping[str, GelSurface],
     table: PolyTable,
-    *,
-    device: str = "auto",
-    resolution: tuple[int, int] | None = None,
-    seed: int = 0,
+    tracer: RayTracer,
 ) -> dict[str, dict[str, SceneError]]:
-    """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against ``fast`` by scene.
+    """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against the images of ``tracer`` by scene.
 
-    ``surfaces`` (B = 1 each) share one grid; ``resolution`` (width, height) [px], None is the sensor's own.
+    ``surfaces`` (B = 1 each) share one grid, that of the first image of ``tracer`` if it has rendered already.
     """
     from raytac.optics.raytrace import RayTracer
     from raytac.optics.taxim import TaximMode
 
-    tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb", "depth"), device=device, seed=seed)
-    traced = {name: tracer.render(surface) for name, surface in surfaces.items()}
+    setting: dict[str, Any] = {"resolution": tracer.camera.resolution, "device": tracer.device}
+    seen = RayTracer(sensor, outputs=("depth",), **setting)
+    traced = {name: (tracer.render(surface).rgb, seen.render(surface).contact) for name, surface in surfaces.items()}
     errors: dict[str, dict[str, SceneError]] = {}
     for family, shadow in (("taxim", False), ("taxim_shadow", True)):
         if shadow and table.shadow is None:
             continue
-        mode = TaximMode(sensor, calibration=table, shadow=shadow, resolution=resolution, device=device)
+        mode = TaximMode(sensor, calibration=table, shadow=shadow, **setting)
         errors[family] = {}
         for name, surface in surfaces.items():
-            image, truth = mode.render(surface), traced[name]
-            assert image.rgb is not None and truth.rgb is not None and truth.contact is not None
+            image, (truth, contact) = mode.render(surface), traced[name]
+            assert image.rgb is not None and truth is not None and contact is not None
             uncovered = float("nan") if image.uncovered is None else float(image.uncovered[0])
-            errors[family][name] = SceneError(truth.rgb[0], image.rgb[0], truth.contact[0], uncovered)
+            errors[family][name] = SceneError(truth[0], image.rgb[0], contact[0], uncovered)
     return errors
