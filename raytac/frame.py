@@ -36,6 +36,9 @@ class TactileFrame:
     """Surface height on the pad grid [m], shape (B, Ny, Nx), float32."""
     contact: np.ndarray | None = None
     """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
+    uncovered: np.ndarray | None = None
+    """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact; None
+    for other modes, and where the table does not tell its coverage."""
     force: np.ndarray | None = None
     """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
     force_law_area: np.ndarray | None = None

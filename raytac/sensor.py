@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
     from raytac.physics.rigid import ContactState, RigidPad
 
-__all__ = ["INTEGRATORS", "OPTICS", "PHYSICS", "TactileSensor"]
+__all__ = ["INTEGRATORS", "OPTICS", "PHYSICS", "TactileSensor", "sensor_outputs"]
 
 PHYSICS = ("rigid",)
 """Names that ``physics=`` accepts."""
-OPTICS = ("raytrace",)
+OPTICS = ("raytrace", "taxim", "phong")
 """Names that ``optics=`` accepts."""
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
@@ -84,13 +84,13 @@ class TactileSensor:
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
             resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own. The field of view stays
                 the sensor's: another shape squeezes it, with a warning.
-            integrator: one of ``INTEGRATORS``.
-            spp: ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
+            integrator: of the ray tracer, one of ``INTEGRATORS``.
+            spp: of the ray tracer; ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
-            optics_options: further keyword arguments of the optical mode.
+            optics_options: further keyword arguments of the optical mode, such as ``calibration`` and ``shadow`` of ``taxim``.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -101,12 +101,19 @@ class TactileSensor:
         if isinstance(optics, str):
             _check_name("optics", optics, OPTICS)
         _check_name("integrator", integrator, INTEGRATORS)
+        if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
+            raise InputError(
+                "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
+            )
         resolve_device(device)
         if not isinstance(outputs, (str, Sequence)):
             raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
         outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in outputs:
             _check_name("outputs", name, OUTPUTS)
+            if isinstance(optics, str) and name not in sensor_outputs(optics):
+                rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
+                raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
         _check_whole("num_envs", num_envs)
         _check_whole("spp", 1 if spp is None else spp)
         size = _checked_resolution(resolution)
@@ -124,7 +131,10 @@ class TactileSensor:
         self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._optics_options = dict(optics_options or {})
         self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
-        self._optics_name = f"{optics}-{integrator}" if isinstance(optics, str) else optics.label
+        self._optics = optics if isinstance(optics, str) else ""
+        self._optics_name = (
+            optics.label if not isinstance(optics, str) else "raytrace-" + integrator if optics == "raytrace" else optics
+        )
         self._pad: RigidPad | None = None
 
     def _pixel_pitch(self) -> float:
@@ -230,6 +240,7 @@ class TactileSensor:
             depth=images.depth,
             height=height,
             contact=images.contact,
+            uncovered=images.uncovered,
             force=force,
             force_law_area=area,
             failed=failed,
@@ -267,19 +278,28 @@ class TactileSensor:
         """
         mode = self._mode
         if mode is None:
-            from raytac.optics.raytrace import RayTracer
-
-            mode = self._mode = RayTracer(
-                self.spec,
-                integrator=self.integrator,
-                resolution=self.resolution,
-                spp=self.spp,
-                outputs=self._optical_outputs,
-                device=self.device,
-                seed=self.seed,
-                **self._optics_options,
-            )
+            mode = self._mode = self._build_mode()
         return mode
+
+    def _build_mode(self) -> OpticalMode:
+        common = {"resolution": self.resolution, "outputs": self._optical_outputs, "device": self.device}
+        if self._optics == "taxim":
+            from raytac.optics.taxim import TaximMode
+
+            return TaximMode(self.spec, **common, **self._optics_options)
+        if self._optics == "phong":
+            from raytac.optics.phong import PhongMode
+
+            return PhongMode(self.spec, **common, **self._optics_options)
+        from raytac.optics.raytrace import RayTracer
+
+        sampling = {"integrator": self.integrator, "spp": self.spp, "seed": self.seed}
+        return RayTracer(self.spec, **common, **sampling, **self._optics_options)
+
+
+def sensor_outputs(optics: str) -> tuple[str, ...]:
+    """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
+    return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
 
 
 def _press_scene(scene: object) -> PressScene:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import CommonOptions, parse_outputs, parse_resolution
 from raytac.report.press import run_press
-from raytac.sensor import INTEGRATORS, TactileSensor
+from raytac.sensor import INTEGRATORS, OPTICS, TactileSensor, sensor_outputs
 from raytac.specs import load_press
 
 __all__ = ["PressArgs"]
@@ -32,22 +33,29 @@ class PressArgs(CommonOptions):
     """Name of a shipped sensor, or path of a sensor file."""
     physics: str = "rigid"
     """How the gel deforms: rigid."""
-    optics: str = "raytrace"
-    """How images are made: raytrace."""
+    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
+    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given) or phong."""
+    calibration: Path | None = None
+    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
+    shadow: bool | None = None
+    """taxim: cast shadows; where the table has them if not given."""
     integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
     """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
     spp: int | None = None
     """fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
-    outputs: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = ",".join(OUTPUTS)
-    """What to compute: one or several of rgb, layers, normals, depth and height, joined by commas."""
+    outputs: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = None
+    """What to compute: one or several of rgb, layers (raytrace only), normals, depth and height, joined by commas; all if not given."""
 
     def run(self) -> int:
         start = time.perf_counter()
-        outputs = parse_outputs(self.outputs, OUTPUTS)
+        if self.optics not in OPTICS:
+            raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
+        every = sensor_outputs(self.optics)
+        outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
-        computed = (*outputs, "layers") if "rgb" in outputs else outputs
+        computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         sensor = TactileSensor(
             self.sensor,
             physics=self.physics,
@@ -58,10 +66,17 @@ class PressArgs(CommonOptions):
             spp=self.spp,
             device=self.device,
             seed=self.seed,
-            optics_options={"progress": self.integrator != "fast"},
+            optics_options=self._optics_options(),
         )
         scene = load_press(self.scene)
         out = self.out if self.out is not None else Path("runs") / "press" / scene.name
         for path in run_press(sensor, scene, out, outputs=outputs, start=start):
             print(path)
         return 0
+
+    def _optics_options(self) -> dict[str, Any]:
+        table = {name: value for name, value in (("calibration", self.calibration), ("shadow", self.shadow)) if value is not None}
+        if table and self.optics != "taxim":
+            rule = f"is a setting of optics='taxim', not of {self.optics!r}"
+            raise InputError(next(iter(table)), value=next(iter(table.values())), rule=rule)
+        return {"progress": self.integrator != "fast"} if self.optics == "raytrace" else table

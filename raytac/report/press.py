@@ -133,6 +133,8 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         change = np.abs(frame.rgb[0].astype(float) - rest.rgb[0])
         metrics["image.change_from_rest_mean_u8"] = float(change.mean())
         metrics["image.change_from_rest_max_u8"] = float(change.max())
+    if frame.uncovered is not None and np.isfinite(frame.uncovered[0]):
+        metrics["taxim.uncovered_share"] = float(frame.uncovered[0])
     metrics |= {f"time.{name}_ms": value for name, value in frame.time_ms.items()}
     return metrics | versions()
 
