@@ -1,0 +1,194 @@
+"""How fast are the table modes, and how far is the baked table from the ray tracer? Error beside time, in one run.
+
+Every frame has a new surface, and everything from the height field to the 8-bit image counts:
+
+    python experiments/bench_taxim.py --out runs/bench_taxim                       # CPU
+    python experiments/bench_taxim.py --out runs/bench_taxim_cuda --device cuda
+
+docs/taxim-table.md explains the figures. The table is baked first, unless the cache has it. The package taxim joins as a peer if it is
+installed (``pip install taxim[jax-cpu]``); it is timed with its own sensor, and its time includes its own deformation of the gel.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from raytac.device import resolve_device
+from raytac.errors import BackendError, RaytacError
+from raytac.gel.surface import GelSurface
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.options import CommonOptions, parse_names
+from raytac.report.machine import machine
+from raytac.report.surfaces import press_peaks
+from raytac.report.table_error import table_errors
+from raytac.report.timing import moving, timed, timed_within
+from raytac.specs.sensor import SensorSpec
+
+SCENES = "sphere,coin,cone,cylinder,edge,mesh,pins,torus,none"
+SIZES = {"320x240": (320, 240), "640x480": (640, 480)}
+BATCHES = {"cpu": (1, 8), "cuda": (1, 64)}
+PEER_BUDGET_S = 30.0
+"""Longest time for one timing of the peer [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Measure time of the table and of Phong's model, and the error of the baked table."""
+
+    scenes: str = SCENES
+    """Shipped press scenes or scene files, joined by commas, for the errors; the first three are timed."""
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+    frames: int = 60
+    """Timed frames a figure (at least 40 for a median to quote)."""
+    quick: bool = False
+    """One small size, few presses and frames: shows that all runs; its figures mean nothing."""
+
+
+def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
+    """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
+    from raytac.optics.phong import PhongMode
+    from raytac.optics.taxim import TaximMode
+
+    if family == "phong":
+        return PhongMode(spec, resolution=size, device=device)
+    return TaximMode(spec, calibration=table, shadow=family == "taxim_shadow", resolution=size, device=device)
+
+
+def speed(
+    spec: SensorSpec, surfaces: Sequence[GelSurface], name: str, size: tuple[int, int], device: str, table: Any, args: Args
+) -> dict[str, Metric]:
+    """Frames a second and milliseconds a frame of each mode, NumPy to NumPy and on the device, by batch."""
+    frames = 5 if args.quick else args.frames
+    metrics: dict[str, Metric] = {}
+    jobs = [
+        (family, batch) for family in ("taxim", "taxim_shadow", "phong") for batch in ((1, 2) if args.quick else BATCHES[device])
+    ]
+    modes: dict[str, Any] = {}
+    for family, batch in tqdm(jobs, desc=f"speed {name}", leave=False, disable=None):
+        mode = modes.setdefault(family, mode_of(spec, family, size, device, table))
+        inputs = moving(surfaces, batch, 6 if batch < 64 else 3)
+        host = timed(mode.render, inputs, frames)
+        resident = timed(device_call(mode), [uploaded(mode, one) for one in inputs], frames)
+        key = f"{family}.{device}.{name}"
+        for part, ms in (("", host), ("device_", resident)):
+            median = float(np.median(ms))
+            metrics[f"{key}.batch{batch}.{part}fps"] = 1e3 * batch / median
+            metrics[f"{key}.batch{batch}.{part}ms_per_frame"] = median / batch
+            metrics[f"{key}.batch{batch}.{part}call_ms_p90"] = float(np.percentile(ms, 90))
+        if batch == 1:
+            metrics |= {f"{key}.fps": 1e3 / float(np.median(host)), f"{key}.ms_per_frame": float(np.median(host))}
+        if batch >= 64:  # what a solver on the same device pays, and what a script with NumPy arrays pays
+            metrics[f"{key}.ms_per_frame"] = float(np.median(resident)) / batch
+            metrics[f"{key}.numpy_ms_per_frame"] = float(np.median(host)) / batch
+    return metrics
+
+
+def uploaded(mode: Any, surface: GelSurface) -> tuple[Any, Any]:
+    """(heights, contact) on the device."""
+    import drjit as dr
+
+    heights = mode.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+    contact = mode.mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+    dr.eval(heights, contact)
+    dr.sync_thread()
+    return heights, contact
+
+
+def device_call(mode: Any) -> Callable[[Any], None]:
+    """From heights on the device to an image on the device."""
+    import drjit as dr
+
+    def call(arrays: tuple[Any, Any]) -> None:
+        dr.eval(mode.render_device(*arrays))
+        dr.sync_thread()
+
+    return call
+
+
+def peer(surfaces: Sequence[GelSurface], name: str, size: tuple[int, int], device: str, args: Args) -> dict[str, Metric]:
+    """Time of the package ``taxim`` on the same contacts; empty, with a word, where it does not run."""
+    from raytac.report.peer_taxim import PeerTaxim
+
+    metrics: dict[str, Metric] = {}
+    for family, shadow in (("peer", False), ("peer_shadow", True)):
+        try:
+            mode = PeerTaxim(size, shadow=shadow, device=device)
+        except BackendError as error:
+            print(f"peer left out: {error}")
+            return {"peer.left_out": str(error)}
+        ms = timed_within(mode.render, moving(surfaces, 1, 6), 3 if args.quick else args.frames, PEER_BUDGET_S)
+        metrics |= {f"{family}.{device}.{name}.ms_per_frame": float(np.median(ms)), f"{family}.label": mode.label}
+    return metrics
+
+
+def error(
+    spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
+) -> dict[str, Metric]:
+    """Contact MAE and PSNR in the box of every scene, against ``fast``."""
+    from raytac.optics.raytrace import RayTracer
+
+    tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
+    metrics: dict[str, Metric] = {}
+    for family, by_scene in table_errors(spec, surfaces, table, tracer).items():
+        for scene, found in by_scene.items():
+            metrics |= {
+                f"{family}.{scene}.psnr_box_db": found.box_psnr,
+                f"{family}.{scene}.contact_mae_levels": found.contact_mae,
+                f"{family}.{scene}.psnr_frame_db": found.frame_psnr,
+            }
+    return metrics
+
+
+def main(args: Args) -> None:
+    from raytac.optics.bake import baked_table
+    from raytac.optics.bake_settings import BakeSettings
+
+    start = time.perf_counter()
+    device = resolve_device(args.device)
+    out = args.out if args.out is not None else Path("runs") / "bench_taxim"
+    scenes = parse_names(args.scenes, "scenes")[: 1 if args.quick else None]
+    sizes = {"80x60": (80, 60)} if args.quick else SIZES
+    first = next(iter(sizes.values()))
+    spec, surfaces = press_peaks(args.sensor, scenes, first, args.seed)
+    metrics: dict[str, Metric] = {"experiment": "bench_taxim", "device": device, "seed": args.seed, **versions(), **machine()}
+    with result_folder(out, ("metrics.json",)) as folder:
+        began = time.perf_counter()
+        settings, baked_at = (BakeSettings.quick(), first) if args.quick else (BakeSettings(), None)
+        table = baked_table(spec, device=device, seed=args.seed, settings=settings, resolution=baked_at)
+        metrics["table_s"] = time.perf_counter() - began
+        metrics |= error(spec, surfaces, table, first, device, args.seed)
+        for name, size in sizes.items():
+            timed_on = scenes[:3]
+            chosen = surfaces if size == first else press_peaks(args.sensor, timed_on, size, args.seed)[1]
+            shown = [chosen[Path(scene).stem] for scene in timed_on]
+            metrics |= speed(spec, shown, name, size, device, table, args)
+        metrics |= peer(shown, name, size, device, args)
+        if f"peer.{device}.{name}.ms_per_frame" in metrics:
+            for family, other in (("taxim", "peer"), ("taxim_shadow", "peer_shadow")):
+                mine = 1e3 / float(metrics[f"{family}.{device}.{name}.fps"])
+                metrics[f"{family}.vs_peer_speedup"] = float(metrics[f"{other}.{device}.{name}.ms_per_frame"]) / mine
+        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
+        write_metrics(folder / "metrics.json", metrics)
+    for key, value in metrics.items():
+        if not key.startswith(("versions.", "machine.")):
+            print(f"{key} = {value:.4g}" if isinstance(value, float) else f"{key} = {value}")
+    print(out / "metrics.json")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except RaytacError as problem:
+        sys.exit(f"error: {problem}")

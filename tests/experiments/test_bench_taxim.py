@@ -1,0 +1,52 @@
+"""The benchmark of the table modes, small, from end to end."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from raytac.errors import InputError, RaytacError
+from raytac.io.metrics import read_metrics
+
+
+@pytest.fixture(scope="module")
+def bench() -> ModuleType:
+    path = Path(__file__).parents[2] / "experiments" / "bench_taxim.py"
+    spec = importlib.util.spec_from_file_location("bench_taxim", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["bench_taxim"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("options", "error"), [({"scenes": " , "}, InputError), ({"scenes": "shpere"}, RaytacError)])
+def test_bad_options_are_refused_before_anything_is_written(
+    bench: ModuleType, tmp_path: Path, options: dict, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        bench.main(bench.Args(out=tmp_path / "out", device="cpu", **options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_quick_run_measures_speed_and_error(
+    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RAYTAC_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        bench, "peer", lambda *_: {"peer.cpu.80x60.ms_per_frame": 50.0, "peer_shadow.cpu.80x60.ms_per_frame": 90.0}
+    )
+    bench.main(bench.Args(out=tmp_path / "out", device="cpu", quick=True))
+    metrics = read_metrics(tmp_path / "out" / "metrics.json")
+    numbers = {key: float(value) for key, value in metrics.items() if not isinstance(value, str)}
+    for family in ("taxim", "taxim_shadow", "phong"):
+        assert numbers[f"{family}.cpu.80x60.fps"] == pytest.approx(1e3 / numbers[f"{family}.cpu.80x60.ms_per_frame"])
+        assert numbers[f"{family}.cpu.80x60.batch2.device_fps"] > 1
+    assert numbers["taxim.vs_peer_speedup"] == pytest.approx(50.0 * numbers["taxim.cpu.80x60.fps"] / 1e3)
+    assert numbers["taxim.sphere.psnr_box_db"] > 28 and numbers["taxim_shadow.sphere.contact_mae_levels"] < 12
+    assert "taxim.sphere.psnr_box_db = " in capsys.readouterr().out
+    assert len(list((tmp_path / "cache" / "tables").iterdir())) == 1
