@@ -94,7 +94,7 @@ class TactileSensor:
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
-            SpecError: the sensor or light file breaks a rule.
+            SpecError: the sensor, light or calibration file breaks a rule.
             BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
         _check_name("physics", physics, PHYSICS)
@@ -130,6 +130,11 @@ class TactileSensor:
         self._pitch = self._pixel_pitch() if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._optics_options = dict(optics_options or {})
+        if optics == "taxim" and isinstance(self._optics_options.get("calibration"), (str, Path)):
+            from raytac.optics.calib_folder import load_calibration
+
+            # A folder that cannot be used is told now, before anything is written.
+            self._optics_options["calibration"] = load_calibration(self._optics_options["calibration"])
         self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
         self._optics = optics if isinstance(optics, str) else ""
         self._optics_name = (
