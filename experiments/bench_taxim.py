@@ -31,7 +31,7 @@ from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.report.machine import machine
 from raytac.report.surfaces import press_peaks
-from raytac.report.table_error import table_errors
+from raytac.report.table_error import error_metrics, table_errors
 from raytac.report.timing import moving, timed, timed_within
 from raytac.specs.sensor import SensorSpec
 
@@ -140,15 +140,7 @@ def error(
     from raytac.optics.raytrace import RayTracer
 
     tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
-    metrics: dict[str, Metric] = {}
-    for family, by_scene in table_errors(spec, surfaces, table, tracer).items():
-        for scene, found in by_scene.items():
-            metrics |= {
-                f"{family}.{scene}.psnr_box_db": found.box_psnr,
-                f"{family}.{scene}.contact_mae_levels": found.contact_mae,
-                f"{family}.{scene}.psnr_frame_db": found.frame_psnr,
-            }
-    return metrics
+    return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 
 def main(args: Args) -> None:

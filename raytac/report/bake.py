@@ -13,7 +13,7 @@ from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.report.machine import machine
 from raytac.report.surfaces import press_peaks
-from raytac.report.table_error import SceneError, table_errors
+from raytac.report.table_error import SceneError, error_metrics, table_errors
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ def run_bake(
             "seed": seed,
             "sensor": sensor.name,
         }
-        keep(baked.table, table_folder(sensor, settings, seed, size))
         write_metrics(folder / "metrics.json", metrics | versions() | machine() | {"wall_s": time.perf_counter() - start})
+        keep(baked.table, table_folder(sensor, settings, seed, size))
         names = sorted(path.name for path in folder.iterdir())
     return [Path(out) / name for name in names]
 
@@ -89,13 +89,4 @@ def bake_metrics(baked: Baked, errors: dict[str, dict[str, SceneError]], bake_s:
     }
     for degree in (0, 1, 2):
         metrics[f"bake.degree{degree}_share"] = float((fit.degree[:-1, :-1] == degree).mean())
-    for family, by_scene in errors.items():
-        for scene, error in by_scene.items():
-            metrics |= {
-                f"{family}.{scene}.psnr_box_db": error.box_psnr,
-                f"{family}.{scene}.contact_mae_levels": error.contact_mae,
-                f"{family}.{scene}.psnr_frame_db": error.frame_psnr,
-            }
-            if np.isfinite(error.uncovered):
-                metrics[f"{family}.{scene}.uncovered_share"] = error.uncovered
-    return metrics
+    return metrics | error_metrics(errors)

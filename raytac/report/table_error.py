@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.io.metrics import Metric
 from raytac.report.image_error import mae, psnr, rmse
 from raytac.specs.sensor import SensorSpec
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from raytac.optics.raytrace import RayTracer
     from raytac.optics.table import PolyTable
 
-__all__ = ["BOX_MARGIN", "SceneError", "contact_box", "table_errors"]
+__all__ = ["BOX_MARGIN", "SceneError", "contact_box", "error_metrics", "table_errors"]
 
 BOX_MARGIN = 15 / 320
 """Margin of the box round the contact as a share of the image's width: 15 px at 320 × 240."""
@@ -98,3 +99,21 @@ def table_errors(
             uncovered = float("nan") if image.uncovered is None else float(image.uncovered[0])
             errors[family][name] = SceneError(truth[0], image.rgb[0], contact[0], uncovered)
     return errors
+
+
+def error_metrics(errors: Mapping[str, Mapping[str, SceneError]]) -> dict[str, Metric]:
+    """Keys ``<family>.<scene>.psnr_box_db``, ``.contact_mae_levels``, ``.psnr_frame_db`` and ``.uncovered_share``.
+
+    A PSNR of equal images, which is infinite, and a share without contact are left out.
+    """
+    metrics: dict[str, Metric] = {}
+    for family, by_scene in errors.items():
+        for scene, error in by_scene.items():
+            figures = {
+                "psnr_box_db": error.box_psnr,
+                "contact_mae_levels": error.contact_mae,
+                "psnr_frame_db": error.frame_psnr,
+                "uncovered_share": error.uncovered,
+            }
+            metrics |= {f"{family}.{scene}.{name}": value for name, value in figures.items() if np.isfinite(value)}
+    return metrics
