@@ -90,6 +90,16 @@ wp.init()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))
 """
 
+_DENOISER = """
+import numpy as np
+from raytac.optics.denoise import make_denoiser
+from raytac.optics.variant import load_mitsuba
+mi, device = load_mitsuba()
+grey = np.full((32, 32, 3), 0.5, np.float32)
+assert abs(make_denoiser(mi, device, (32, 32))(grey) - grey).max() < 0.05, "a grey image does not stay grey"
+print("OptiX" if device == "cuda" else "Open Image Denoise", "kept a grey image grey")
+"""
+
 
 @dataclass(frozen=True)
 class Probe:
@@ -153,6 +163,11 @@ def _no_warp() -> str:
     return "" if importlib.util.find_spec("warp") else "not installed: only the soft pad will need it"
 
 
+def _no_denoiser() -> str:
+    absent = bool(cuda_missing()) and not importlib.util.find_spec("mitsuba_oidn")
+    return "not installed: only denoise=True needs it" if absent else ""
+
+
 def _no_llvm() -> str:
     return "" if llvm_library() else "no libLLVM found"
 
@@ -167,6 +182,11 @@ PROBES = (
         "mitsuba-llvm", _TRACE.format(device="cpu"), False,
         "pip install karellen-llvm-core, or set DRJIT_LIBLLVM_PATH to libLLVM 16 or newer (14 is refused, 15 may abort)",
         _no_llvm,
+    ),
+    Probe(
+        "denoiser", _DENOISER, False,
+        "CPU: pip install raytac[denoise]; CUDA: the driver's nvoptix.bin in /usr/share/nvidia (containers often lack it)",
+        _no_denoiser,
     ),
     Probe("mujoco", _MUJOCO, True, "pip install 'mujoco>=4.0,<5'"),
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),

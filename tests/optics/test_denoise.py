@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from raytac.device import cuda_missing
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics.denoise import make_denoiser
@@ -82,3 +83,9 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
     with pytest.raises(BackendError, match=r"pip install raytac\[denoise\]"):
         RayTracer(like_a_mini(), resolution=RESOLUTION, device="cpu", integrator="reference", denoise=True)
+
+
+@pytest.mark.skipif(not cuda_missing(), reason="OptiX may work here")
+def test_optix_that_does_not_work_is_an_error_and_no_abort() -> None:
+    with pytest.raises(BackendError, match="OptiX's denoiser does not work here: .+nvoptix.bin"):
+        make_denoiser(None, "cuda", (32, 32))
