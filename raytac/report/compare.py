@@ -221,6 +221,8 @@ class _Run:
             row = self.store.read(file, key)
             if row is None:
                 if built is None:
+                    if mode.prepare is not None:
+                        mode.prepare(setting)
                     start = time.perf_counter()
                     built = mode.build(setting)
                     _rgb(built, scene.surface)

@@ -111,11 +111,12 @@ def _panel(axes: Axes, rows: Sequence[Row], column: str) -> None:
         for s in points:
             values = known(select(rows, mode=s.mode), column)
             axes.plot([s.ms, s.ms], [min(values), max(values)], color=colour, linewidth=0.6, alpha=0.5, zorder=2)
-            if s.spp is not None:
-                place = (s.ms, s.errors[column])
-                axes.annotate(
-                    f"{s.spp}", place, xytext=(3.5, 2.5), textcoords="offset points", fontsize=6, color=colour, zorder=4
-                )
+            label = SHORT[s.family] if s.spp is None else f"{s.spp}"
+            place: dict[str, Any] = {"xytext": (3.5, 2.5), "textcoords": "offset points"}
+            # To the left where the right half of the panel would cut it off.
+            if s.spp is None and s.ms > math.sqrt(axes.get_xlim()[0] * axes.get_xlim()[1]):
+                place |= {"xytext": (-3.5, 2.5), "ha": "right"}
+            axes.annotate(label, (s.ms, s.errors[column]), fontsize=6, color=colour, zorder=4, **place)
         x, y = [s.ms for s in points], [s.errors[column] for s in points]
         axes.plot(x, y, color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=4.5, zorder=3)
     noise = [value for value in known(rows, f"noise_{column}") if value > 0]

@@ -30,6 +30,8 @@ FAMILIES = {
     "peer_shadow": "taxim package with shadow",
 }
 """Name in keys and files, and in words, of every kind of mode; a sampled family has one mode for each number of samples a pixel."""
+BAKE_CODE = ("raytac.optics.bake", "raytac.gel.elastic", "raytac.gel.gaussian", "raytac.gel.primitives", "raytac.gel.rasterize")
+"""Modules that shape a baked table."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Mode:
     """Samples a pixel, None for a mode without noise."""
     options: dict[str, Any] = field(default_factory=dict)
     """Settings as they go into the key of a row."""
+    prepare: Callable[[Setting], object] | None = None
+    """Work before the first image whose result stays on disk for later processes, such as baking a table; it is not timed."""
     has_reference: bool = True
     """Whether the image shows our sensor, so that its error against our reference means something."""
     note: str = ""
@@ -99,7 +103,7 @@ def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False
         _peer("peer_shadow", shadow=True),
     ]
     slow = ("taxim", "taxim_shadow", "peer", "peer_shadow") if quick else ()
-    return (*modes, *(replace(mode, build=_too_slow) if mode.family in slow else mode for mode in others))
+    return (*modes, *(replace(mode, build=_too_slow, prepare=None) if mode.family in slow else mode for mode in others))
 
 
 def _too_slow(setting: Setting) -> OpticalMode:
@@ -139,7 +143,16 @@ def _named(family: str, optics: str, options: dict[str, Any]) -> Mode:
         )
         return sensor.optical_mode
 
-    return Mode(family, build, (f"raytac.optics.{optics}", "raytac.optics.bake"), options={"optics": optics, **options})
+    table = optics == "taxim"
+    code = (f"raytac.optics.{optics}", *(BAKE_CODE if table else ()))
+    note = "" if table else "lights and constants as published for another sensor, not fitted to this one"
+    return Mode(family, build, code, options={"optics": optics, **options}, prepare=_bake if table else None, note=note)
+
+
+def _bake(setting: Setting) -> None:
+    from raytac.optics.bake import baked_table
+
+    baked_table(setting.tracers.spec, device=setting.tracers.device)
 
 
 def _peer(family: str, *, shadow: bool) -> Mode:
