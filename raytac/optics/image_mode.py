@@ -21,6 +21,7 @@ from raytac.optics.base import OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatLayout
 from raytac.optics.raytrace import RayTracer
+from raytac.optics.recording import no_collection
 from raytac.optics.refraction import Slab
 from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, safe_heights
 from raytac.optics.variant import load_mitsuba
@@ -264,7 +265,8 @@ class ImageMode(ABC):
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(self._frame)
         touched = contact if self.needs_contact else self.mi.UInt8(0)
-        return self._frozen[key](heights, touched, self._rest, self._inputs)
+        with no_collection():
+            return self._frozen[key](heights, touched, self._rest, self._inputs)
 
     def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any) -> tuple[Any, Any]:
         mi = self.mi

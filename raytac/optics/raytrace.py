@@ -17,6 +17,7 @@ from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.denoise import make_denoiser
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.lamp import Lamp
+from raytac.optics.recording import no_collection
 from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.refraction import Slab
 from raytac.optics.response import Response
@@ -256,7 +257,8 @@ class RayTracer:
         key = function.__name__, dr.width(heights)
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(function)
-        return self._frozen[key](heights, self._inputs)
+        with no_collection():
+            return self._frozen[key](heights, self._inputs)
 
     def _fast_frame(self, heights: Any, inputs: FastInputs) -> tuple[Any, list[Any]]:
         channels = self._linear(heights, inputs)

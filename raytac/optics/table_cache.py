@@ -27,6 +27,7 @@ _NOT_IN_TABLE = (
     "memory",
     "taxim",
     "table_shadow",
+    "recording",
     "table_cache",
     "calib_folder",
     "restricted_pickle",
