@@ -87,5 +87,5 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch: pytest.
 
 @pytest.mark.skipif(not cuda_missing(), reason="OptiX may work here")
 def test_optix_that_does_not_work_is_an_error_and_no_abort() -> None:
-    with pytest.raises(BackendError, match="OptiX's denoiser does not work here: .+nvoptix.bin"):
+    with pytest.raises(BackendError, match=r"OptiX's denoiser does not work here: .+nvoptix\.bin"):
         make_denoiser(None, "cuda", (32, 32))
