@@ -103,9 +103,12 @@ def _blur_matrix(n: int, sigma: float) -> np.ndarray:
     offset = np.arange(-radius, radius + 1)
     weights = np.exp(-0.5 * (offset / sigma) ** 2)
     weights /= weights.sum()
-    place = (np.arange(n)[:, None] + offset) % (2 * n)
+    # The mirrored line repeats after 2n pixels, so a kernel of any width folds into one period.
+    folded = np.zeros(2 * n)
+    np.add.at(folded, offset % (2 * n), weights)
+    place = (np.arange(n)[:, None] + np.arange(2 * n)) % (2 * n)
     matrix = np.zeros((n, n))
-    np.add.at(matrix, (np.arange(n)[:, None], np.where(place >= n, 2 * n - 1 - place, place)), weights[None, :])
+    np.add.at(matrix, (np.arange(n)[:, None], np.where(place >= n, 2 * n - 1 - place, place)), folded[None, :])
     return matrix
 
 

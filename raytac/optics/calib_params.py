@@ -92,8 +92,8 @@ def read_params(path: Path, pixel_pitch: float | None, n_bins: int, shape: tuple
         settings[key] = float(value)
     for key, (name, default) in _RELATIVE.items():
         pair = parts["simulator"].get(key, (default / shape[1], default / shape[0]))
-        if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(v) and 0 < v <= 1 for v in pair):
-            rule = "must be two numbers in (0, 1], shares of the image's width and height"
+        if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(v) and 0 < v <= 10 for v in pair):
+            rule = "must be two numbers in (0, 10], shares of the image's width and height"
             raise CalibrationError(rule, file=path, key=f"simulator.{key}", value=pair)
         settings[name] = float(pair[0] * shape[1])
     for key, value in parts["raytac"].items():

@@ -33,10 +33,10 @@ def mi() -> Any:
 def shade(mi: Any, table: PolyTable, z: np.ndarray, mask: np.ndarray, lift: np.ndarray, *, shadow: bool) -> np.ndarray:
     """The mode's shader on one height image [px], (H, W, 3) R, G, B."""
     h, w = z.shape
-    flat = (mi.Float(np.ascontiguousarray(a, dtype=np.float32).ravel()) for a in (z, lift))
+    heights, moved = (mi.Float(np.ascontiguousarray(a, dtype=np.float32).ravel()) for a in (z, lift))
     contact = mi.UInt8(mask.astype(np.uint8).ravel())
     shader = TableShader(mi, table, (w, h), table.pixel_pitch[0], shadow=shadow)
-    channels, _ = shader.levels(ImageHeights(*flat, contact, 1, (w, h)), shader.inputs)
+    channels, _ = shader.levels(ImageHeights(heights, moved, contact, 1, (w, h)), shader.inputs)
     return np.stack([np.array(c) for c in channels], axis=-1).reshape(h, w, 3)
 
 
@@ -46,7 +46,7 @@ def random_table(rng: np.random.Generator, shape: tuple[int, int], n: int = 40) 
     values = rng.uniform(-60, -10, (3, 63, 9, 20)).astype(np.float32)
     shadow = ShadowTable(np.arange(0, 2 * np.pi, 0.1), values, lengths)
     background = rng.integers(60, 180, (*shape, 3)).astype(np.float32)
-    return PolyTable(gradients, None, background, (1e-3 * PIXMM,) * 2, shadow, slopes_of="height")
+    return PolyTable(gradients, None, background, (1e-3 * PIXMM, 1e-3 * PIXMM), shadow, slopes_of="height")
 
 
 def as_upstream(table: PolyTable) -> upstream.Upstream:
@@ -230,7 +230,7 @@ def test_shadows_fall_away_from_each_light_and_lengthen_with_depth(mi: Any) -> N
         np.zeros((3, 4, 4, 6)),
         None,
         np.full((*shape, 3), 100, np.float32),
-        (1e-3 * PIXMM,) * 2,
+        (1e-3 * PIXMM, 1e-3 * PIXMM),
         ShadowTable(directions, values, lengths, first_depth=0.0, depth_offset=0),
         slopes_of="height",
     )
