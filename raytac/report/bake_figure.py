@@ -95,7 +95,13 @@ def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> N
         for row, scene in enumerate(scenes):
             images = [("ray tracer", errors["taxim"][scene].traced, "")]
             for family, by_scene in errors.items():
-                images.append((names[family], by_scene[scene].table, f"{by_scene[scene].box_psnr:.1f} dB"))
+                images.append(
+                    (
+                        names[family],
+                        by_scene[scene].table,
+                        "equal" if np.isinf(by_scene[scene].box_psnr) else f"{by_scene[scene].box_psnr:.1f} dB",
+                    )
+                )
             for axes, (title, image, note) in zip(grid[row], images, strict=False):
                 axes.imshow(image, interpolation="nearest")
                 axes.set_title(f"{scene}: {title}" if not note else f"{title}, {note}")
