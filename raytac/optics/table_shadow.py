@@ -110,7 +110,7 @@ class ShadowCaster:
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
         # Only a few pixels cast: bring them together, so that no lane idles.
-        caster = dr.compress(casts | (i == 0))  # never none, which no kernel may have; pixel 0 goes no way unless it casts
+        caster: Any = dr.compress(casts | (i == 0))  # never none, which no kernel may have; pixel 0 goes no way unless it casts
         a, d, x0, y0, first_of = (dr.gather(type(v), v, caster) for v in (a, d, mi.Int32(column), mi.Int32(row), first))
         origin = dr.gather(mi.Float, of, caster)
         moved = dr.gather(mi.Float, seen.moved, caster)
