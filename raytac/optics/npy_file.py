@@ -43,7 +43,7 @@ def npz_names(path: Path) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return {name.removesuffix(".npy") for name in archive.namelist()}
-    except (OSError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged archive ends in errors of many types
         raise CalibrationError(f"cannot be read ({error})", file=path) from error
 
 

@@ -2,7 +2,8 @@
 
 A pickle is a program: ``pickle.load`` calls whatever it names. Upstream's shadow tables are pickled object arrays, so they are read by
 an unpickler that knows only what such an array needs, as stand-ins that check every argument; any other name ends the reading before
-anything is called. Arrays are built from the stand-ins afterwards, so that no state from the file reaches NumPy unchecked.
+anything is called. Arrays are built from the stand-ins afterwards, so that no state from the file reaches NumPy unchecked. The program
+itself is looked through before it runs, since a few bytes of it can ask for more memory than there is.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import pickletools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,20 +21,44 @@ __all__ = ["load_restricted"]
 
 _NUMBERS = "biuf"
 """Kinds of NumPy numbers that are admitted."""
+_MOST_ITEMS = 2**22
+"""Items read at most; upstream's tables hold some 50,000. A list may stand in many places of a pickle, and takes its size in each."""
+_LARGEST_INT = 2**64
+_OPCODES = frozenset(
+    """
+    PROTO FRAME STOP MARK POP POP_MARK
+    NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT
+    STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8
+    EMPTY_LIST LIST APPEND APPENDS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3
+    PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD
+""".split()
+)  # noqa: SIM905
+"""Instructions that numbers, lists, tuples and arrays need, in any protocol."""
 
 
 def load_restricted(data: bytes) -> Any:
-    """Object of the pickle ``data``: numbers, text, lists, tuples, and NumPy arrays and scalars of them.
+    """Object of the pickle ``data``: numbers, lists, tuples, and NumPy arrays and scalars of them.
 
     Raises:
-        pickle.UnpicklingError: it names anything else, or is cut short or damaged. Nothing that it names has run.
+        pickle.UnpicklingError: it names or holds anything else, asks for far more memory than its own size, or is cut short or damaged.
+            Nothing that it names has run.
     """
     try:
-        return _plain(_Unpickler(io.BytesIO(data)).load())
+        _check_program(data)
+        return _Plain().of(_Unpickler(io.BytesIO(data)).load())
     except pickle.UnpicklingError:
         raise
     except Exception as error:  # a damaged stream ends in errors of many types
         raise pickle.UnpicklingError(f"the pickle is damaged: {type(error).__name__}: {error}") from error
+
+
+def _check_program(data: bytes) -> None:
+    """Refuse instructions that are not needed, and places in the memo that would make it larger than the pickle."""
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name not in _OPCODES:
+            raise pickle.UnpicklingError(f"it has the instruction {opcode.name}, which numbers, lists and arrays do not need")
+        if opcode.name in ("PUT", "LONG_BINPUT") and not 0 <= int(argument or 0) < len(data):
+            raise pickle.UnpicklingError(f"it notes an object at place {argument}, beyond its own {len(data)} bytes")
 
 
 class _Unpickler(pickle.Unpickler):
@@ -92,29 +118,46 @@ class _Array:
         _, shape, kind, fortran, data = state
         self.kind, self.shape, self.fortran, self.data = _dtype_of(kind), shape, bool(fortran), data
 
-    def array(self) -> np.ndarray:
-        shape = tuple(int(n) for n in self.shape)
-        order = "F" if self.fortran else "C"
-        if self.kind.kind != "O":
-            return np.frombuffer(_bytes(self.data), dtype=self.kind).reshape(shape, order=order)
-        items = self.data
+
+class _Plain:
+    """Replaces stand-ins by their arrays, up to ``_MOST_ITEMS`` items."""
+
+    def __init__(self) -> None:
+        self._left = _MOST_ITEMS
+
+    def of(self, item: Any) -> Any:
+        """``item`` with every stand-in in it replaced."""
+        self._spend(1)
+        if isinstance(item, _Array):
+            return self._array(item)
+        if isinstance(item, (list, tuple)):
+            return type(item)(self.of(one) for one in item)
+        if isinstance(item, int) and not -_LARGEST_INT < item < _LARGEST_INT:
+            raise pickle.UnpicklingError("it holds an integer of more than 64 bits")
+        if isinstance(item, (bool, int, float, np.number, np.bool_)):
+            return item
+        raise pickle.UnpicklingError(
+            f"it holds a {type(item).__name__}, and only numbers, lists, tuples and NumPy arrays are read"
+        )
+
+    def _array(self, stand_in: _Array) -> np.ndarray:
+        shape, order = tuple(int(n) for n in stand_in.shape), "F" if stand_in.fortran else "C"
+        if stand_in.kind.kind != "O":
+            data = _bytes(stand_in.data)
+            self._spend(len(data) // stand_in.kind.itemsize)
+            return np.frombuffer(data, dtype=stand_in.kind).reshape(shape, order=order)
+        items = stand_in.data
         if not isinstance(items, list) or min(shape, default=0) < 0 or len(items) != math.prod(shape):
             raise pickle.UnpicklingError(f"an array of shape {shape} without its items")
         out = np.empty(len(items), dtype=object)
         for k, item in enumerate(items):
-            out[k] = _plain(item)
+            out[k] = self.of(item)
         return out.reshape(shape, order=order)
 
-
-def _plain(item: Any) -> Any:
-    """``item`` with every stand-in replaced by its array."""
-    if isinstance(item, _Array):
-        return item.array()
-    if isinstance(item, (list, tuple)):
-        return type(item)(_plain(one) for one in item)
-    if item is None or isinstance(item, (bool, int, float, str, bytes, np.number, np.bool_)):
-        return item
-    raise pickle.UnpicklingError(f"it holds a {type(item).__name__}")
+    def _spend(self, items: int) -> None:
+        self._left -= items
+        if self._left < 0:
+            raise pickle.UnpicklingError(f"it holds more than {_MOST_ITEMS} items")
 
 
 def _dtype_of(kind: Any) -> np.dtype:

@@ -156,6 +156,13 @@ def lists_with(value: Any) -> np.ndarray:
     return lists
 
 
+def future_zip(path: Path) -> None:
+    """Let the archive's directory ask for a version of the format that nobody has."""
+    whole = bytearray(path.read_bytes())
+    whole[whole.rindex(b"PK\x01\x02") + 6] = 200
+    path.write_bytes(whole)
+
+
 BAD: list[tuple[str, Callable[[Path], Any], list[str]]] = [
     ("no polycalib", lambda f: (f / "polycalib.npz").unlink(), ["polycalib.npz"]),
     ("no pack", lambda f: (f / "dataPack.npz").unlink(), ["dataPack.npz"]),
@@ -169,7 +176,7 @@ BAD: list[tuple[str, Callable[[Path], Any], list[str]]] = [
     ("gel map", lambda f: np.save(f / "gelmap.npy", np.zeros((3, 4))), ["gelmap.npy", "(12, 16)"]),
     ("pickled gel map", lambda f: np.save(f / "gelmap.npy", np.array([{}]), allow_pickle=True), ["gelmap.npy"]),
     ("directions", lambda f: rewrite(f / "shadowTable.npz", shadowDirections=np.zeros(6)), ["(3, 6, n_depth)", "(3, 7, 4)"]),
-    ("list of text", lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with(["a"])), ["shadowTable[1, 2, 3]"]),
+    ("list of text", lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with(["a"])), ["shadowTable", "holds a str"]),
     ("no list", lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with(3.0)), ["shadowTable[1, 2, 3]", "list"]),
     ("list of lists", lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with([[1.0]])), ["shadowTable[1, 2, 3]"]),
     (
@@ -177,6 +184,9 @@ BAD: list[tuple[str, Callable[[Path], Any], list[str]]] = [
         lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with([np.inf])),
         ["shadowTable[1, 2, 3]", "finite"],
     ),
+    ("huge number", lambda f: rewrite(f / "shadowTable.npz", shadowTable=lists_with([10**400])), ["shadowTable", "64 bits"]),
+    ("huge pitch", lambda f: edit_params(f, "sensor", pixmm=10**400), ["sensor.pixmm"]),
+    ("strange zip", lambda f: future_zip(f / "raytac.npz"), ["raytac.npz", "zip file version"]),
     ("no JSON", lambda f: (f / "params.json").write_text("{"), ["params.json", "JSON"]),
     ("JSON list", lambda f: (f / "params.json").write_text("[]"), ["params.json", "sensor"]),
     ("other size", lambda f: edit_params(f, "sensor", w=17), ["sensor.w", "17", "16"]),
@@ -262,7 +272,9 @@ def test_numbers_lists_and_arrays_are_admitted(protocol: int) -> None:
     np.testing.assert_array_equal(load_restricted(pickle.dumps(big_endian, protocol)), big_endian)
 
 
-@pytest.mark.parametrize("item", [{}, {1}, print, Path("a"), np.dtype("f8"), np.array(["a"]), np.ndarray, 1j], ids=repr)
+@pytest.mark.parametrize(
+    "item", [{}, {1}, print, Path("a"), np.dtype("f8"), np.array(["a"]), np.ndarray, 1j, "text", b"bytes", None, 2**64], ids=repr
+)
 def test_anything_else_is_refused(item: object) -> None:
     with pytest.raises(pickle.UnpicklingError):
         load_restricted(pickle.dumps([item]))
@@ -271,7 +283,40 @@ def test_anything_else_is_refused(item: object) -> None:
 def test_what_is_admitted_cannot_be_changed() -> None:
     # GLOBAL numpy dtype, then BUILD with a state: would set attributes of what the name stands for.
     with pytest.raises(pickle.UnpicklingError, match="changes what it names"):
+        load_restricted(b"cnumpy\ndtype\n(I1\ntb.")
+    with pytest.raises(pickle.UnpicklingError, match="instruction EMPTY_DICT"):
         load_restricted(b"cnumpy\ndtype\n}S'x'\nI1\nsb.")
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        b"\x80\x02]r\xff\xff\xff\x3f.",  # LONG_BINPUT: the unpickler would make its memo 16 GB long
+        b"]p99999999\n.",  # PUT: the same in text
+        b"]p-1\n.",
+    ],
+)
+def test_a_memo_larger_than_the_pickle_is_refused(program: bytes) -> None:
+    with pytest.raises(pickle.UnpicklingError, match="notes an object at place"):
+        load_restricted(program)
+
+
+def test_lists_in_lists_cannot_grow_without_bound() -> None:
+    """Each list holds the one before it twice: 40 of them, 2⁴⁰ items in 300 bytes."""
+    program = b"\x80\x02]q\x00" + b"".join(b"]q%c(h%ch%ce" % (k + 1, k, k) for k in range(40)) + b"."
+    assert len(program) < 400
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("raytac.optics.restricted_pickle._MOST_ITEMS", 10_000)
+        with pytest.raises(pickle.UnpicklingError, match="more than 10000 items"):
+            load_restricted(program)
+        with pytest.raises(pickle.UnpicklingError, match="more than 10000 items"):
+            load_restricted(pickle.dumps([np.zeros(10_000)]))
+        assert load_restricted(pickle.dumps([np.zeros(9_000)]))[0].shape == (9_000,)
+
+
+def test_persistent_objects_are_refused() -> None:
+    with pytest.raises(pickle.UnpicklingError, match="PERSID"):
+        load_restricted(b"Pname\n.")
 
 
 def test_an_npz_that_unpacks_to_too_much_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
