@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 import warnings
 from collections.abc import Sequence
@@ -90,7 +91,8 @@ class TactileSensor:
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
-            optics_options: further keyword arguments of the optical mode, such as ``calibration`` and ``shadow`` of ``taxim``.
+            optics_options: further keyword arguments of the optical mode, such as ``calibration`` and ``shadow`` of ``taxim``;
+                their values are checked when it is built.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -104,6 +106,11 @@ class TactileSensor:
         if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
             raise InputError(
                 "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
+            )
+        if not isinstance(optics, str) and (integrator != "fast" or spp is not None or optics_options):
+            value = {"integrator": integrator, "spp": spp, "optics_options": optics_options}
+            raise InputError(
+                "integrator, spp, optics_options", value=value, rule="belong to a mode that is built here; it has its own"
             )
         resolve_device(device)
         if not isinstance(outputs, (str, Sequence)):
@@ -279,6 +286,7 @@ class TactileSensor:
         """The renderer, built on first use.
 
         Raises:
+            InputError: an unknown name or a bad value in ``optics_options``.
             BackendError: the renderer or the device does not work here.
         """
         mode = self._mode
@@ -287,19 +295,21 @@ class TactileSensor:
         return mode
 
     def _build_mode(self) -> OpticalMode:
-        common = {"resolution": self.resolution, "outputs": self._optical_outputs, "device": self.device}
+        settings: dict[str, Any] = {"resolution": self.resolution, "outputs": self._optical_outputs, "device": self.device}
         if self._optics == "taxim":
-            from raytac.optics.taxim import TaximMode
+            from raytac.optics.taxim import TaximMode as Mode
+        elif self._optics == "phong":
+            from raytac.optics.phong import PhongMode as Mode
+        else:
+            from raytac.optics.raytrace import RayTracer as Mode
 
-            return TaximMode(self.spec, **common, **self._optics_options)
-        if self._optics == "phong":
-            from raytac.optics.phong import PhongMode
-
-            return PhongMode(self.spec, **common, **self._optics_options)
-        from raytac.optics.raytrace import RayTracer
-
-        sampling = {"integrator": self.integrator, "spp": self.spp, "seed": self.seed}
-        return RayTracer(self.spec, **common, **sampling, **self._optics_options)
+            settings |= {"integrator": self.integrator, "spp": self.spp, "seed": self.seed}
+        known = [name for name in inspect.signature(Mode).parameters if name != "sensor" and name not in settings]
+        for name, value in self._optics_options.items():
+            if name not in known:
+                rule = f"is no option of optics={self._optics!r}, or an argument of TactileSensor itself"
+                raise InputError(f"optics_options[{name!r}]", value=value, rule=rule, choices=known)
+        return Mode(self.spec, **settings, **self._optics_options)
 
 
 def sensor_outputs(optics: str) -> tuple[str, ...]:

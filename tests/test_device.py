@@ -98,6 +98,46 @@ def test_cuda_that_loads_and_does_not_trace(asked: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+class Untraceable:
+    """Stands in for Mitsuba where every variant can be set and CUDA does not trace."""
+
+    Ray3f = staticmethod(lambda *args: None)
+
+    def __init__(self) -> None:
+        self._variant: str | None = None
+
+    def variant(self) -> str | None:
+        return self._variant
+
+    def set_variant(self, variant: str) -> None:
+        self._variant = variant
+
+    def load_dict(self, _: dict) -> Untraceable:
+        return self
+
+    def ray_test(self, _: object) -> list[bool]:
+        return [self._variant != "cuda_ad_rgb"]
+
+
+def test_a_cuda_that_can_be_set_and_does_not_trace_is_never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    from raytac.optics import variant
+
+    monkeypatch.setattr(variant, "_require_llvm", lambda: None)
+    mi = Untraceable()
+    for _ in range(2):
+        with pytest.raises(BackendError, match="cuda_ad_rgb does not work here: a ray missed"):
+            variant._started(mi, "cuda", "cuda")
+    with pytest.warns(RuntimeWarning, match="CUDA does not trace here"):
+        assert variant._started(mi, "auto", "cuda") == "cpu"
+    assert mi.variant() == "llvm_ad_rgb" and variant._started(mi, "auto", "cuda") == "cpu"
+    with pytest.raises(BackendError, match="already renders with llvm_ad_rgb"):
+        variant._started(mi, "cuda", "cuda")
+    after_cuda = Untraceable()
+    with pytest.raises(BackendError):
+        variant._started(after_cuda, "cuda", "cuda")
+    assert variant._started(after_cuda, "cpu", "cpu") == "cpu"
+
+
 def test_an_optix_that_the_user_named_is_the_only_one_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = []
     monkeypatch.setattr(device, "_load", lambda names: tried.append(names))

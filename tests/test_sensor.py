@@ -176,3 +176,16 @@ def test_nothing_heavy_is_imported_before_it_is_needed() -> None:
 
 def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
     assert TactileSensor(sensor_spec, outputs=tuple(reversed(OUTPUTS))).outputs == OUTPUTS
+
+
+def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> None:
+    for setting in ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadow": True}}):
+        with pytest.raises(InputError, match="it has its own"):
+            TactileSensor(sensor_spec, optics=Shader(sensor_spec), **setting)
+
+
+@pytest.mark.parametrize(("optics", "known"), [("raytrace", "denoise"), ("taxim", "calibration"), ("phong", "lights")])
+def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(sensor_spec: SensorSpec, optics: str, known: str) -> None:
+    for name in ("calibratoin", "resolution"):
+        with pytest.raises(InputError, match=f"optics_options.*{name}.*choose from: .*{known}"):
+            _ = TactileSensor(sensor_spec, optics=optics, device="cpu", optics_options={name: 1}).optical_mode

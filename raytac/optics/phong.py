@@ -105,6 +105,8 @@ class PhongMode(ImageMode):
         """
         if isinstance(lights, str) and lights not in PHONG_LIGHTS:
             raise InputError("lights", value=lights, rule="must be a known set of lights", choices=PHONG_LIGHTS)
+        if not isinstance(lights, (str, tuple, list)):
+            raise InputError("lights", value=lights, rule="must be a name or PhongLights", choices=PHONG_LIGHTS)
         self.lights = PHONG_LIGHTS[lights] if isinstance(lights, str) else tuple(lights)
         for light in self.lights:
             if not isinstance(light, PhongLight):
@@ -114,9 +116,10 @@ class PhongMode(ImageMode):
                 raise InputError("lights", value=light, rule="must be finite, with three numbers in direction and colour")
         super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
         width, height = self.camera.resolution
-        if background is not None and (background.shape != (height, width, 3) or background.dtype != np.uint8):
-            rule = f"must be a uint8 image of shape ({height}, {width}, 3)"
-            raise InputError("background", value=f"{background.dtype} {background.shape}", rule=rule)
+        if background is not None:
+            found = f"{background.dtype} {background.shape}" if isinstance(background, np.ndarray) else type(background).__name__
+            if found != f"uint8 {(height, width, 3)}":
+                raise InputError("background", value=found, rule=f"must be a uint8 array of shape {(height, width, 3)}")
         self._background = background
 
     def _build(self, grid: PadGrid) -> PhongArrays:

@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.errors import BackendError, InputError
+from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.optics.image_mode import ImageHeights, ImageMode
 from raytac.optics.table import PolyTable
@@ -117,7 +117,8 @@ class TaximMode(ImageMode):
             device: ``auto``, ``cpu`` or ``cuda``.
 
         Raises:
-            InputError: a value out of its choices, or a calibration that is malformed or of another shape of image.
+            InputError: a value out of its choices, or an image of another shape than the table's.
+            CalibrationError: a file of the calibration folder is missing or malformed.
             BackendError: Dr.Jit cannot run on ``device``.
         """
         self.label = "taxim"
@@ -185,10 +186,8 @@ def _table(calibration: object, sensor: SensorSpec, device: str) -> PolyTable:
     if calibration is not None:
         rule = f"must be a PolyTable, a calibration folder or None, not {type(calibration).__name__}"
         raise InputError("calibration", value=calibration, rule=rule)
-    try:
-        from raytac.optics.bake import baked_table
-    except ImportError as error:
-        raise BackendError(f"no table can be baked here ({error}): give optics_options={{'calibration': FOLDER}}") from error
+    from raytac.optics.bake import baked_table
+
     return baked_table(sensor, device=device)
 
 

@@ -36,10 +36,12 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
 
 def _started(mi: Any, device: str, name: str) -> str:
     """The device whose variant is set in ``mi``: ``name``, or another one that ``device = "auto"`` may fall back to."""
-    active = next((known for known, variant in VARIANTS.items() if variant == mi.variant()), None)
+    # A variant that could be set and did not trace is still set, and nothing renders with it.
+    current = None if mi.variant() == getattr(mi, "raytac_failed_variant", None) else mi.variant()
+    active = next((known for known, variant in VARIANTS.items() if variant == current), None)
     if active is not None and device == "auto":
         return active
-    if mi.variant() not in (None, VARIANTS[name]):
+    if current not in (None, VARIANTS[name]):
         raise BackendError(
             f"this process already renders with {mi.variant()}, so {VARIANTS[name]} (device {name!r}) cannot be used; "
             "keep one device per process"
@@ -59,19 +61,24 @@ def _started(mi: Any, device: str, name: str) -> str:
 
 
 def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
-    """Set the variant, trace one ray if asked, and return why that failed, or nothing.
+    """Set the variant, trace one ray if asked, and return why that failed, or nothing; a failure is noted in ``mi``.
 
     A CUDA whose libraries load may still not trace: no kernel image for the card, no OptiX in a container, a driver that is too old.
     """
+    failure = ""
     try:
         mi.set_variant(variant)
         if trace:
             scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
             if not scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]:
-                return "a ray missed what it must hit"
+                failure = "a ray missed what it must hit"
     except (ImportError, RuntimeError) as error:
-        return " ".join(str(error).split())
-    return ""
+        failure = " ".join(str(error).split()) or type(error).__name__
+    if failure:
+        mi.raytac_failed_variant = variant
+    elif getattr(mi, "raytac_failed_variant", None) == variant:
+        mi.raytac_failed_variant = None
+    return failure
 
 
 def _require_llvm() -> None:

@@ -114,3 +114,7 @@ def test_wrong_lights_and_backgrounds_are_refused(spec: SensorSpec) -> None:
         PhongMode(spec, lights=(PhongLight((0, 0, np.nan), (0, 0, 0), 1, 1),), resolution=RESOLUTION, device="cpu")
     with pytest.raises(InputError, match=r"background.*\(60, 80, 3\)"):
         PhongMode(spec, background=np.zeros((3, 3, 3), np.uint8), resolution=RESOLUTION, device="cpu")
+    with pytest.raises(InputError, match="background = 'list'"):
+        PhongMode(spec, background=[[0]], resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"lights = 3.*gelsight2014"):
+        PhongMode(spec, lights=3, resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]
