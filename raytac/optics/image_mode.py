@@ -31,6 +31,8 @@ __all__ = ["HEIGHT_MODE_OUTPUTS", "ImageHeights", "ImageMode", "see_heights"]
 
 HEIGHT_MODE_OUTPUTS = ("rgb", "normals", "depth")
 """Optical outputs of these modes: they know colours, not the light of each LED."""
+_ROUNDING = 2
+"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
 _LARGEST_ARRAY = 2**32 - 1
 """Dr.Jit indexes with 32 bits."""
 
@@ -164,11 +166,11 @@ class ImageMode(ABC):
     # ---------------------------------------------------------------- memory
 
     def memory_per_env(self, grid: PadGrid) -> int:
-        """Device memory of one environment in a batch on ``grid`` [byte]: nodes, height images, intermediate and final images."""
+        """Most device memory that an environment of a batch on ``grid`` takes [byte]: nodes, height images, those on the way, the last."""
         width, height = self.camera.resolution
         nodes = grid.shape[0] * grid.shape[1] * (5 if self.needs_contact else 4)
-        # Heights, displacement and contact, what the mode holds, three channels and their bytes.
-        return nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 1 + 15))
+        # Heights and displacement, what the mode holds; contact and flags; three channels and their bytes.
+        return _ROUNDING * (nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 2 + 15)))
 
     def largest_batch(self, grid: PadGrid) -> int:
         """Largest number of environments that one call may render on ``grid``."""

@@ -151,8 +151,9 @@ class TaximMode(ImageMode):
         return self._shader.levels(seen, inputs)
 
     def _floats_per_pixel(self) -> float:
-        # With shadows: differences, the least values found (both 3), two packed images of 4 for the blurs, direction and ring.
-        return 3 + 3 + 8 + 2 if self.shadow else 0
+        # With shadows: differences and least values (3 each), four packed images' worth for the blurs (16), and what tells the pixels
+        # that cast: direction, bins, places and their list (5).
+        return 27 if self.shadow else 0
 
     def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
         if self.table.covered is None:

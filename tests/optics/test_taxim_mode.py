@@ -14,6 +14,7 @@ import pytest
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.calib_folder import save_calibration
+from raytac.optics.phong import PhongMode
 from raytac.optics.table import PolyTable, ShadowTable
 from raytac.optics.taxim import TaximMode, resized
 from raytac.sensor import TactileSensor
@@ -170,6 +171,25 @@ def test_what_it_cannot_do_is_refused(spec: SensorSpec, grid: PadGrid) -> None:
     mode.render(at_rest(grid))
     with pytest.raises(InputError, match="whole number of grids"):
         mode.render_device(mode.mi.Float([0, 1, 2]))
+
+
+@pytest.mark.parametrize("kind", ["table", "shadow", "phong"])
+def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadGrid, kind: str) -> None:
+    """The peak of Dr.Jit's own arrays stays below what is stated, and that is no wild guess."""
+    from raytac.optics.memory import peak_bytes
+
+    size = (160, 120)
+    mode = (
+        PhongMode(spec, background=np.zeros((120, 160, 3), np.uint8), resolution=size, device="cpu")
+        if kind == "phong"
+        else TaximMode(spec, calibration=make_table(spec), shadow=kind == "shadow", resolution=size, device="cpu")
+    )
+    height, contact = ball(grid)
+    for envs in (1, 3, 7):  # the allocator's powers of two suit some batches better than others
+        batch = surface(grid, *[height] * envs, contact=contact)
+        mode.render(batch)
+        peak = peak_bytes(lambda batch=batch: mode.render(batch), "cpu")
+        assert 0.35 * envs * mode.memory_per_env(grid) < peak <= envs * mode.memory_per_env(grid)
 
 
 def test_a_batch_that_does_not_fit_is_refused(spec: SensorSpec, grid: PadGrid, monkeypatch: pytest.MonkeyPatch) -> None:
