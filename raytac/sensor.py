@@ -261,8 +261,7 @@ class TactileSensor:
 
     def rest(self) -> TactileFrame:
         """Frame of one untouched pad (B = 1), what every difference image is taken from."""
-        rest = self.grid.rest[None].astype(np.float32)
-        return self.update(GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan)))
+        return self.update(GelSurface.at_rest(self.grid))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
         """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where it is not.

@@ -73,6 +73,12 @@ class GelSurface:
     def __repr__(self) -> str:
         return summary(self)
 
+    @classmethod
+    def at_rest(cls, grid: PadGrid) -> GelSurface:
+        """One untouched pad (B = 1)."""
+        height = grid.rest[None].astype(np.float32)
+        return cls(grid, height, np.zeros(height.shape, bool), np.full((1, 2), np.nan))
+
     @property
     def batch(self) -> int:
         return self.height.shape[0]

@@ -61,13 +61,12 @@ class Calibration:
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
         self.grid: PadGrid = make_grid(sensor.gelpad, min(COARSEST_PITCH, px, py))
         """Nodes of the presses, as fine as the image."""
-        rest = self.grid.rest[None].astype(np.float32)
-        surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan))
-        rgb = self.tracer.render(surface).rgb
+        rest = GelSurface.at_rest(self.grid)
+        rgb = self.tracer.render(rest).rgb
         assert rgb is not None
         self.rest_image: np.ndarray = rgb[0]
         """(H, W, 3) uint8."""
-        self._rest = self.tracer.mi.Float(rest.ravel())
+        self._rest = self.tracer.mi.Float(rest.height.ravel())
 
     def views(self, presses: Iterable[GelSurface]) -> Iterator[Views]:
         """Render ``presses`` (one environment each, on ``grid``) in batches and see their slopes as the table mode does."""

@@ -126,8 +126,7 @@ class PhongMode(ImageMode):
         image = self._background
         if image is None:
             tracer = RayTracer(self.sensor, resolution=self.camera.resolution, device=self.device)
-            rest = grid.rest[None].astype(np.float32)
-            image = tracer.render(GelSurface(grid, rest, np.zeros(rest.shape, bool), np.full((1, 2), np.nan))).rgb
+            image = tracer.render(GelSurface.at_rest(grid)).rgb
             assert image is not None
         dimmed = AMBIENT * image.reshape(-1, 3).astype(np.float32)
         return PhongArrays([self.mi.Float(np.ascontiguousarray(dimmed[:, c])) for c in range(3)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
@@ -72,6 +73,8 @@ def cached(folder: Path) -> PolyTable | None:
 def keep(table: PolyTable, folder: Path) -> None:
     """Write the table to ``folder`` as a whole: it is written beside it and then renamed, in place of a damaged one.
 
+    A whole table that is there already stays, so that a reader never finds half of it: under one digest all are the same.
+
     Raises:
         InputError: the folder cannot be written.
     """
@@ -79,14 +82,28 @@ def keep(table: PolyTable, folder: Path) -> None:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
+        if folder.exists():
+            if _is_whole(folder):
+                return
+            os.replace(folder, work / "damaged")
         save_calibration(table, work / folder.name)
-        shutil.rmtree(folder, ignore_errors=True)
-        # Another process may have been faster; its table is the same.
-        if not folder.exists():
+        try:
             os.replace(work / folder.name, folder)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            # Another process was faster.
     except OSError as error:
         rule = f"must be a folder that can be written ({error.strerror}); RAYTAC_CACHE names another"
         raise InputError("cache", value=folder, rule=rule) from error
     finally:
         if work is not None:
             shutil.rmtree(work, ignore_errors=True)
+
+
+def _is_whole(folder: Path) -> bool:
+    try:
+        load_calibration(folder)
+    except CalibrationError:
+        return False
+    return True

@@ -13,6 +13,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -331,15 +332,12 @@ class _Scene:
         encode = tracers.get(size).response.encode_numpy
         self.truth = encode(halves.mean(axis=0))
         self._halves = [encode(half) for half in halves]
-        self._masks: dict[str, np.ndarray] = {}
 
-    @property
+    @cached_property
     def masks(self) -> dict[str, np.ndarray]:
-        if not self._masks:
-            self._masks = self._tracers.regions(self._size, self.surface)
-        return self._masks
+        return self._tracers.regions(self._size, self.surface)
 
-    @property
+    @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
         """Noise of the reference by region: the halves are independent, so half their difference has the variance of their mean."""
         one, two = self._halves
