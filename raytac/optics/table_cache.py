@@ -11,29 +11,14 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-import raytac.gel
-import raytac.optics
 from raytac.errors import CalibrationError, InputError
+from raytac.io.code_digest import code_digest
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.calib_folder import load_calibration, save_calibration
 from raytac.optics.table import PolyTable
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["cache_root", "cached", "keep", "table_folder", "table_key"]
-
-_NOT_IN_TABLE = (
-    "phong",
-    "reference",
-    "denoise",
-    "memory",
-    "taxim",
-    "table_shadow",
-    "recording",
-    "table_cache",
-    "calib_folder",
-    "restricted_pickle",
-)
-"""Modules of raytac.optics on which no baked table depends: other modes, and what reads a table."""
 
 
 def cache_root() -> Path:
@@ -44,14 +29,10 @@ def cache_root() -> Path:
 
 
 def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
-    """Digest of sensor and lights (not of where their files lie), settings, and the code of gel and ray tracer; the device is not in it."""
+    """Digest of sensor and lights (not of where their files lie), settings, and the code that bakes; the device is not in it."""
     plain = replace(sensor, source=None, lights=replace(sensor.lights, source=None))
-    digest = hashlib.sha256(repr((plain, settings, seed, resolution)).encode())
-    for package in (raytac.gel, raytac.optics):
-        for path in sorted(Path(str(package.__file__)).parent.glob("*.py")):
-            if path.stem not in _NOT_IN_TABLE:
-                digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()[:24]
+    basis = plain, settings, seed, resolution, code_digest("raytac.optics.bake")
+    return hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
 
 
 def table_folder(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> Path:

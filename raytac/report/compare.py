@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from raytac.errors import BackendError, InputError, RaytacError
 from raytac.gel.surface import GelSurface
+from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
-from raytac.report.code_digest import code_digest
 from raytac.report.image_error import METRICS, SSIM_BORDER, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
 from raytac.report.machine import machine

@@ -30,8 +30,6 @@ FAMILIES = {
     "peer_shadow": "taxim package with shadow",
 }
 """Name in keys and files, and in words, of every kind of mode; a sampled family has one mode for each number of samples a pixel."""
-BAKE_CODE = ("raytac.optics.bake", "raytac.gel.elastic", "raytac.gel.gaussian", "raytac.gel.primitives", "raytac.gel.rasterize")
-"""Modules that shape a baked table."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ def _named(family: str, optics: str, options: dict[str, Any]) -> Mode:
         return sensor.optical_mode
 
     table = optics == "taxim"
-    code = (f"raytac.optics.{optics}", *(BAKE_CODE if table else ()))
+    code = (f"raytac.optics.{optics}",)
     note = "" if table else "lights and constants as published for another sensor, not fitted to this one"
     return Mode(family, build, code, options={"optics": optics, **options}, prepare=_bake if table else None, note=note)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.io.code_digest import code_digest
 from raytac.io.metrics import versions
-from raytac.report.code_digest import code_digest
 from raytac.report.tracers import Tracers, path_trace
 
 __all__ = ["References"]

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
+from raytac.io import code_digest
 from raytac.optics import bake, table_cache
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.table import PolyTable, TaximConstants
@@ -100,8 +101,10 @@ def test_other_code_is_another_key(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     asked = SPEC, BakeSettings(), 0, (320, 240)
     before = table_cache.table_key(*asked)
     assert before == table_cache.table_key(*asked)
-    (tmp_path / "fast.py").write_text("changed = True\n")
-    monkeypatch.setattr(table_cache.raytac.optics, "__file__", str(tmp_path / "__init__.py"))
+    changed = tmp_path / "fast.py"
+    changed.write_text("changed = True\n")
+    sources = code_digest.module_sources
+    monkeypatch.setattr(code_digest, "module_sources", lambda roots: sources(roots) | {"raytac.optics.fast": changed})
     assert table_cache.table_key(*asked) != before
 
 

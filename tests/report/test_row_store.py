@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.report.code_digest import code_digest, module_sources
 from raytac.report.row_store import Row, RowStore, row_key
 
 
@@ -53,22 +52,3 @@ def test_keys_depend_on_every_part_and_on_nothing_else() -> None:
     basis = {"seed": 0, "mode": ["fast", {"spp": 4}]}
     assert row_key(basis) == row_key({"mode": ["fast", {"spp": 4}], "seed": 0})
     assert len({row_key(basis), row_key(basis | {"seed": 1}), row_key(basis | {"mode": ["fast", {}]})}) == 3
-
-
-def test_code_of_a_mode_is_all_that_it_imports() -> None:
-    names = set(module_sources(["raytac.optics.raytrace"]))
-    assert {"raytac.optics.fast", "raytac.optics.reference", "raytac.optics.response", "raytac.optics.camera"} <= names
-    assert all(name.startswith("raytac.optics") for name in names)
-    assert "raytac.optics.fast" not in module_sources(["raytac.optics.reference"])
-    assert not module_sources(["raytac.optics.no_such_module"])
-
-
-def test_digest_changes_with_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = code_digest("raytac.optics.camera")
-    assert before == code_digest("raytac.optics.camera") != code_digest("raytac.optics.response")
-    changed = tmp_path / "camera.py"
-    changed.write_text("x = 1\n")
-    monkeypatch.setattr("raytac.report.code_digest.module_sources", lambda roots: {"raytac.optics.camera": changed})
-    one = code_digest("raytac.optics.camera")
-    changed.write_text("x = 2\n")
-    assert one != code_digest("raytac.optics.camera")

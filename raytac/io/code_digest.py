@@ -10,9 +10,12 @@ from pathlib import Path
 
 __all__ = ["code_digest", "module_sources"]
 
+WITHIN = ("raytac.gel", "raytac.optics")
+"""Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
 
-def module_sources(roots: Iterable[str], within: str = "raytac.optics") -> dict[str, Path]:
-    """Source files of ``roots`` and of all modules of the package ``within`` that they import, also inside functions.
+
+def module_sources(roots: Iterable[str]) -> dict[str, Path]:
+    """Source files of ``roots`` and of all modules of the packages ``WITHIN`` that they import, also inside functions.
 
     Roots that do not exist are left out. Imports are read from the sources; nothing is run except the ``__init__`` of packages.
     """
@@ -35,7 +38,7 @@ def module_sources(roots: Iterable[str], within: str = "raytac.optics") -> dict[
                 imported = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module:
                 imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            waiting += [name for name in imported if (name + ".").startswith(within + ".")]
+            waiting += [name for name in imported if (name + ".").startswith(tuple(package + "." for package in WITHIN))]
     return found
 
 

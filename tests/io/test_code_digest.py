@@ -1,0 +1,35 @@
+"""A digest of code: of all that a module imports, and of nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from raytac.io.code_digest import code_digest, module_sources
+
+
+def test_code_of_a_mode_is_all_that_it_imports() -> None:
+    names = set(module_sources(["raytac.optics.raytrace"]))
+    assert {"raytac.optics.fast", "raytac.optics.reference", "raytac.optics.response", "raytac.gel.surface"} <= names
+    assert all(name.startswith(("raytac.optics", "raytac.gel")) for name in names)
+    assert "raytac.optics.fast" not in module_sources(["raytac.optics.reference"])
+    assert not module_sources(["raytac.optics.no_such_module"])
+
+
+def test_code_of_a_table_is_that_of_its_bake_and_not_of_the_mode_that_uses_it() -> None:
+    baked, used = (set(module_sources([f"raytac.optics.{name}"])) for name in ("bake", "taxim"))
+    assert {"raytac.gel.elastic", "raytac.gel.rasterize", "raytac.optics.fast", "raytac.optics.bake_shadow"} <= baked
+    assert not {"raytac.optics.taxim", "raytac.optics.table_shadow", "raytac.optics.phong"} & baked
+    assert used >= baked | {"raytac.optics.table_shadow"}  # the mode imports the bake, inside a function
+
+
+def test_digest_changes_with_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = code_digest("raytac.optics.camera")
+    assert before == code_digest("raytac.optics.camera") != code_digest("raytac.optics.response")
+    changed = tmp_path / "camera.py"
+    changed.write_text("x = 1\n")
+    monkeypatch.setattr("raytac.io.code_digest.module_sources", lambda roots: {"raytac.optics.camera": changed})
+    one = code_digest("raytac.optics.camera")
+    changed.write_text("x = 2\n")
+    assert one != code_digest("raytac.optics.camera")
