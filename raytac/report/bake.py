@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -85,7 +84,6 @@ def bake_metrics(baked: Baked, errors: dict[str, dict[str, SceneError]], bake_s:
         "bake.n_bins": table.n_bins,
         "bake.steepest_covered_deg": 90.0 * (int(steepest[-1]) + 1) / (table.n_bins - 1) if len(steepest) else 0.0,
         "bake.covered_share": float(fit.covered[:-1, :-1].mean()),
-        "machine.cpus": os.cpu_count() or 1,
     }
     for degree in (0, 1, 2):
         metrics[f"bake.degree{degree}_share"] = float((fit.degree[:-1, :-1] == degree).mean())

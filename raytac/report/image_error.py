@@ -18,6 +18,7 @@ __all__ = [
     "METRICS",
     "RING_WIDTH",
     "SSIM_SIGMA",
+    "contact_box",
     "error_maps",
     "flip_map",
     "has_flip",
@@ -108,12 +109,24 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.asarray(values)[..., 0]
 
 
+def contact_box(contact: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of the contact's bounding box with ``margin`` [px] on each side, within the image; all of it without contact."""
+    height, width = contact.shape
+    if not contact.any():
+        return slice(0, height), slice(0, width)
+    rows, columns = (np.flatnonzero(contact.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+
+
 def regions(contact: np.ndarray, pixel_pitch: tuple[float, float], ring_width: float = RING_WIDTH) -> dict[str, np.ndarray]:
     """Masks (H, W) bool of the parts of an image over which errors are taken.
 
     ``frame``: all pixels. ``contact``: where the object touches, as the camera sees it. ``ring``: pixels outside the contact and at most
-    ``ring_width`` [m] from its nearest pixel, where shadows fall and the gel bends. ``box``: the contact's bounding box. The last three
-    are empty if nothing touches.
+    ``ring_width`` [m] from its nearest pixel, where shadows fall and the gel bends. ``box``: the contact's bounding box, no margin. The
+    last three are empty if nothing touches.
 
     Args:
         contact: (H, W) bool, as ``OpticsImages.contact`` of one environment.
@@ -132,10 +145,9 @@ def regions(contact: np.ndarray, pixel_pitch: tuple[float, float], ring_width: f
 
     ring, box = np.zeros_like(contact), np.zeros_like(contact)
     if contact.any():
+        box[contact_box(contact)] = True
         distance = np.asarray(distance_transform_edt(~contact, sampling=(pixel_pitch[1], pixel_pitch[0])))
         ring = (distance <= ring_width * (1 + 1e-9)) & ~contact
-        rows, columns = (np.flatnonzero(contact.any(axis=axis)) for axis in (1, 0))
-        box[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
     return {"frame": np.ones_like(contact), "contact": contact, "ring": ring, "box": box}
 
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
-from raytac.report.image_error import mae, psnr, rmse
+from raytac.report.image_error import contact_box, mae, psnr, rmse
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from raytac.optics.raytrace import RayTracer
     from raytac.optics.table import PolyTable
 
-__all__ = ["BOX_MARGIN", "SceneError", "contact_box", "error_metrics", "table_errors"]
+__all__ = ["BOX_MARGIN", "SceneError", "error_metrics", "table_errors"]
 
 BOX_MARGIN = 15 / 320
 """Margin of the box round the contact as a share of the image's width: 15 px at 320 × 240."""
@@ -38,8 +38,8 @@ class SceneError:
 
     @property
     def box(self) -> tuple[slice, slice]:
-        """Rows and columns of ``contact_box``."""
-        return contact_box(self.contact)
+        """Rows and columns of the contact's bounding box with ``BOX_MARGIN`` on each side; the whole image if nothing touches."""
+        return contact_box(self.contact, round(BOX_MARGIN * self.contact.shape[1]))
 
     @property
     def contact_mae(self) -> float:
@@ -56,19 +56,6 @@ class SceneError:
     def frame_psnr(self) -> float:
         """PSNR over the image [dB]."""
         return psnr(rmse(self.table, self.traced))
-
-
-def contact_box(contact: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the contact's bounding box with ``BOX_MARGIN`` on each side, within the image; all of it without contact."""
-    height, width = contact.shape
-    if not contact.any():
-        return slice(0, height), slice(0, width)
-    margin = round(BOX_MARGIN * width)
-    rows, columns = (np.flatnonzero(contact.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
-    )
 
 
 def table_errors(

@@ -15,6 +15,7 @@ from raytac.report.image_error import (
     FLIP_PPD,
     METRICS,
     SSIM_BORDER,
+    contact_box,
     error_maps,
     flip_map,
     has_flip,
@@ -144,6 +145,17 @@ def test_regions_of_a_disc() -> None:
     assert masks["ring"][(distance > 11) & (distance < 14.5)].all() and not masks["ring"][distance > 15.5].any()
     rows, columns = np.nonzero(masks["box"])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 40, 30, 50) and masks["box"].sum() == 21 * 21
+
+
+def test_box_with_a_margin_stays_in_the_image() -> None:
+    contact = np.zeros((40, 60), bool)
+    assert contact_box(contact, 5) == (slice(0, 40), slice(0, 60))
+    contact[3:10, 50:58] = True
+    assert contact_box(contact) == (slice(3, 10), slice(50, 58))
+    rows, columns = contact_box(contact, 5)
+    grown = np.zeros_like(contact)
+    grown[rows, columns] = True
+    assert grown.sum() == (10 + 5) * (60 - 45) and grown[0, 45] and grown[14, 59] and not grown[15].any()
 
 
 def test_ring_is_as_wide_in_metres_along_both_axes() -> None:
