@@ -29,7 +29,6 @@ from raytac.specs.sensor import SensorSpec
 __all__ = ["RayTracer"]
 
 
-
 @dataclass(frozen=True)
 class FastInputs:
     """Every device array that a recorded ``fast`` frame reads besides the heights; Dr.Jit wants them named as inputs."""
@@ -115,7 +114,9 @@ class RayTracer:
             raise InputError("resolution", value=resolution, rule="must be (width, height), each >= 1 pixel")
         self.rays = round(np.sqrt(spp or 1))
         if integrator == "fast" and self.rays**2 != (spp or 1):
-            raise InputError("spp", value=spp, rule="the fast integrator takes a square number of rays a pixel", choices=(1, 4, 9, 16))
+            raise InputError(
+                "spp", value=spp, rule="the fast integrator takes a square number of rays a pixel", choices=(1, 4, 9, 16)
+            )
         if integrator == "fast" and denoise:
             raise InputError("denoise", value=denoise, rule="the fast integrator has no noise", choices=(False,))
         self.mi, self.device = load_mitsuba(device)
@@ -211,7 +212,9 @@ class RayTracer:
     def render_layers(self, surface: GelSurface) -> dict[str, np.ndarray]:
         """Linear radiance by layer, each (B, H, W, 3) float32, from any integrator; whatever ``outputs`` say about rgb."""
         if not self._lit:
-            raise InputError("outputs", value=self.outputs, rule="layers need a tracer with an output of light", choices=("rgb", "layers"))
+            raise InputError(
+                "outputs", value=self.outputs, rule="layers need a tracer with an output of light", choices=("rgb", "layers")
+            )
         heights, failed = self._checked(surface)
         layers = self._layers(heights)
         for image in layers.values():
@@ -242,7 +245,7 @@ class RayTracer:
     def render_device(self, heights: Any) -> dict[str, Any]:
         """``fast`` on device arrays: heights (B·Ny·Nx) [m] to ``rgb`` (B·H·W·3, UInt8-valued) and ``layers`` (list of channels).
 
-        Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
+        Heights must be finite, which is not checked here. Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
         if self._grid is None:
             raise InputError("heights", value=type(heights).__name__, rule="render a GelSurface first: it tells the grid")

@@ -86,7 +86,9 @@ def test_another_rest_surface_is_refused(tracer: Build) -> None:
         mode.render(at_rest(replace(grid, rest=grid.rest - 1e-4)))
 
 
-@pytest.mark.parametrize("shape", [(0, 84, 102), (84, 102), (1, 82, 102)], ids=["no environment", "no batch axis", "rows missing"])
+@pytest.mark.parametrize(
+    "shape", [(0, 84, 102), (84, 102), (1, 82, 102)], ids=["no environment", "no batch axis", "rows missing"]
+)
 def test_surfaces_of_another_shape_are_refused(tracer: Build, shape: tuple[int, ...]) -> None:
     spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
     grid = grid_of(spec)
