@@ -247,7 +247,8 @@ class ImageMode(ABC):
     def render_device(self, heights: Any, contact: Any = None) -> tuple[Any, Any]:
         """On device arrays: heights (B·Ny·Nx) [m] and contact (B·Ny·Nx, UInt8, or None) to (image, flags).
 
-        The image is B·H·W·3, UInt8. Heights must be finite, which is not checked here. Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
+        The image is B·H·W·3, UInt8. Heights must be finite, which is not checked here.
+        Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
         replays them afterwards.
 
         Raises:

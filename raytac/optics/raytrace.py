@@ -245,7 +245,8 @@ class RayTracer:
     def render_device(self, heights: Any) -> dict[str, Any]:
         """``fast`` on device arrays: heights (B·Ny·Nx) [m] to ``rgb`` (B·H·W·3, UInt8-valued) and ``layers`` (list of channels).
 
-        Heights must be finite, which is not checked here. Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
+        Heights must be finite, which is not checked here.
+        Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
         if self._grid is None:
             raise InputError("heights", value=type(heights).__name__, rule="render a GelSurface first: it tells the grid")
