@@ -185,7 +185,7 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         metrics |= {f"{key}.{name}": value for name, value in optional.items() if value is not None}
         if summary.batch_ms_per_frame is not None:
             metrics[f"{key}.batch"] = summary.batch
-            metrics[f"{key}.ms_per_frame"] = min(summary.ms, summary.batch_ms_per_frame)
+            metrics[f"{key}.numpy_ms_per_frame"] = min(summary.ms, summary.batch_ms_per_frame)
     for row in rows:
         metrics |= _row_metrics(row)
     for equal in equal_errors(rows):
