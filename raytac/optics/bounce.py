@@ -15,6 +15,7 @@ the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -92,6 +93,12 @@ class CaseLight:
         return np.einsum("nm,cmk->cnk", monomials, self.coefficients).astype(np.float32)
 
 
+def patch_counts(layout: CoatLayout) -> tuple[int, int]:
+    """Nodes along x and y of the coarse grid over the pad."""
+    nx, ny = (max(2, round((n - 1) * d / PATCH) + 1) for n, d in ((layout.nx, layout.dx), (layout.ny, layout.dy)))
+    return nx, ny
+
+
 @dataclass(frozen=True)
 class BounceField:
     """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, made anew each frame.
@@ -112,7 +119,7 @@ class BounceField:
     @classmethod
     def build(cls, mi: Any, layout: CoatLayout, case: CaseLight) -> BounceField:
         """Lay the grid over the pad and evaluate the case's light on it."""
-        nx, ny = (max(2, round((n - 1) * d / PATCH) + 1) for n, d in ((layout.nx, layout.dx), (layout.ny, layout.dy)))
+        nx, ny = patch_counts(layout)
         dx, dy = (layout.nx - 1) * layout.dx / (nx - 1), (layout.ny - 1) * layout.dy / (ny - 1)
         x, y = np.meshgrid(layout.x0 + dx * np.arange(nx), layout.y0 + dy * np.arange(ny))
         k = np.arange(-REACH, REACH + 1)
@@ -128,6 +135,12 @@ class BounceField:
             offset_x=mi.Int32(ox[near].astype(np.int32)),
             offset_y=mi.Int32(oy[near].astype(np.int32)),
         )
+
+    @staticmethod
+    def memory_per_env(layout: CoatLayout, channels: int) -> int:
+        """Bytes that the grid takes while it is filled: packed results and the loop's sums before and after, patches and their light."""
+        nodes = math.prod(patch_counts(layout))
+        return nodes * (channels * (16 + 2 * 12) + 16 * (channels // 3) + 60)
 
     def _node(self, i: Any) -> tuple[Any, Any, Any]:
         """(env, ix, iy) of patch index ``i``."""

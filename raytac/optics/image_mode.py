@@ -20,6 +20,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.base import OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatLayout
+from raytac.optics.memory import ROUNDING, check_batch, largest_batch
 from raytac.optics.raytrace import RayTracer
 from raytac.optics.recording import no_collection
 from raytac.optics.refraction import Slab
@@ -31,10 +32,6 @@ __all__ = ["HEIGHT_MODE_OUTPUTS", "ImageHeights", "ImageMode", "see_heights"]
 
 HEIGHT_MODE_OUTPUTS = ("rgb", "normals", "depth")
 """Optical outputs of these modes: they know colours, not the light of each LED."""
-_ROUNDING = 2
-"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
-_LARGEST_ARRAY = 2**32 - 1
-"""Dr.Jit indexes with 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -170,22 +167,16 @@ class ImageMode(ABC):
         width, height = self.camera.resolution
         nodes = grid.shape[0] * grid.shape[1] * (5 if self.needs_contact else 4)
         # Heights and displacement, what the mode holds; contact and flags; three channels and their bytes.
-        return _ROUNDING * (nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 2 + 15)))
+        return ROUNDING * (nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 2 + 15)))
 
     def largest_batch(self, grid: PadGrid) -> int:
         """Largest number of environments that one call may render on ``grid``."""
         width, height = self.camera.resolution
-        return min(self._memory // self.memory_per_env(grid), _LARGEST_ARRAY // (4 * max(width * height, grid.rest.size)))
+        return largest_batch(self._memory, self.memory_per_env(grid), 4 * max(width * height, grid.rest.size))
 
     def _check_batch(self, envs: int, grid: PadGrid) -> None:
-        most = self.largest_batch(grid)
-        if envs > most:
-            each = self.memory_per_env(grid) / 1e6
-            rule = (
-                f"must be at most {most}: an environment takes {each:.1f} MB, this {self.device} has {self._memory / 1e9:.1f} GB "
-                "and an array at most 2^32 values; render in parts"
-            )
-            raise InputError("number of environments", value=envs, rule=rule)
+        each = self.memory_per_env(grid)
+        check_batch(envs, self.largest_batch(grid), per_env=each, memory=self._memory, device=self.device)
 
     # ---------------------------------------------------------------- images
 

@@ -1,4 +1,4 @@
-"""How much memory of the device a computation with Dr.Jit needs at its peak."""
+"""Memory of the device: what a computation with Dr.Jit takes at its peak, and how large a batch may be."""
 
 from __future__ import annotations
 
@@ -6,7 +6,36 @@ from collections.abc import Callable
 
 import drjit as dr
 
-__all__ = ["peak_bytes"]
+from raytac.errors import InputError
+
+__all__ = ["ROUNDING", "check_batch", "largest_batch", "peak_bytes"]
+
+ROUNDING = 2
+"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
+_LARGEST_ARRAY = 2**32 - 1
+"""Dr.Jit indexes with 32 bits."""
+
+
+def largest_batch(memory: int, per_env: int, values_per_env: int) -> int:
+    """Most environments that one call may render.
+
+    ``memory`` of the device and ``per_env`` that an environment takes at most [byte]; ``values_per_env``: length of its longest array.
+    """
+    return min(memory // per_env, _LARGEST_ARRAY // values_per_env)
+
+
+def check_batch(envs: int, most: int, *, per_env: int, memory: int, device: str) -> None:
+    """Refuse a batch that would not fit, before Dr.Jit ends the process over it.
+
+    Raises:
+        InputError: more than ``most`` environments; the message gives ``per_env`` and ``memory`` [byte].
+    """
+    if envs > most:
+        rule = (
+            f"must be at most {most}: an environment takes {per_env / 1e6:.1f} MB, this {device} has {memory / 1e9:.1f} GB "
+            "and an array at most 2^32 values; render in parts"
+        )
+        raise InputError("number of environments", value=envs, rule=rule)
 
 
 def peak_bytes(call: Callable[[], object], device: str) -> int:

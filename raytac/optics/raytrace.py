@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.device import total_memory
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS, OpticsImages
@@ -17,6 +18,7 @@ from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.denoise import make_denoiser
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.lamp import Lamp
+from raytac.optics.memory import ROUNDING, check_batch, largest_batch
 from raytac.optics.recording import no_collection
 from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.refraction import Slab
@@ -135,6 +137,7 @@ class RayTracer:
         self._scene_lamps = [Lamp.from_spec(self.mi, led, UNIT) for led in leds]
         self.response = Response(sensor.response, self.camera)
         self._flat_field = None if flat_field is None else self._check_flat_field(flat_field)
+        self._memory = total_memory(self.device)
         self._grid: PadGrid | None = None
 
     def _check_flat_field(self, image: np.ndarray) -> np.ndarray:
@@ -173,6 +176,23 @@ class RayTracer:
             self.response.set_flat_field(self._flat_field, total(self._layers(rest))[0])
         self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
         self._grid = grid
+
+    # ---------------------------------------------------------------- memory
+
+    def memory_per_env(self, grid: PadGrid) -> int:
+        """Most device memory that an environment of a ``fast`` batch on ``grid`` takes [byte]: the field at the nodes, the images."""
+        width, height = self.camera.resolution
+        # A node has its height, a normal, corners packed for one gather and its share of the tiles' bounds; a pixel has its channels, the
+        # image in linear light and in bytes, and where it looks.
+        nodes, pixels = grid.rest.size * 32, width * height * (4 * 3 * len(self.layer_names) + 15 + 24)
+        channels = 3 * len(self.layer_names)
+        indirect = BounceField.memory_per_env(CoatLayout.from_grid(grid), channels) if self.bounce else 0
+        return ROUNDING * (nodes + pixels + indirect)
+
+    def largest_batch(self, grid: PadGrid) -> int:
+        """Largest number of environments that one call of ``fast`` may render on ``grid``; sampled images take one at a time."""
+        width, height = self.camera.resolution
+        return largest_batch(self._memory, self.memory_per_env(grid), max(4 * grid.rest.size, 3 * width * height))
 
     # ---------------------------------------------------------------- images
 
@@ -224,6 +244,11 @@ class RayTracer:
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
         check_shapes(surface)
+        if self.integrator == "fast" or {"normals", "depth"} & set(self.outputs):
+            each = self.memory_per_env(surface.grid)
+            check_batch(
+                len(surface.height), self.largest_batch(surface.grid), per_env=each, memory=self._memory, device=self.device
+            )
         self._prepare(surface.grid)
         return safe_heights(surface)
 

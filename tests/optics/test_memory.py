@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from raytac.errors import InputError
+from raytac.optics.memory import peak_bytes
 from tests.optics.conftest import Build
 from tests.optics.scenes import ball, grid_of, like_a_mini, surface
 
@@ -60,3 +62,29 @@ def test_30_reference_updates_hold_memory_flat(tracer: Build) -> None:
 )
 def test_2000_updates_hold_memory_flat(tracer: Build, options: dict) -> None:
     assert growth_mb(tracer, 2000, **options) < 20
+
+
+@pytest.mark.parametrize("layers", ["colour", "led"])
+@pytest.mark.parametrize("outputs", [("rgb",), ("rgb", "layers", "normals", "depth")])
+def test_memory_of_an_environment_is_what_is_stated(tracer: Build, layers: str, outputs: tuple[str, ...]) -> None:
+    """The peak of Dr.Jit's own arrays stays below what is stated, and that is no wild guess."""
+    spec = like_a_mini()
+    grid = grid_of(spec)
+    mode = tracer(spec, layers=layers, outputs=outputs)
+    height, contact = ball(grid)
+    for envs in (1, 3, 5):  # the allocator's powers of two suit some batches better than others
+        batch = surface(grid, *[height] * envs, contact=contact)
+        mode.render(batch)
+        peak = peak_bytes(lambda batch=batch: mode.render(batch), "cpu")
+        assert 0.3 * envs * mode.memory_per_env(grid) < peak <= envs * mode.memory_per_env(grid)
+
+
+def test_a_batch_that_does_not_fit_is_refused(tracer: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = like_a_mini()
+    grid = grid_of(spec)
+    mode = tracer(spec)
+    monkeypatch.setattr(mode, "_memory", 5 * mode.memory_per_env(grid) // 2)
+    assert mode.largest_batch(grid) == 2
+    mode.render(surface(grid, grid.rest, grid.rest))
+    with pytest.raises(InputError, match="must be at most 2: an environment takes"):
+        mode.render(surface(grid, grid.rest, grid.rest, grid.rest))
