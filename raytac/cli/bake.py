@@ -21,7 +21,8 @@ class BakeArgs(CommonOptions):
     """Calibrate a Taxim table on the ray tracer of a sensor: virtual presses of balls and pins, fitted by slope.
 
     Writes the table as a calibration folder that the package taxim reads too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz,
-    params.json, raytac.npz), coverage.png, sheet.png and metrics.json, and keeps it in the cache, from where optics taxim takes it.
+    params.json, raytac.npz), coverage.png, sheet.png and metrics.json, and keeps it in the cache, from where optics taxim takes it if it is
+    of the sensor's own resolution and not of --quick. Without --out the folder is runs/bake/SENSOR, with --quick runs/bake/SENSOR-quick.
     An error or Ctrl-C leaves folder and cache as they were.
     """
 
@@ -32,7 +33,7 @@ class BakeArgs(CommonOptions):
     scenes: str = "sphere,coin,pins"
     """Shipped press scenes or scene files, joined by commas, on which the table is compared with the ray tracer."""
     quick: bool = False
-    """Few presses and coarse bins, in seconds: shows that all runs; a poor table."""
+    """Few presses and coarse bins, in seconds: shows that all runs; a poor table, which only --calibration FOLDER uses."""
 
     def run(self) -> int:
         from raytac.optics.bake_settings import BakeSettings
@@ -42,7 +43,7 @@ class BakeArgs(CommonOptions):
         sensor = load_sensor(self.sensor)
         paths = run_bake(
             sensor,
-            self.out if self.out is not None else Path("runs") / "bake" / sensor.name,
+            self.out if self.out is not None else Path("runs") / "bake" / (sensor.name + ("-quick" if self.quick else "")),
             settings=BakeSettings.quick() if self.quick else BakeSettings(),
             scenes=parse_names(self.scenes, "scenes"),
             device=self.device,

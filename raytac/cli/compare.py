@@ -44,10 +44,11 @@ class CompareArgs(CommonOptions):
         settings.check()
         try:
             comparison = run_comparison(settings, out)
+            written = write_comparison(comparison, out, time.perf_counter() - start)
         except KeyboardInterrupt:
             print(f"raytac: interrupted; finished rows are kept in {out}, the same command goes on from there", file=sys.stderr)
             return 130
-        for path in write_comparison(comparison, out, time.perf_counter() - start):
+        for path in written:
             print(path)
         return 0
 

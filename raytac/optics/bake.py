@@ -7,6 +7,7 @@ image at rest are what the bin's polynomial is fitted to (docs/taxim-table.md, *
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -80,6 +81,8 @@ def baked_table(
     folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
     table = cached(folder)
     if table is None:
+        if progress:
+            print(f"raytac: no table of {sensor.name} yet, so it is baked once and kept in {folder.parent}", file=sys.stderr)
         keep(bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress), folder)
         # What later processes will read, to the last bit.
         table = load_calibration(folder)
@@ -123,7 +126,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     settings = BakeSettings() if settings is None else settings
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
     images = settings.images + 6 * settings.pins
-    with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=not progress) as bar:
+    with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
         sums = BinSums(settings.n_bins, camera.resolution)
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
             add_samples(sums, views, at.rest_image)
