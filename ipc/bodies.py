@@ -74,7 +74,7 @@ class AffineBody:
 
     name: str
     surface: TriMesh
-    material: Stiff = Stiff()
+    material: Stiff = field(default_factory=Stiff)
     pose: Pose = Pose()
 
 

@@ -85,7 +85,7 @@ def stretch_block_definite(s: wp.vec3d, m: wp.float64, k: wp.float64, lam: wp.fl
 @wp.func
 def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.float64:
     """The c' between 0 and c closest to c for which the element's second derivative is positive semi-definite."""
-    U, s, V = wp.svd3(F)
+    _U, s, _V = wp.svd3(F)
     top = wp.max(wp.max(wp.abs(s[0]), wp.abs(s[1])), wp.abs(s[2]))
     limit = m / wp.max(top, wp.float64(1.0e-30))  # twist and flip modes: m ± c s_i ≥ 0
     high = wp.clamp(c, -limit, limit)

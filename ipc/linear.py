@@ -15,7 +15,7 @@ import warp as wp
 
 from ipc.contact import Contacts, mat34d
 
-__all__ = ["BlockJacobi", "Pcg", "Preconditioner", "SystemView", "row_sum"]
+__all__ = ["BlockJacobi", "Pcg", "Preconditioner", "SystemView", "row_column", "row_sum"]
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,7 +1,7 @@
 """One time step: driven bodies advance as far as they can, projected Newton finds the state of least incremental potential.
 
-Each Newton iteration (i) moves the driven frames towards their targets while no gap shrinks by more than ``motion_fraction``,
-(ii) solves H p = −g by PCG, with the exact Hessian first and a positive semi-definite one once negative curvature is met (the
+Each Newton iteration (i) tells the linear system where driven frames are going, so that the unknowns move out of their way in the same
+step, and takes that step as far as gaps allow, until the frames have arrived; (ii) solves H p = −g by PCG, with the exact Hessian first and a positive semi-definite one once negative curvature is met (the
 on-demand projection of Longva et al. 2023, "Pitfalls of Projection"), (iii) limits the step by continuous collision detection,
 (iv) halves it until the energy falls enough and no tetrahedron is inverted. An environment is done when p is small, the whole step was
 taken and its frames have arrived, or are blocked. Environments never wait on or change each other's arithmetic: every decision is a
@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ipc import dynamics, elasticity
 from ipc.collision import Collision
+from ipc.contact import Contacts
 from ipc.layout import Layout
-from ipc.linear import BlockJacobi, Pcg, Preconditioner, SystemView, row_sum
+from ipc.linear import BlockJacobi, Pcg, Preconditioner, SystemView, row_column, row_sum
 from ipc.settings import Settings
 
 __all__ = ["Newton", "StepCounts"]
@@ -32,7 +34,9 @@ CCD_SLACK = 0.1
 GAP_FLOOR = 0.01
 """Driven bodies may not close a gap below this share of d̂; the soft side is given time to yield first."""
 BLOCKED_ADVANCE = 1e-4
-"""Frames that advance by less than this share of their motion while nothing else moves are blocked."""
+"""Frames that advance by less than this share of their motion although everything else had come to rest are blocked."""
+POOR_ADVANCE = 0.05
+"""Below this share of what was left, the unknowns get time to rest before the frames try again."""
 
 
 @wp.kernel
@@ -92,7 +96,35 @@ def judge(
 
 
 @wp.kernel
-def take(y1: wp.array2d(dtype=wp.vec3d), mask: wp.array(dtype=wp.int32), y: wp.array2d(dtype=wp.vec3d)):
+def push_rows(
+    system: SystemView,
+    contacts: Contacts,
+    dx: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    residual: wp.array2d(dtype=wp.vec3d),
+):
+    """residual −= Σ q (q·dx) with vertex motions dx, on the unknowns."""
+    env, r = wp.tid()
+    if active[env] == 0 or r >= contacts.row_count[env]:
+        return
+    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    s = wp.float64(0.0)
+    for k in range(4):
+        if verts[k] >= 0:
+            s += wp.dot(row_column(row, k), dx[env, verts[k]])
+    for k in range(4):
+        v = verts[k]
+        if v >= 0:
+            q = s * (wp.transpose(system.R[env, system.vert_body[v]]) * row_column(row, k))
+            for m in range(system.vert_count[v]):
+                node = system.vert_nodes[v, m]
+                if system.free[node] != 0:
+                    wp.atomic_sub(residual, env, node, system.vert_weight[v, m] * q)
+
+
+@wp.kernel
+def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2d(dtype=Any)):
     """y = y1 where the mask is set."""
     env, i = wp.tid()
     if mask[env] != 0:
@@ -249,8 +281,8 @@ class Newton:
         """World positions of the nodes."""
         self._launch(dynamics.node_world, out.shape, [self.y, self.R, self.t, self.node_body], [out])
 
-    def _aim_inertia(self) -> None:
-        inputs = [self.target, self.xw, self.R, self.t, self.node_body]
+    def _aim_inertia(self, R: wp.array, t: wp.array) -> None:
+        inputs = [self.target, self.xw, R, t, self.node_body]
         self._launch(dynamics.inertia_target, self.xw.shape, inputs, [self.local_target, self.local_start])
 
     # --- parts of a step -------------------------------------------------------------------------------------------------------
@@ -325,32 +357,63 @@ class Newton:
         """A device mask of the environments of ``mask`` (B,)."""
         return wp.array(mask.astype(np.int32), dtype=wp.int32, device=self.device)
 
-    def _advance_frames(self, share: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Move frames towards their targets as far as gaps allow; returns the new share (B,)."""
-        trial = np.where(active, 1.0, share)
-        mask = self.device_mask(active)
-        for attempt in range(6):
+    def _aim_frames(self, share: np.ndarray, travelling: np.ndarray) -> None:
+        """Let the linear system know where the frames of the travelling environments go.
+
+        Their inertia is taken at the targets, and ``x1`` − ``x`` becomes the motion that the contact rows will feel (see _push_ahead).
+        """
+        self.share1.assign(np.where(travelling, 1.0, share))
+        self.set_frames(self.share1, self.R1, self.t1)
+        self.place_vertices(self.y, self.R1, self.t1, self.x1)
+        self._launch(difference, self.x.shape, [self.x1, self.x], [self.dx])
+        self._aim_inertia(self.R1, self.t1)
+
+    def _push_ahead(self, travelling: np.ndarray) -> None:
+        """Residual −= Σ q (q·dx): what moves under orders pushes the unknowns ahead in the linear model."""
+        if self.collision.row_most:
+            inputs = [self.system, self.collision.contacts, self.dx, self.device_mask(travelling)]
+            self._launch(push_rows, (self.batch, self.collision.row_most), inputs, [self.residual])
+
+    def _travel(self, share: np.ndarray, travelling: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Move frames and unknowns together as far as gaps allow; returns the new share and the length taken, both (B,).
+
+        The energy is not asked: it is another one at the new frames. What counts is that gaps stay open and no element inverts.
+        """
+        since = time.perf_counter()
+        mask = self.device_mask(travelling)
+        length = np.where(travelling, 1.0, 0.0)
+        for attempt in range(8):
+            trial = np.where(travelling, share + length * (1.0 - share), share)
+            trial = np.where(length == 1.0, 1.0, trial)
             self.share1.assign(trial)
+            self.alpha.assign(length)
             self.set_frames(self.share1, self.R1, self.t1)
-            self.place_vertices(self.y, self.R1, self.t1, self.x1)
+            self._launch(dynamics.advance_nodes, self.y.shape, [self.y, self.p, self.alpha, self.y1])
+            self.place_vertices(self.y1, self.R1, self.t1, self.x1)
             self._launch(difference, self.x.shape, [self.x1, self.x], [self.dx])
             self.collision.refresh(self.x, self.dx, mask)
             self.alpha.fill_(1.0)
+            # A shortened motion ends where a gap is about used up: it is looked at again (a turning frame's way is no straight line),
+            # with half the limit, or rounding would refuse what was just allowed.
+            ease = 1.0 if attempt == 0 else 0.5
             self.collision.limit_step(
                 *(self.x, self.dx, (self.R, self.t), (self.R1, self.t1)),
-                *(1.0 - self.settings.motion_fraction, GAP_FLOOR * self.collision.d_hat, mask, self.alpha),
+                *(ease * (1.0 - self.settings.motion_fraction), ease * GAP_FLOOR * self.collision.d_hat, mask, self.alpha),
             )
-            alpha = np.where(active, self.alpha.numpy(), 1.0)
+            self.min_det.fill_(np.inf)
+            inputs = [self.y, self.y1, self.tets, self.grads, *self.elastic, mask]
+            self._launch(elasticity.element_energy_change, self.el_change.shape, inputs, [self.el_change, self.min_det])
+            alpha = np.where(travelling, self.alpha.numpy(), 1.0)
+            alpha = np.where(travelling & ~(self.min_det.numpy() > 0), 0.5 * alpha, alpha)
             if (alpha >= 1.0).all():
                 break
-            # The share that would fit on a straight line; a turning frame is looked at again, since its way is none.
-            shorter = alpha * (1.0 - 1e-9) if attempt < 3 else 0.0
-            trial = np.where(alpha < 1.0, share + (trial - share) * shorter, trial)
-        wp.copy(self.R, self.R1)
-        wp.copy(self.t, self.t1)
-        wp.copy(self.x, self.x1)
-        self._aim_inertia()
-        return trial
+            length = length * np.where(alpha >= 1.0, 1.0, alpha * (1.0 - 1e-9) if attempt < 6 else 0.0)
+        # Environments that stay have their old y and frames in y1 and R1.
+        for old, new in ((self.y, self.y1), (self.x, self.x1), (self.R, self.R1), (self.t, self.t1)):
+            self._launch(take, old.shape, [new, mask], [old])
+        self._aim_inertia(self.R, self.t)
+        self._timed("travel", since)
+        return trial, length
 
     def _line_search(self, active: np.ndarray, counts: StepCounts) -> np.ndarray:
         """Take the step p as far as contacts, energy and inversion allow; returns the length taken (B,), 0 where none was."""
@@ -450,7 +513,7 @@ class Newton:
         self.inertia_scale.assign(1.0 / h2)
         inputs = [self.xw, self.v, self.xw_before, self.v_before, self.second_order, self.acceleration, settings.dt]
         self._launch(dynamics.predict, self.xw.shape, inputs, [self.target])
-        self._aim_inertia()
+        self._aim_inertia(self.R, self.t)
         if self.collision.friction:
             self.dx.zero_()
             self.collision.refresh(self.x, self.dx, self.active)
@@ -506,19 +569,21 @@ class Newton:
         failed = np.zeros(self.batch, bool)
         counts.converged = np.where(active, False, counts.converged)
         used = np.zeros(self.batch, np.int64)
+        # Frames on their way: a poor advance is followed by plain iterations until the unknowns rest, then by one more try.
+        poor, rested, ready = np.zeros(self.batch, bool), np.zeros(self.batch, bool), np.ones(self.batch, bool)
         while active.any():
             since = time.perf_counter()
-            before = share
-            travelling = active & (share < 1.0)
-            if travelling.any():
-                share = self._advance_frames(share, travelling)
-            since = self._timed("frames", since)
             mask = self.device_mask(active)
             self.dx.zero_()
             self.collision.refresh(self.x, self.dx, mask)
             since = self._timed("broad", since)
+            travelling = active & (share < 1.0) & ready & (~poor | rested)
+            if travelling.any():
+                self._aim_frames(share, travelling)
             self.assemble(mask)
             self._note_extremes(active, counts)
+            if travelling.any():
+                self._push_ahead(travelling)
             self._timed("forces", since)
             counts.linear += self._solve(active)
             self.size.zero_()
@@ -527,13 +592,29 @@ class Newton:
             bad = self.bad.numpy().astype(bool) & active
             failed |= bad
             active &= ~bad
+            travelling &= ~bad
             speed = self.size.numpy() / settings.dt
             counts.residual_speed = np.where(active, speed, counts.residual_speed)
-            alpha = self._line_search(active, counts) if active.any() else np.zeros(self.batch)
             counts.newton += active
             used += active
+            blocked = np.zeros(self.batch, bool)
+            if travelling.any():
+                before = share
+                share, length = self._travel(share, travelling)
+                blocked = travelling & poor & (share - before < BLOCKED_ADVANCE)
+                poor = np.where(travelling, length < POOR_ADVANCE, poor)
+                rested &= ~travelling
+                ready &= ~travelling
+                active &= ~blocked
+                counts.converged |= blocked
+            plain = active & ~travelling
+            if not plain.any():
+                active &= used < settings.max_newton
+                continue
+            alpha = self._line_search(plain, counts)
+            ready |= plain
             # A search that found nothing: try again with a definite matrix; if it was definite, this is as far as it goes.
-            stuck = active & (alpha == 0.0)
+            stuck = plain & (alpha == 0.0)
             if stuck.any():
                 project = self.project.numpy().copy()
                 give_up = stuck & ((project != 0) | (speed <= settings.velocity_tolerance))
@@ -542,10 +623,9 @@ class Newton:
                 active &= ~give_up
                 project[stuck] = 1
                 self.project.assign(project)
-            still = (speed <= settings.velocity_tolerance) & (alpha >= 1.0)
-            arrived = share >= 1.0
-            blocked = ~arrived & (share - before < BLOCKED_ADVANCE)
-            done = active & still & (arrived | blocked)
+            still = plain & (speed <= settings.velocity_tolerance) & (alpha >= 1.0)
+            rested |= still
+            done = active & still & (share >= 1.0)
             counts.converged |= done
             active &= ~done
             active &= used < settings.max_newton

@@ -322,7 +322,7 @@ class World:
         """Points and forces on a half-space: the reactions of its contacts, friction included, (B, n, 3)."""
         solver = self._solver
         collision = solver.collision
-        forces = np.zeros(solver.x.shape + (3,))
+        forces = np.zeros((*solver.x.shape, 3))
         plane_of = self.layout.pairs[:, 1]
         found, lagged = collision.contacts, collision.lagged
         x, start = solver.x.numpy(), solver.x_start.numpy()
