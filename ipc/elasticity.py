@@ -102,6 +102,29 @@ def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64
 
 
 @wp.func
+def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
+    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that near rest it is not the small difference of large numbers."""
+    one, half = wp.float64(1.0), wp.float64(0.5)
+    G = F1 - F0
+    if model == 2:
+        eye = wp.identity(n=3, dtype=wp.float64)
+        sum_of = F0 * wp.transpose(F0) + F1 * wp.transpose(F1) - wp.float64(2.0) * eye
+        return mu * wp.ddot(G * wp.transpose(F1) + F0 * wp.transpose(G), sum_of)
+    ic = wp.ddot(G, F0 + F1)
+    # det(F0 + G) − det F0, term by term
+    J = wp.ddot(cofactor(F0), G) + wp.ddot(F0, cofactor(G)) + wp.determinant(G)
+    both = wp.determinant(F0) + wp.determinant(F1)
+    if model == 1:
+        a = one + wp.float64(0.75) * mu / lam
+        z = ic / (wp.ddot(F0, F0) + one)
+        log1p = wp.log(one + z)
+        if wp.abs(z) < wp.float64(1.0e-3):
+            log1p = z * (one - z * (half - z * (wp.float64(1.0 / 3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a)
+    return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0))
+
+
+@wp.func
 def deformation(
     env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), tets: wp.array2d(dtype=wp.int32), grads: wp.array2d(dtype=wp.vec3d)
 ) -> wp.mat33d:
@@ -236,5 +259,5 @@ def element_energy_change(
         return
     F0 = deformation(env, e, y0, tets, grads)
     F1 = deformation(env, e, y1, tets, grads)
-    change[env, e] = volume[e] * (strain_energy(F1, model[e], mu[e], lam[e]) - strain_energy(F0, model[e], mu[e], lam[e]))
+    change[env, e] = volume[e] * strain_energy_change(F0, F1, model[e], mu[e], lam[e])
     wp.atomic_min(min_det, env, wp.determinant(F1))

@@ -250,6 +250,7 @@ class Newton:
         self.inertia_scale, self.alpha, self.slope, self.change, self.noise = (numbers() for _ in range(5))
         self.min_det, self.size, self.barrier_energy, self.elastic_energy = (numbers() for _ in range(4))
         self.active, self.project, self.bad, self.searching, self.trials, self.mask = (flags() for _ in range(6))
+        self.reach = 0.0
         self.timers: dict[str, float] = {}
 
     # --- small helpers ---------------------------------------------------------------------------------------------------------
@@ -415,8 +416,12 @@ class Newton:
         self._timed("travel", since)
         return trial, length
 
-    def _line_search(self, active: np.ndarray, counts: StepCounts) -> np.ndarray:
-        """Take the step p as far as contacts, energy and inversion allow; returns the length taken (B,), 0 where none was."""
+    def _line_search(self, active: np.ndarray, counts: StepCounts) -> tuple[np.ndarray, np.ndarray]:
+        """Take the step p as far as contacts, energy and inversion allow.
+
+        Returns:
+            The length taken, 0 where none was, and the length that contacts allowed; both (B,).
+        """
         since = time.perf_counter()
         self.mask.assign(active.astype(np.int32))
         self._launch(dynamics.vertex_motion, self.x.shape, [self.p, self.R, *self.vert_map], [self.dx])
@@ -425,15 +430,18 @@ class Newton:
         self.alpha.fill_(1.0)
         frames = (self.R, self.t)
         self.collision.limit_step(self.x, self.dx, frames, frames, CCD_SLACK, 0.0, self.mask, self.alpha)
-        counts.ccd = np.where(active, np.minimum(counts.ccd, self.alpha.numpy()), counts.ccd)
+        allowed = self.alpha.numpy().copy()
+        counts.ccd = np.where(active, np.minimum(counts.ccd, allowed), counts.ccd)
         since = self._timed("ccd", since)
         self._launch(slope_of, self.p.shape, [self.p, self.gradient, self.mask], [self.node_change])
         self.slope.zero_()
         row_sum(self.node_change, self.mask, self.slope)
         self.elastic_energy.zero_()
         row_sum(self.el_energy, self.mask, self.elastic_energy)
-        # Rounding of the energies themselves; only steps of that size are accepted without a true decrease.
-        self.noise.assign(1e-14 * (np.abs(self.elastic_energy.numpy()) + np.abs(self.barrier_energy.numpy())))
+        # Rounding of the energies themselves, and of gaps between coordinates of size L: only steps of that size are accepted without
+        # a true decrease.
+        reach = 1.0 + self.reach / self.collision.d_hat
+        self.noise.assign(1e-14 * np.abs(self.elastic_energy.numpy()) + 1e-15 * reach * np.abs(self.barrier_energy.numpy()))
         wp.copy(self.searching, self.mask)
         self.trials.zero_()
         for _ in range(self.settings.max_line_search):
@@ -464,7 +472,7 @@ class Newton:
         self._launch(take, self.y.shape, [self.y1, self.mask], [self.y])
         self._launch(take, self.x.shape, [self.x1, self.mask], [self.x])
         self._timed("line_search", since)
-        return np.where(taken, self.alpha.numpy(), 0.0)
+        return np.where(taken, self.alpha.numpy(), 0.0), allowed
 
     def _note_extremes(self, active: np.ndarray, counts: StepCounts) -> None:
         """Least gap and determinant of the state just assembled."""
@@ -514,6 +522,7 @@ class Newton:
         inputs = [self.xw, self.v, self.xw_before, self.v_before, self.second_order, self.acceleration, settings.dt]
         self._launch(dynamics.predict, self.xw.shape, inputs, [self.target])
         self._aim_inertia(self.R, self.t)
+        self.reach = float(np.abs(np.nan_to_num(self.x.numpy())).max(initial=0.0))
         if self.collision.friction:
             self.dx.zero_()
             self.collision.refresh(self.x, self.dx, self.active)
@@ -611,19 +620,19 @@ class Newton:
             if not plain.any():
                 active &= used < settings.max_newton
                 continue
-            alpha = self._line_search(plain, counts)
+            alpha, allowed = self._line_search(plain, counts)
             ready |= plain
             # A search that found nothing: try again with a definite matrix; if it was definite, this is as far as it goes.
             stuck = plain & (alpha == 0.0)
             if stuck.any():
                 project = self.project.numpy().copy()
-                give_up = stuck & ((project != 0) | (speed <= settings.velocity_tolerance))
-                counts.stalled |= give_up & (speed > settings.velocity_tolerance)
-                counts.converged |= give_up & (speed <= settings.velocity_tolerance) & (share >= 1.0)
+                give_up = stuck & (project != 0) & (speed > settings.velocity_tolerance)
+                counts.stalled |= give_up
                 active &= ~give_up
                 project[stuck] = 1
                 self.project.assign(project)
-            still = plain & (speed <= settings.velocity_tolerance) & (alpha >= 1.0)
+            # A step this small has arrived, also where rounding of the energies kept it from being taken.
+            still = plain & (speed <= settings.velocity_tolerance) & (allowed >= 1.0)
             rested |= still
             done = active & still & (share >= 1.0)
             counts.converged |= done
