@@ -66,7 +66,7 @@ def additive_ccd(
         if t_next >= t_max:
             return t_max
         d = pair_distance(ee, x0 + t_next * d0, x1 + t_next * d1, x2 + t_next * d2, x3 + t_next * d3)
-        if d <= gap * wp.float64(1.0 + 1.0e-3) or t_next - t < wp.float64(1.0e-6):
+        if d <= gap * wp.float64(1.001) or t_next - t < wp.float64(1.0e-6):
             if d > gap:
                 return t_next
             return t

@@ -48,7 +48,7 @@ def frames_at(
         sign = wp.float64(-1.0)
     q1 = sign * end_q[env, b]
     q = sign * end_q[env, b]
-    if s < wp.float64(1.0) and wp.dot(q0, q1) < wp.float64(1.0 - 1.0e-14):
+    if s < wp.float64(1.0) and wp.dot(q0, q1) < wp.float64(0.99999999999999):
         q = wp.normalize(wp.quat_slerp(q0, q1, s))
     now_q[env, b] = q
     R[env, b] = wp.quat_to_matrix(q)
@@ -128,7 +128,7 @@ def predict(
     """x̃ of the nodes, world frame."""
     env, i = wp.tid()
     if second_order[env] != 0:
-        a, b = wp.float64(1.0 / 3.0), wp.float64(2.0 / 9.0)
+        a, b = wp.float64(1.0) / wp.float64(3.0), wp.float64(2.0) / wp.float64(9.0)
         four = wp.float64(4.0)
         target[env, i] = (
             a * (four * xw[env, i] - xw_before[env, i])
@@ -178,12 +178,17 @@ def node_gradient(
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     residual: wp.array2d(dtype=wp.vec3d),
+    force_size: wp.array2d(dtype=wp.float64),
 ):
-    """Adds inertia, drag and contact to the elastic gradient; the residual is its negative on the unknowns, zero on bonded nodes."""
+    """Adds inertia, drag and contact to the elastic gradient; the residual is its negative on the unknowns, zero on bonded nodes.
+
+    ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
+    """
     env, i = wp.tid()
     if active[env] == 0:
         return
     g = gradient[env, i]
+    elastic = wp.length(g)
     for k in range(row_start[i], row_start[i + 1]):
         j = col[k]
         if mass[k] != wp.float64(0.0):
@@ -192,6 +197,7 @@ def node_gradient(
     for k in range(node_vert_start[i], node_vert_start[i + 1]):
         contact += node_vert_weight[k] * vert_gradient[env, node_vert[k]]
     g += wp.transpose(R[env, node_body[i]]) * contact
+    force_size[env, i] = elastic + wp.length(contact)
     gradient[env, i] = g
     if node_free[i] != 0:
         residual[env, i] = -g

@@ -119,7 +119,7 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
         z = ic / (wp.ddot(F0, F0) + one)
         log1p = wp.log(one + z)
         if wp.abs(z) < wp.float64(1.0e-3):
-            log1p = z * (one - z * (half - z * (wp.float64(1.0 / 3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+            log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
         return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a)
     return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0))
 

@@ -238,7 +238,7 @@ class Newton:
         self.el_F, self.el_P = (wp.zeros((batch, self.elements), dtype=wp.mat33d, device=device) for _ in range(2))
         self.el_mck = vectors(self.elements)
         self.el_J, self.el_energy, self.el_change = (numbers(batch, self.elements) for _ in range(3))
-        self.node_change = numbers(batch, self.nodes)
+        self.node_change, self.force_size = numbers(batch, self.nodes), numbers(batch, self.nodes)
         self.system = SystemView()
         self.system.row_start, self.system.col, self.system.diagonal = self.row_start, self.col, const(diagonal, wp.int32)
         self.system.free, self.system.node_body = self.node_free, self.node_body
@@ -248,7 +248,7 @@ class Newton:
         self.pcg = Pcg(batch, self.nodes, device)
         self.preconditioner: Preconditioner = BlockJacobi(batch, self.nodes, device)
         self.inertia_scale, self.alpha, self.slope, self.change, self.noise = (numbers() for _ in range(5))
-        self.min_det, self.size, self.barrier_energy, self.elastic_energy = (numbers() for _ in range(4))
+        self.min_det, self.size, self.barrier_energy = (numbers() for _ in range(3))
         self.active, self.project, self.bad, self.searching, self.trials, self.mask = (flags() for _ in range(6))
         self.reach = 0.0
         self.timers: dict[str, float] = {}
@@ -312,7 +312,7 @@ class Newton:
             *(self.y, self.local_target, self.local_start, self.row_start, self.col, self.mass, self.drag, self.inertia_scale),
             *(self.vert_gradient, self.R, self.node_body, self.node_free, *self.followers, active),
         ]
-        self._launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual])
+        self._launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
     def _fill_matrix(self, active: wp.array) -> None:
         inputs = [
@@ -436,12 +436,10 @@ class Newton:
         self._launch(slope_of, self.p.shape, [self.p, self.gradient, self.mask], [self.node_change])
         self.slope.zero_()
         row_sum(self.node_change, self.mask, self.slope)
-        self.elastic_energy.zero_()
-        row_sum(self.el_energy, self.mask, self.elastic_energy)
-        # Rounding of the energies themselves, and of gaps between coordinates of size L: only steps of that size are accepted without
-        # a true decrease.
-        reach = 1.0 + self.reach / self.collision.d_hat
-        self.noise.assign(1e-14 * np.abs(self.elastic_energy.numpy()) + 1e-15 * reach * np.abs(self.barrier_energy.numpy()))
+        # Rounding of positions moves the energy by force × size × 1e-16: only steps of that effect are accepted without a true decrease.
+        self.noise.zero_()
+        row_sum(self.force_size, self.mask, self.noise)
+        self.noise.assign(1e-15 * self.reach * self.noise.numpy())
         wp.copy(self.searching, self.mask)
         self.trials.zero_()
         for _ in range(self.settings.max_line_search):

@@ -36,21 +36,24 @@ def block_on_slope(mu: float, kind: str, theta: float = THETA, dt: float = 0.01)
 
 
 @pytest.mark.parametrize("kind", ["affine", "soft"])
-@pytest.mark.parametrize(("mu", "share"), [(0.5, 1.0), (0.8, 0.625)])
-def test_block_sticks_with_the_creep_of_the_mollifier(kind: str, mu: float, share: float) -> None:
-    """Under the share r of its friction limit it creeps at ε_v (1 − √(1 − r))."""
+@pytest.mark.parametrize("mu", [0.5, 0.51, 0.8])
+def test_block_sticks_with_the_creep_of_the_mollifier(kind: str, mu: float) -> None:
+    """Under the share r of its friction limit it creeps at ε_v (1 − √(1 − r)); at r = 1 exactly it keeps a speed of the size of ε_v."""
     world = block_on_slope(mu, kind, theta=0.0)
-    for k in range(40):
-        # Pressed on first, pulled along after: at the threshold itself nothing would stop a block that once slid.
-        world.set_gravity((9.81 * np.sin(THETA) if k >= 15 else 0.0, 0.0, -9.81 * np.cos(THETA)))
+    speeds = []
+    for k in range(50):
+        # Pressed on first, pulled along little by little: at the threshold itself nothing would stop a block that once slid.
+        world.set_gravity((9.81 * np.sin(THETA) * np.clip((k - 10) / 25, 0, 1), 0.0, -9.81 * np.cos(THETA)))
+        before = world.positions("block")[0].mean(axis=0)[0]
         report = world.step()
+        speeds.append((world.positions("block")[0].mean(axis=0)[0] - before) / world.settings.dt)
         assert report.converged[0] and report.min_gap[0] > 0
-    before = world.positions("block")[0].mean(axis=0)
-    for _ in range(10):
-        world.step()
-    speed = (world.positions("block")[0].mean(axis=0) - before)[0] / (10 * world.settings.dt)
-    predicted = 1e-4 * (1 - np.sqrt(1 - share))
-    assert speed == pytest.approx(predicted, rel=0.02 if share < 1 else 0.1), f"creeps at {speed:.4g} m/s"
+    predicted = 1e-4 * (1 - np.sqrt(1 - 0.5 / mu))
+    if mu == 0.5:
+        assert predicted <= speeds[-1] < 2 * predicted
+        assert speeds[-1] == pytest.approx(speeds[-6], rel=0.01)
+    else:
+        assert speeds[-1] == pytest.approx(predicted, rel=0.02)
 
 
 @pytest.mark.parametrize("kind", ["affine", "soft"])
@@ -100,20 +103,20 @@ def test_collision_keeps_momentum_and_energy_never_rises() -> None:
 
 @pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("bdf2", 2)])
 def test_fall_and_order_of_convergence(integrator: str, order: int) -> None:
-    """A soft bar clamped at one end and let go: the tip's way converges with the order of the integrator."""
-    mesh = ipc.box_mesh(np.linspace(0, 0.03, 4), [0.0, 0.01], [0.0, 0.01])
+    """A soft cube bonded on one side and let go: the other side's way converges with the order of the integrator."""
+    mesh = ipc.box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
     tips = []
-    for steps in (20, 40, 80):
+    for steps in (10, 20, 40):
         settings = ipc.Settings(
             dt=0.02 / steps, gravity=(0, 0, -2.0), integrator=integrator, velocity_tolerance=1e-10, linear_tolerance=1e-8
         )
         bonded = ipc.vertices_in_box(mesh, (0, -1, -1), (0, 1, 1))
-        world = ipc.World([ipc.SoftBody("bar", mesh, ipc.Material(2e4, 0.3), bonded=bonded)], settings, device="cpu")
+        world = ipc.World([ipc.SoftBody("bar", mesh, ipc.Material(2e3, 0.3), bonded=bonded)], settings, device="cpu")
         for _ in range(steps):
             world.step()
         tips.append(world.positions("bar")[0, -1])
     rate = np.log2(np.linalg.norm(tips[1] - tips[0]) / np.linalg.norm(tips[2] - tips[1]))
-    assert np.linalg.norm(tips[0] - mesh.vertices[-1]) > 1e-4
+    assert np.linalg.norm(tips[0] - mesh.vertices[-1]) > 5e-5
     assert rate == pytest.approx(order, abs=0.35), f"order {rate:.2f}"
 
 
