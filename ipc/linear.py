@@ -95,19 +95,16 @@ def row_column(row: mat34d, k: wp.int32) -> wp.vec3d:
     return wp.vec3d(row[0, k], row[1, k], row[2, k])
 
 
-@wp.kernel
-def multiply_rows(
+@wp.func
+def add_row(
     system: SystemView,
     contacts: Contacts,
+    env: wp.int32,
+    r: wp.int32,
     p: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
     out: wp.array2d(dtype=wp.vec3d),
 ):
-    """out += Σ q (q·p); bonded nodes have p = 0 and get nothing."""
-    env, r = wp.tid()
-    if active[env] == 0 or r >= contacts.row_count[env]:
-        return
+    """out += q (q·p) of row r, on the unknowns."""
     verts, row = contacts.row_verts[env, r], contacts.row[env, r]
     s = wp.float64(0.0)
     for k in range(4):
@@ -127,6 +124,22 @@ def multiply_rows(
                     node = system.vert_nodes[v, m]
                     if system.free[node] != 0:
                         wp.atomic_add(out, env, node, system.vert_weight[v, m] * q)
+
+
+@wp.kernel
+def multiply_rows(
+    system: SystemView,
+    contacts: Contacts,
+    p: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    out: wp.array2d(dtype=wp.vec3d),
+):
+    """out += Σ q (q·p); bonded nodes have p = 0 and get nothing."""
+    env, r = wp.tid()
+    if active[env] == 0 or r >= contacts.row_count[env]:
+        return
+    add_row(system, contacts, env, r, p, out)
 
 
 @wp.kernel
@@ -305,6 +318,72 @@ def next_direction(z: wp.array2d(dtype=wp.vec3d), s: Scalars, running: wp.array(
         p[env, i] = z[env, i] + s.beta[env] * p[env, i]
 
 
+@wp.kernel
+def solve_in_one_thread(
+    system: SystemView,
+    contacts: Contacts,
+    inverse: wp.array2d(dtype=wp.mat33d),
+    tolerance: wp.float64,
+    max_iterations: wp.int32,
+    active: wp.array(dtype=wp.int32),
+    p: wp.array2d(dtype=wp.vec3d),
+    Ap: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    r: wp.array2d(dtype=wp.vec3d),
+    x: wp.array2d(dtype=wp.vec3d),
+    s: Scalars,
+):
+    """All iterations of one environment, one after the other: what a CPU does anyway, without a launch for every vector operation."""
+    env = wp.tid()
+    if active[env] == 0:
+        return
+    zero = wp.float64(0.0)
+    n = r.shape[1]
+    s.iterations[env] = 0
+    s.negative[env] = 0
+    rr0 = wp.float64(0.0)
+    rz = wp.float64(0.0)
+    for i in range(n):
+        z = inverse[env, i] * r[env, i]
+        p[env, i] = z
+        rr0 += wp.length_sq(r[env, i])
+        rz += wp.dot(r[env, i], z)
+    if rr0 == zero:
+        return
+    rows = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    for it in range(max_iterations):
+        for i in range(n):
+            f = wp.vec3d()
+            if system.free[i] != 0:
+                for k in range(system.row_start[i], system.row_start[i + 1]):
+                    f += system.blocks[env, k] * p[env, system.col[k]]
+            Ap[env, i] = f
+        for row in range(rows):
+            add_row(system, contacts, env, row, p, Ap)
+        curvature = wp.float64(0.0)
+        for i in range(n):
+            curvature += wp.dot(p[env, i], Ap[env, i])
+        if not (curvature > zero):
+            s.negative[env] = 1
+            return
+        alpha = rz / curvature
+        rr = wp.float64(0.0)
+        new = wp.float64(0.0)
+        for i in range(n):
+            x[env, i] = x[env, i] + alpha * p[env, i]
+            left = r[env, i] - alpha * Ap[env, i]
+            r[env, i] = left
+            rr += wp.length_sq(left)
+            new += wp.dot(left, inverse[env, i] * left)
+        s.iterations[env] = it + 1
+        if not (rr > tolerance * tolerance * rr0):
+            return
+        beta = new / rz
+        rz = new
+        for i in range(n):
+            p[env, i] = inverse[env, i] * r[env, i] + beta * p[env, i]
+
+
 class Preconditioner(Protocol):
     """Approximates H⁻¹, symmetric and positive definite."""
 
@@ -321,19 +400,19 @@ class BlockJacobi:
     """Inverses of the 3×3 diagonal blocks, contact rows included."""
 
     def __init__(self, batch: int, nodes: int, device: wp.Device) -> None:
-        self._inverse = wp.zeros((batch, nodes), dtype=wp.mat33d, device=device)
+        self.inverse = wp.zeros((batch, nodes), dtype=wp.mat33d, device=device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        device, dim = self._inverse.device, self._inverse.shape
-        wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self._inverse], device=device)
+        device, dim = self.inverse.device, self.inverse.shape
+        wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self.inverse], device=device)
         if rows:
             wp.launch(
-                diagonal_rows, dim=(dim[0], rows), inputs=[system, contacts, active], outputs=[self._inverse], device=device
+                diagonal_rows, dim=(dim[0], rows), inputs=[system, contacts, active], outputs=[self.inverse], device=device
             )
-        wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self._inverse], device=device)
+        wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
-        wp.launch(apply_blocks, dim=r.shape, inputs=[self._inverse, r, running], outputs=[z], device=r.device)
+        wp.launch(apply_blocks, dim=r.shape, inputs=[self.inverse, r, running], outputs=[z], device=r.device)
 
 
 @dataclass(frozen=True)
@@ -397,6 +476,10 @@ class Pcg:
             active: mask (B,).
         """
         s, run, device = self._scalars, self._running, self.device
+        if not device.is_cuda and isinstance(preconditioner, BlockJacobi):
+            inputs = [system, contacts, preconditioner.inverse, tolerance, max_iterations, active, self._p, self._Ap]
+            wp.launch(solve_in_one_thread, dim=self.batch, inputs=inputs, outputs=[residual, x, s], device=device)
+            return PcgResult(s.iterations.numpy().copy(), s.negative.numpy().astype(bool))
         preconditioner.apply(residual, active, self._z)
         self._dot(residual, residual, active, self._a)
         self._dot(residual, self._z, active, self._b)
