@@ -6,6 +6,8 @@ arrays whose first axis is the environment. SI units; see ``ipc/README.md``.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from ipc.bodies import AffineBody, HalfSpace, KinematicBody, Pose, SoftBody, vertices_in_box, vertices_near
 from ipc.errors import IpcError, OverlapError, SolverError
 from ipc.materials import Material, Stiff
@@ -13,6 +15,9 @@ from ipc.meshes import TetMesh, TriMesh, box_mesh, box_surface, domed_pad, grade
 from ipc.report import ContactPairs, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.tetwild import tetrahedralize
+
+if TYPE_CHECKING:
+    from ipc.world import State, World
 
 __all__ = [
     "RAYTAC_IPC_MARKER",
@@ -51,7 +56,7 @@ RAYTAC_IPC_MARKER = "raytac-ipc"
 __version__ = "0.1.0"
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import the solver, and with it Warp, only when it is asked for."""
     if name in ("World", "State"):
         from ipc import world

@@ -406,9 +406,7 @@ class BlockJacobi:
         device, dim = self.inverse.device, self.inverse.shape
         wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self.inverse], device=device)
         if rows:
-            wp.launch(
-                diagonal_rows, dim=(dim[0], rows), inputs=[system, contacts, active], outputs=[self.inverse], device=device
-            )
+            wp.launch(diagonal_rows, dim=(dim[0], rows), inputs=[system, contacts, active], outputs=[self.inverse], device=device)
         wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:

@@ -14,7 +14,9 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def both(x: wp.array2d(dtype=wp.vec3d), pt: wp.array(dtype=wp.vec4d), ee: wp.array(dtype=wp.vec4d), t: wp.array2d(dtype=wp.vec3d)):
+def both(
+    x: wp.array2d(dtype=wp.vec3d), pt: wp.array(dtype=wp.vec4d), ee: wp.array(dtype=wp.vec4d), t: wp.array2d(dtype=wp.vec3d)
+):
     i = wp.tid()
     a, b, c, d = x[i, 0], x[i, 1], x[i, 2], x[i, 3]
     pt[i] = point_triangle_coefficients(a, b, c, d)
@@ -41,17 +43,17 @@ def scalars(x: wp.array(dtype=wp.float64), top: wp.float64, out: wp.array2d(dtyp
 def advance(x: wp.array2d(dtype=wp.vec3d), d: wp.array2d(dtype=wp.vec3d), slack: wp.float64, out: wp.array2d(dtype=wp.float64)):
     i = wp.tid()
     one, zero = wp.float64(1.0), wp.float64(0.0)
-    out[i, 0] = ccd.additive_ccd(
-        False, x[i, 0], x[i, 1], x[i, 2], x[i, 3], d[i, 0], d[i, 1], d[i, 2], d[i, 3], slack, zero, one
-    )
-    out[i, 1] = ccd.additive_ccd(
-        True, x[i, 0], x[i, 1], x[i, 2], x[i, 3], d[i, 0], d[i, 1], d[i, 2], d[i, 3], slack, zero, one
-    )
+    out[i, 0] = ccd.additive_ccd(False, x[i, 0], x[i, 1], x[i, 2], x[i, 3], d[i, 0], d[i, 1], d[i, 2], d[i, 3], slack, zero, one)
+    out[i, 1] = ccd.additive_ccd(True, x[i, 0], x[i, 1], x[i, 2], x[i, 3], d[i, 0], d[i, 1], d[i, 2], d[i, 3], slack, zero, one)
 
 
 def coefficients(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n = len(x)
-    pt, ee, t = wp.zeros(n, dtype=wp.vec4d, device="cpu"), wp.zeros(n, dtype=wp.vec4d, device="cpu"), wp.zeros((n, 2), dtype=wp.vec3d, device="cpu")
+    pt, ee, t = (
+        wp.zeros(n, dtype=wp.vec4d, device="cpu"),
+        wp.zeros(n, dtype=wp.vec4d, device="cpu"),
+        wp.zeros((n, 2), dtype=wp.vec3d, device="cpu"),
+    )
     wp.launch(both, dim=n, inputs=[wp.array(x, dtype=wp.vec3d, device="cpu")], outputs=[pt, ee, t], device="cpu")
     return pt.numpy(), ee.numpy(), t.numpy()
 
@@ -61,7 +63,9 @@ def degenerate(rng: np.random.Generator) -> np.ndarray:
     x = rng.standard_normal((400, 4, 3))
     special = np.round(rng.standard_normal((400, 4, 3)) * 2) / 2
     size = np.linalg.norm(np.cross(special[:, 2] - special[:, 1], special[:, 3] - special[:, 1]), axis=1)
-    edges = np.minimum(np.linalg.norm(special[:, 1] - special[:, 0], axis=1), np.linalg.norm(special[:, 3] - special[:, 2], axis=1))
+    edges = np.minimum(
+        np.linalg.norm(special[:, 1] - special[:, 0], axis=1), np.linalg.norm(special[:, 3] - special[:, 2], axis=1)
+    )
     return np.concatenate([x, special[(size > 0.1) & (edges > 0.1)]])
 
 
@@ -119,7 +123,9 @@ def test_ccd_never_passes_and_rarely_stops_early(rng: np.random.Generator) -> No
         alpha = out.numpy()[:, kind]
         start = np.linalg.norm(coefficients(x)[2][:, kind], axis=-1)
         ways = np.linspace(0, 1, 101)[None, :, None, None] * alpha[:, None, None, None]
-        along = np.linalg.norm(coefficients((x[:, None] + ways * d[:, None]).reshape(-1, 4, 3))[2][:, kind], axis=-1).reshape(300, 101)
+        along = np.linalg.norm(coefficients((x[:, None] + ways * d[:, None]).reshape(-1, 4, 3))[2][:, kind], axis=-1).reshape(
+            300, 101
+        )
         assert (along.min(axis=1) >= 0.1 * start * (1 - 1e-9)).all()
         ended = alpha < 1
         stopped += ended.sum()

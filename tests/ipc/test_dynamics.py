@@ -84,7 +84,9 @@ def test_collision_keeps_momentum_and_energy_never_rises() -> None:
     world = ipc.World(bodies, settings, device="cpu")
     world.set_velocity("a", (1.0, 0.0, 0.0))
     mass = 0.02**3 * 1000
-    lumped = [np.bincount(m.tets.ravel(), weights=np.full(m.tets.size, mass / m.tets.size), minlength=len(m.vertices)) for m in (a, b)]
+    lumped = [
+        np.bincount(m.tets.ravel(), weights=np.full(m.tets.size, mass / m.tets.size), minlength=len(m.vertices)) for m in (a, b)
+    ]
 
     def momentum() -> np.ndarray:
         return sum(w @ world.velocities(n)[0] for w, n in zip(lumped, "ab", strict=True))
