@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -134,7 +135,7 @@ def cube(size: float = SIZE, cells: int = 1, lift: float = 0.0) -> ipc.TetMesh:
 
 def lifted(mesh: ipc.TetMesh, z: float, x: float = 0.0) -> ipc.TetMesh:
     """The same tetrahedra, moved [m]."""
-    return ipc.TetMesh(mesh.vertices + [x, 0.0, z], mesh.tets)
+    return ipc.TetMesh(mesh.vertices + np.array([x, 0.0, z]), mesh.tets)
 
 
 SOFT = ipc.Material(1e6, 0.4)
@@ -144,7 +145,14 @@ def drop(
     mesh: ipc.TetMesh, obstacle: ipc.Body, args: Args, gravity: tuple[float, float, float] = (0, 0, -9.81), **settings: float
 ) -> ipc.World:
     """A soft body and what it falls on."""
-    options: dict = {"dt": 0.025, "gravity": gravity, "d_hat": D_HAT, "max_newton": MAX_NEWTON, "friction": 0.1, "kappa": 1e5}
+    options: Any = {
+        "dt": 0.025,
+        "gravity": gravity,
+        "d_hat": D_HAT,
+        "max_newton": MAX_NEWTON,
+        "friction": 0.1,
+        "kappa": 1e5,
+    }
     return ipc.World([ipc.SoftBody("soft", mesh, SOFT), obstacle], ipc.Settings(**(options | settings)), device=args.device)
 
 
@@ -300,7 +308,7 @@ CASES: dict[str, Callable[[Args], Worst]] = {
     "sliding_wedge": lambda a: run(drop(lifted(wedge(False), 4e-4), kinematic(sheet(8)), a, TILTED), 12),
     "internal_edges": lambda a: run(drop(cube(lift=4e-4), kinematic(sheet(7)), a, TILTED), 12),
     "cliff": lambda a: run(
-        drop(lifted(cube(lift=4e-4), 0.0, 0.008), kinematic(ipc.box_surface((SIZE,) * 3, (0, 0, -SIZE / 2))), a), 12
+        drop(lifted(cube(lift=4e-4), 0.0, 0.008), kinematic(ipc.box_surface((SIZE, SIZE, SIZE), (0, 0, -SIZE / 2))), a), 12
     ),
     "vertex_alignment": lambda a: two_cubes(a, SOFT),
     "edge_alignment": lambda a: two_cubes(a, SOFT, offset=SIZE),

@@ -46,9 +46,9 @@ CONTACT = 1e-3
 PLANE_STRAIN = YOUNG / (1 - POISSON**2)
 
 
-def graded_side(cell: float, reach: float, growth: float = 1.35) -> np.ndarray:
-    """Coordinates from 0 [m]: cells of ``cell`` over 1.5 contact radii, then growing until ``reach``."""
-    line = list(np.arange(0.0, 1.5 * CONTACT + 1e-12, cell))
+def graded_side(cell: float, reach: float, growth: float = 1.5) -> np.ndarray:
+    """Coordinates from 0 [m]: cells of ``cell`` over 1.3 contact radii, then growing until ``reach``."""
+    line = list(np.arange(0.0, 1.3 * CONTACT + 1e-12, cell))
     while line[-1] < reach:
         cell *= growth
         line.append(line[-1] + cell)
@@ -56,8 +56,8 @@ def graded_side(cell: float, reach: float, growth: float = 1.35) -> np.ndarray:
 
 
 def half_space_block(refine: float) -> ipc.SoftBody:
-    """A block of 25 contact radii to each side and down, fine under the contact, bonded on all sides but the top."""
-    side = graded_side(CONTACT / (4 * refine), 25 * CONTACT)
+    """A block of 60 contact radii to each side and down, fine under the contact, bonded on all sides but the top."""
+    side = graded_side(CONTACT / (4 * refine), 60 * CONTACT)
     line = np.concatenate([-side[:0:-1], side])
     mesh = ipc.box_mesh(line, line, -side[::-1], mirrored=True)
     v, edge = mesh.vertices, side[-1]
@@ -109,8 +109,8 @@ def press(tool: ipc.TriMesh, depths: np.ndarray, args: Args, d_hat: float) -> tu
 
 def block_pressure(device: str) -> dict[str, float]:
     """Two blocks of different meshes pressed together (ν = 0, so the exact pressure is uniform): spread of the contact stress."""
-    lower = ipc.box_mesh(*(np.linspace(0, 10e-3, n) for n in (7, 7, 4)))
-    upper = ipc.box_mesh(*(np.linspace(0, 10e-3, n) for n in (6, 6, 4)))
+    seven, six, four = (np.linspace(0, 10e-3, n) for n in (7, 6, 4))
+    lower, upper = ipc.box_mesh(seven, seven, four), ipc.box_mesh(six, six, four)
     d_hat = 0.1e-3
     material = ipc.Material(YOUNG, 0.0)
     bodies = [

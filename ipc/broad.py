@@ -8,6 +8,10 @@ Per body pair, primitives outside the other body's box are dropped first; the re
 tool is a few hundred against a few hundred.
 """
 
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 import warp as wp

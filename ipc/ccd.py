@@ -5,6 +5,10 @@ distance can shrink faster than l = max‖δ_A‖ + max‖δ_B‖ per unit of t,
 advance stops when the distance has fallen to ``slack`` of the one at the start.
 """
 
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 import warp as wp

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -31,14 +33,14 @@ class Collision:
         meshes = []
         for index, (a, b) in enumerate(layout.pairs):
             if layout.half_space[b]:
-                ids = np.arange(layout.vert_start[a], layout.vert_start[a + 1])
+                ids = np.arange(int(layout.vert_start[a]), int(layout.vert_start[a + 1]))
                 plane_vert.append(ids)
                 plane_body.append(np.full(len(ids), b))
                 plane_pair.append(np.full(len(ids), index))
             else:
                 meshes.append((index, int(a), int(b)))
         self.planes = sum(len(p) for p in plane_vert)
-        self.friction = bool((layout.friction > 0).any())
+        self.friction: bool = bool((layout.friction > 0).any())
 
         def ints(parts: list) -> wp.array:
             return wp.array(np.concatenate([np.zeros(0), *parts]).astype(np.int32), dtype=wp.int32, device=device)
@@ -129,7 +131,7 @@ class Collision:
         self.contacts.row = wp.zeros((self.batch, rows), dtype=contact.mat34d, device=self.device)
         self._pair_room, self._row_room = pairs, rows
 
-    def _size_lagged(self, lagged: friction.Lagged, pairs: int) -> None:
+    def _size_lagged(self, lagged: Any, pairs: int) -> None:
         for name, dtype in {
             "verts": wp.vec4i,
             "coef": wp.vec4d,

@@ -6,6 +6,10 @@ Because a frame's rotation keeps lengths, the same energy holds in frame coordin
 bonded vertex is a constant.
 """
 
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 import warp as wp

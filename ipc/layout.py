@@ -114,7 +114,7 @@ def _corner_gradients(x: Floats) -> Floats:
     """∇w of the corners of tetrahedra (T, 4, 3) [1/m]."""
     inverse = np.linalg.inv(x[:, 1:] - x[:, :1])  # columns are the gradients of w_1, w_2, w_3
     rest = np.swapaxes(inverse, 1, 2)
-    return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
+    return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1, dtype=np.float64)
 
 
 def _affine_parts(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
@@ -310,7 +310,7 @@ def build_layout(
         lam=floats(lams),
         row_start=np.concatenate([[0], np.cumsum(np.bincount(blocks // n, minlength=n))]).astype(np.int32),
         col=(blocks % n).astype(np.int32),
-        mass=np.bincount(which[elements:], weights=floats(mass_values), minlength=len(blocks)),
+        mass=np.bincount(which[elements:], weights=floats(mass_values), minlength=len(blocks)).astype(np.float64),
         part_start=part_start,
         part=part,
         corner_start=corner_start,

@@ -5,6 +5,10 @@ H = blocks + Σ q qᵀ: a block matrix of one pattern for every environment, and
 by itself. Sums are taken in chunks of nodes in a fixed order: the result does not depend on scheduling.
 """
 
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -50,7 +54,7 @@ def row_sum(values: wp.array, active: wp.array, out: wp.array) -> None:
     batch, n = values.shape
     if n == 0:
         return
-    if values.device.is_cuda and n > 64:
+    if wp.get_device(values.device).is_cuda and n > 64:
         chunk = int(n**0.5) + 1
         partial = wp.empty((batch, -(-n // chunk)), dtype=wp.float64, device=values.device)
         wp.launch(sum_chunks, dim=partial.shape, inputs=[values, chunk, active], outputs=[partial], device=values.device)

@@ -33,7 +33,7 @@ class TetMesh:
     """
 
     vertices: NDArray[np.float64]
-    tets: NDArray[np.int32]
+    tets: NDArray[np.integer]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", np.ascontiguousarray(self.vertices, dtype=np.float64))
@@ -60,7 +60,7 @@ class TriMesh:
     """
 
     vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
+    faces: NDArray[np.integer]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", np.ascontiguousarray(self.vertices, dtype=np.float64))
@@ -179,7 +179,7 @@ class SurfaceTopology:
     edge_area: NDArray[np.float64]
 
 
-def surface_topology(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> SurfaceTopology:
+def surface_topology(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> SurfaceTopology:
     """Edges, and the areas that weigh contacts (Li et al. 2023, "Convergent Incremental Potential Contact", section 3)."""
     x = vertices[faces]
     area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
@@ -187,13 +187,13 @@ def surface_topology(vertices: NDArray[np.float64], faces: NDArray[np.int32]) ->
     edges, inverse = np.unique(sides, axis=0, return_inverse=True)
     vertex_area = np.bincount(faces.ravel(), weights=np.repeat(area / 3, 3), minlength=len(vertices))
     edge_area = np.bincount(inverse.ravel(), weights=np.repeat(area / 3, 3), minlength=len(edges))
-    return SurfaceTopology(edges.astype(np.int32), vertex_area, edge_area)
+    return SurfaceTopology(edges.astype(np.int32), vertex_area.astype(np.float64), edge_area.astype(np.float64))
 
 
 def box_surface(size: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriMesh:
     """The twelve triangles of a box of that size [m] about ``centre`` [m]."""
     half = np.asarray(size) / 2
-    mesh = box_mesh(*((-h, h) for h in half))
+    mesh = box_mesh((-half[0], half[0]), (-half[1], half[1]), (-half[2], half[2]))
     return TriMesh(mesh.vertices + np.asarray(centre), surface_of(mesh.tets))
 
 

@@ -1,12 +1,16 @@
 """One time step: driven bodies advance as far as they can, projected Newton finds the state of least incremental potential.
 
 Each Newton iteration (i) tells the linear system where driven frames are going, so that the unknowns move out of their way in the same
-step, and takes that step as far as gaps allow, until the frames have arrived; (ii) solves H p = −g by PCG, with the exact Hessian first and a positive semi-definite one once negative curvature is met (the
-on-demand projection of Longva et al. 2023, "Pitfalls of Projection"), (iii) limits the step by continuous collision detection,
-(iv) halves it until the energy falls enough and no tetrahedron is inverted. An environment is done when p is small, the whole step was
-taken and its frames have arrived, or are blocked. Environments never wait on or change each other's arithmetic: every decision is a
-mask.
+step, and takes that step as far as gaps allow, until the frames have arrived; (ii) solves H p = −g by PCG, with the exact Hessian first
+and a positive semi-definite one once negative curvature is met (projection on demand, after Longva et al. 2023, "Pitfalls of
+Projection"); (iii) limits the step by continuous collision detection; (iv) halves it until the energy falls enough and no tetrahedron
+is inverted. An environment is done when p is small and its frames have arrived, or are blocked. Environments never wait on or change
+each other's arithmetic: every decision is a mask.
 """
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

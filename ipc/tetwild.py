@@ -45,7 +45,9 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
         import pytetwild
     except ImportError as error:
         raise IpcError('tetrahedralize needs pytetwild: pip install "raytac[ipc]", or pass tetrahedra') from error
-    vertices, tets = pytetwild.tetrahedralize(surface.vertices, surface.faces, edge_length_abs=edge_length, quiet=True)[:2]
+    vertices, tets = pytetwild.tetrahedralize(  # pyright: ignore[reportPrivateImportUsage]
+        surface.vertices, surface.faces.astype(np.int32), edge_length_abs=edge_length, quiet=True
+    )[:2]
     vertices, tets = np.asarray(vertices, dtype=np.float64), np.asarray(tets, dtype=np.int32)
     negative = tet_volumes(vertices, tets) < 0
     tets[negative] = tets[negative][:, [0, 1, 3, 2]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -47,6 +48,11 @@ class State:
     second_order: NDArray[np.int32]
     kappa: Floats
     failed: NDArray[np.bool_]
+
+
+def _host(array: wp.array) -> NDArray[Any]:
+    """The array in NumPy: a view on the CPU, a copy from CUDA."""
+    return array.numpy()
 
 
 class World:
@@ -158,7 +164,7 @@ class World:
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps the last target's. Steps turn by less than half a turn.
         """
         body = self._framed(name)
-        goal_p, goal_q = self._solver.goal_p.numpy().copy(), self._solver.goal_q.numpy().copy()
+        goal_p, goal_q = _host(self._solver.goal_p).copy(), _host(self._solver.goal_q).copy()
         if position is not None:
             goal_p[:, body] = self._per_env(position, (3,), "position")
         if rotation is not None:
@@ -181,7 +187,7 @@ class World:
         if first == last:
             raise IpcError(f"{name!r} has no unknowns: drive it with set_target")
         mask = self._mask(envs)
-        v = self._solver.v.numpy().copy()
+        v = _host(self._solver.v).copy()
         v[mask, first:last] = self._per_env(velocity, (3,), "velocity")[mask, None]
         self._solver.v.assign(v)
 
@@ -215,11 +221,11 @@ class World:
             projected=counts.projected,
             ccd=counts.ccd,
             speed=counts.residual_speed,
-            pairs=solver.collision.contacts.count.numpy().astype(np.int64),
-            kappa=solver.kappa.numpy().copy(),
-            elastic=elastic.numpy().copy(),
-            kinetic=kinetic.numpy().copy(),
-            barrier=solver.barrier_energy.numpy().copy(),
+            pairs=_host(solver.collision.contacts.count).astype(np.int64),
+            kappa=_host(solver.kappa).copy(),
+            elastic=_host(elastic).copy(),
+            kinetic=_host(kinetic).copy(),
+            barrier=_host(solver.barrier_energy).copy(),
         )
 
     @property
@@ -232,7 +238,7 @@ class World:
     def frame(self, name: str) -> tuple[Floats, Floats]:
         """``world_from_body`` of a driven body: rotations (B, 3, 3) and positions [m] (B, 3)."""
         body = self._framed(name)
-        return self._solver.R.numpy()[:, body].copy(), self._solver.t.numpy()[:, body].copy()
+        return _host(self._solver.R)[:, body].copy(), _host(self._solver.t)[:, body].copy()
 
     def positions(self, name: str, frame: str = "world") -> Floats:
         """Positions [m] of a body, (B, n, 3): all vertices of a soft body's mesh, else its surface's vertices.
@@ -248,13 +254,13 @@ class World:
             raise IpcError(f"frame = {frame!r}: choose 'world' or 'body'")
         solver = self._solver
         if isinstance(self.bodies[body], SoftBody):
-            y = solver.y.numpy()[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
+            y = _host(solver.y)[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
             if frame == "body":
                 return y
-            return np.einsum("bij,bnj->bni", solver.R.numpy()[:, body], y) + solver.t.numpy()[:, body, None]
+            return np.einsum("bij,bnj->bni", _host(solver.R)[:, body], y) + _host(solver.t)[:, body, None]
         if frame == "body":
             raise IpcError(f"{name!r} is no soft body: frame='body' is for bonded soft bodies")
-        return solver.x.numpy()[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
+        return _host(solver.x)[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
 
     def velocities(self, name: str) -> Floats:
         """World velocities [m/s] of a soft body's vertices, (B, n, 3), or of an affine body's four reference corners (B, 4, 3)."""
@@ -262,7 +268,7 @@ class World:
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
             raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return self._solver.v.numpy()[:, first:last].copy()
+        return _host(self._solver.v)[:, first:last].copy()
 
     def affine_pose(self, name: str) -> tuple[Floats, Floats]:
         """A (B, 3, 3) and p [m] (B, 3) of an affine body's map x = A X + p."""
@@ -272,7 +278,7 @@ class World:
             raise IpcError(f"{name!r} is no affine body")
         pose = self.bodies[body].pose
         corner = rotation_matrix(pose.rotation).T @ (self.layout.node_rest[first] - pose.position)
-        y = self._solver.y.numpy()[:, first:last]
+        y = _host(self._solver.y)[:, first:last]
         A = np.einsum("bki,kj->bij", y, self.layout.grads[self.layout.tet_start[body]])
         return A, y[:, 0] - A @ corner
 
@@ -289,7 +295,7 @@ class World:
         """Contact and friction force on each surface vertex [N], world frame, (B, n, 3); order as in :meth:`surface`."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
-        return -self._solver.vert_gradient.numpy()[:, first:last]
+        return -_host(self._solver.vert_gradient)[:, first:last]
 
     def traction(self, name: str) -> Floats:
         """Contact force per rest area at each surface vertex [Pa], world frame, (B, n, 3)."""
@@ -304,18 +310,18 @@ class World:
         """
         body = self._index(name)
         solver, layout = self._solver, self.layout
-        origin = solver.t.numpy()[:, body] if layout.framed[body] else np.zeros((self.num_envs, 3))
+        origin = _host(solver.t)[:, body] if layout.framed[body] else np.zeros((self.num_envs, 3))
         first, last = layout.vert_start[body : body + 2]
         if isinstance(self.bodies[body], HalfSpace):
             points, forces = self._plane_forces(body)
         elif isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
             nodes = np.arange(layout.node_start[body], layout.node_start[body + 1])
             nodes = nodes[layout.node_free[nodes] == 0]
-            R = solver.R.numpy()[:, body]
-            forces = -np.einsum("bij,bnj->bni", R, solver.gradient.numpy()[:, nodes])
-            points = np.einsum("bij,bnj->bni", R, solver.y.numpy()[:, nodes]) + origin[:, None]
+            R = _host(solver.R)[:, body]
+            forces = -np.einsum("bij,bnj->bni", R, _host(solver.gradient)[:, nodes])
+            points = np.einsum("bij,bnj->bni", R, _host(solver.y)[:, nodes]) + origin[:, None]
         else:
-            points, forces = solver.x.numpy()[:, first:last], -solver.vert_gradient.numpy()[:, first:last]
+            points, forces = _host(solver.x)[:, first:last], -_host(solver.vert_gradient)[:, first:last]
         return Wrench(forces.sum(axis=1), np.cross(points - origin[:, None], forces).sum(axis=1))
 
     def _plane_forces(self, body: int) -> tuple[Floats, Floats]:
@@ -325,17 +331,17 @@ class World:
         forces = np.zeros((*solver.x.shape, 3))
         plane_of = self.layout.pairs[:, 1]
         found, lagged = collision.contacts, collision.lagged
-        x, start = solver.x.numpy(), solver.x_start.numpy()
+        x, start = _host(solver.x), _host(solver.x_start)
         for env in range(self.num_envs):
-            n = int(found.count.numpy()[env])
-            verts = found.verts.numpy()[env, :n]
-            mine = (verts[:, 1] < 0) & (plane_of[found.pair.numpy()[env, :n]] == body)
-            normal, force = found.normal.numpy()[env, :n][mine], found.force.numpy()[env, :n][mine]
+            n = int(_host(found.count)[env])
+            verts = _host(found.verts)[env, :n]
+            mine = (verts[:, 1] < 0) & (plane_of[_host(found.pair)[env, :n]] == body)
+            normal, force = _host(found.normal)[env, :n][mine], _host(found.force)[env, :n][mine]
             np.add.at(forces[env], verts[mine, 0], -force[:, None] * normal)
-            n = int(lagged.count.numpy()[env]) if collision.friction else 0
-            verts = lagged.verts.numpy()[env, :n]
-            mine = (verts[:, 1] < 0) & (plane_of[lagged.pair.numpy()[env, :n]] == body)
-            v, normal, limit = verts[mine, 0], lagged.normal.numpy()[env, :n][mine], lagged.limit.numpy()[env, :n][mine]
+            n = int(_host(lagged.count)[env]) if collision.friction else 0
+            verts = _host(lagged.verts)[env, :n]
+            mine = (verts[:, 1] < 0) & (plane_of[_host(lagged.pair)[env, :n]] == body)
+            v, normal, limit = verts[mine, 0], _host(lagged.normal)[env, :n][mine], _host(lagged.limit)[env, :n][mine]
             u = x[env, v] - start[env, v]
             u -= (u * normal).sum(axis=1, keepdims=True) * normal
             y, eps = np.linalg.norm(u, axis=1), solver.friction_eps
@@ -348,16 +354,16 @@ class World:
         if not 0 <= env < self.num_envs:
             raise IpcError(f"env = {env}: environments are 0 to {self.num_envs - 1}")
         found = self._solver.collision.contacts
-        n = int(found.count.numpy()[env])
-        pairs = self.layout.pairs[found.pair.numpy()[env, :n]]
+        n = int(_host(found.count)[env])
+        pairs = self.layout.pairs[_host(found.pair)[env, :n]]
         names = self.layout.names
         return ContactPairs(
             bodies=tuple((names[a], names[b]) for a, b in pairs),
-            vertices=found.verts.numpy()[env, :n].copy(),
-            weights=found.coef.numpy()[env, :n].copy(),
-            normal=found.normal.numpy()[env, :n].copy(),
-            gap=found.gap.numpy()[env, :n].copy(),
-            force=found.force.numpy()[env, :n].copy(),
+            vertices=_host(found.verts)[env, :n].copy(),
+            weights=_host(found.coef)[env, :n].copy(),
+            normal=_host(found.normal)[env, :n].copy(),
+            gap=_host(found.gap)[env, :n].copy(),
+            force=_host(found.force)[env, :n].copy(),
         )
 
     # --- state -----------------------------------------------------------------------------------------------------------------
@@ -366,14 +372,14 @@ class World:
         """A copy of the state of every environment."""
         s = self._solver
         return State(
-            y=s.y.numpy().copy(),
-            velocity=s.v.numpy().copy(),
-            velocity_before=s.v_before.numpy().copy(),
-            position_before=s.xw_before.numpy().copy(),
-            frame_rotation=s.frame_q.numpy()[..., [3, 0, 1, 2]].copy(),
-            frame_position=s.frame_p.numpy().copy(),
-            second_order=s.second_order.numpy().copy(),
-            kappa=s.kappa.numpy().copy(),
+            y=_host(s.y).copy(),
+            velocity=_host(s.v).copy(),
+            velocity_before=_host(s.v_before).copy(),
+            position_before=_host(s.xw_before).copy(),
+            frame_rotation=_host(s.frame_q)[..., [3, 0, 1, 2]].copy(),
+            frame_position=_host(s.frame_p).copy(),
+            second_order=_host(s.second_order).copy(),
+            kappa=_host(s.kappa).copy(),
             failed=self._failed.copy(),
         )
 
@@ -388,8 +394,8 @@ class World:
             OverlapError: if surfaces cross or touch in that state.
         """
         mask, s = self._mask(envs), self._solver
-        if state.y.shape != s.y.numpy().shape:
-            raise IpcError(f"the state has nodes of shape {state.y.shape}: this world has {s.y.numpy().shape}")
+        if state.y.shape != _host(s.y).shape:
+            raise IpcError(f"the state has nodes of shape {state.y.shape}: this world has {_host(s.y).shape}")
         self._check_overlap(state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         for target, values in (
@@ -404,7 +410,7 @@ class World:
             (s.second_order, state.second_order),
             (s.kappa, state.kappa),
         ):
-            merged = target.numpy().copy()
+            merged = _host(target).copy()
             merged[mask] = values[mask]
             target.assign(merged)
         self._failed[mask] = state.failed[mask]

@@ -8,7 +8,7 @@ import warp as wp
 
 import ipc
 
-wp.config.quiet = True
+wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
 wp.init()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import warp as wp
@@ -12,7 +14,9 @@ from ipc.layout import build_layout
 from ipc.newton import Newton
 from tests.ipc.conftest import unit_cell
 
-MODELS = ["stable", "stable_log"]
+Model = Literal["stable", "stable_log"]
+
+MODELS: list[Model] = ["stable", "stable_log"]
 
 
 def make_newton(material: ipc.Material, mesh: ipc.TetMesh | None = None, bonded: np.ndarray | None = None) -> Newton:
@@ -57,7 +61,7 @@ def energy_change(solver: Newton, y0: np.ndarray, y1: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_gradient_and_hessian_match_finite_differences(model: str, rng: np.random.Generator) -> None:
+def test_gradient_and_hessian_match_finite_differences(model: Model, rng: np.random.Generator) -> None:
     solver = make_newton(ipc.Material(1e5, 0.4, model=model))
     y = solver.layout.node_rest + 0.1 * rng.standard_normal(solver.layout.node_rest.shape)
     g = gradient_at(solver, y)
@@ -74,7 +78,7 @@ def test_gradient_and_hessian_match_finite_differences(model: str, rng: np.rando
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_projected_hessian_is_definite_and_close(model: str, rng: np.random.Generator) -> None:
+def test_projected_hessian_is_definite_and_close(model: Model, rng: np.random.Generator) -> None:
     solver = make_newton(ipc.Material(1e5, 0.45, model=model))
     indefinite = 0
     for scale in (0.02, 0.2, 0.6):
@@ -96,7 +100,7 @@ def test_projected_hessian_is_definite_and_close(model: str, rng: np.random.Gene
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
-def test_rest_state_is_free_of_stress_and_has_lame_constants(model: str, poisson: float) -> None:
+def test_rest_state_is_free_of_stress_and_has_lame_constants(model: Model, poisson: float) -> None:
     material = ipc.Material(2e5, poisson, model=model)
     solver = make_newton(material)
     rest = solver.layout.node_rest
@@ -138,7 +142,7 @@ def test_affine_patch_is_reproduced() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_uniaxial_and_shear_moduli(model: str) -> None:
+def test_uniaxial_and_shear_moduli(model: Model) -> None:
     """A pulled block has E and ν, a sheared one G, to 0.1 %, at a strain of 1e-4."""
     material = ipc.Material(1e5, 0.45, model=model)
     mesh = unit_cell(2)

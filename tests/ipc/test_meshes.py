@@ -64,7 +64,7 @@ def test_tetwild_fills_a_surface_and_reads_its_cache(tmp_path: Path, monkeypatch
 
     def fake(vertices: np.ndarray, faces: np.ndarray, **options: object) -> tuple[np.ndarray, np.ndarray]:
         calls.append(options["edge_length_abs"])
-        mesh = ipc.box_mesh(*([-0.5, 0.5] for _ in range(3)))
+        mesh = ipc.box_mesh([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])
         return mesh.vertices, mesh.tets[:, [0, 2, 1, 3]]
 
     monkeypatch.setitem(sys.modules, "pytetwild", types.SimpleNamespace(tetrahedralize=fake))

@@ -19,7 +19,7 @@ def make_world(num_envs: int = 1, friction: float = 0.0, **settings: object) -> 
     return ipc.World([bonded_pad(small_pad()), ball], ipc.Settings(**options), num_envs=num_envs, device="cpu")
 
 
-def press(world: ipc.World, depth: float, steps: int, side: float = 0.0) -> list[ipc.StepReport]:
+def press(world: ipc.World, depth: float | np.ndarray, steps: int, side: float = 0.0) -> list[ipc.StepReport]:
     """Drive the ball ``depth`` [m] down and ``side`` [m] along x from where it is; depth and side may be arrays (B,)."""
     start = world.frame("ball")[1]
     reports = []
@@ -66,8 +66,9 @@ def test_press_balances_forces_and_stays_apart() -> None:
 def test_bonded_vertices_do_not_move_and_follow_their_frame() -> None:
     world = make_world()
     press(world, 0.6e-3, 4)
-    bonded = world.bodies[0].bonded
-    rest = world.bodies[0].mesh.vertices
+    pad = world.bodies[0]
+    assert isinstance(pad, ipc.SoftBody)
+    bonded, rest = pad.bonded, pad.mesh.vertices
     assert (world.positions("pad", frame="body")[0, bonded] == rest[bonded]).all()
     world.set_target("pad", position=(1e-4, 0.0, 2e-4), rotation=(np.cos(0.02), 0.0, np.sin(0.02), 0.0))
     report = world.step()
