@@ -425,6 +425,15 @@ class PcgResult:
     negative: np.ndarray
 
 
+GRAPH_ITERATIONS = 8
+"""PCG iterations between two looks at the flags on CUDA."""
+
+
+def any_set(flags: wp.array) -> bool:
+    """Whether any flag is set; waits for the device."""
+    return bool(flags.numpy().any())
+
+
 class Pcg:
     """Preconditioned conjugate gradients (Hestenes, Stiefel 1952) for a batch of systems."""
 
@@ -437,6 +446,8 @@ class Pcg:
         chunks = -(-nodes // self.chunk)
         self._a, self._b = (wp.zeros((batch, chunks), dtype=wp.float64, device=device) for _ in range(2))
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._graph: wp.Graph | None = None
+        self._graph_key: tuple = ()
         self._scalars = Scalars()
         for name in ("rz", "alpha", "beta", "rr0", "rr"):
             setattr(self._scalars, name, wp.zeros(batch, dtype=wp.float64, device=device))
@@ -453,6 +464,30 @@ class Pcg:
             wp.launch(
                 multiply_rows, dim=(self.batch, rows), inputs=[system, contacts, p, mask], outputs=[out], device=self.device
             )
+
+    def _iterate(
+        self,
+        system: SystemView,
+        contacts: Contacts,
+        rows: int,
+        preconditioner: Preconditioner,
+        residual: wp.array,
+        x: wp.array,
+        tolerance: float,
+        max_iterations: int,
+    ) -> None:
+        """One iteration of the running environments."""
+        s, run, device = self._scalars, self._running, self.device
+        wp.launch(next_direction, dim=x.shape, inputs=[self._z, s, run], outputs=[self._p], device=device)
+        self.multiply(system, contacts, rows, run, self._p, self._Ap)
+        self._dot(self._p, self._Ap, run, self._a)
+        wp.launch(step_length, dim=self.batch, inputs=[self._a, s], outputs=[run], device=device)
+        wp.launch(update_iterate, dim=x.shape, inputs=[self._p, self._Ap, s, run], outputs=[x, residual], device=device)
+        preconditioner.apply(residual, run, self._z)
+        self._dot(residual, residual, run, self._a)
+        self._dot(residual, self._z, run, self._b)
+        inputs = [self._a, self._b, tolerance, max_iterations, s]
+        wp.launch(next_scalars, dim=self.batch, inputs=inputs, outputs=[run], device=device)
 
     def solve(
         self,
@@ -486,27 +521,21 @@ class Pcg:
         self._dot(residual, residual, active, self._a)
         self._dot(residual, self._z, active, self._b)
         wp.launch(start_scalars, dim=self.batch, inputs=[self._a, self._b, active, s], outputs=[run], device=device)
-        # On CUDA a look at the flags costs a synchronisation, so several iterations go by between looks.
-        stride = 8 if device.is_cuda else 1
-        done = 0
-        while done < max_iterations:
-            for _ in range(min(stride, max_iterations - done)):
-                wp.launch(next_direction, dim=x.shape, inputs=[self._z, s, run], outputs=[self._p], device=device)
-                self.multiply(system, contacts, rows, run, self._p, self._Ap)
-                self._dot(self._p, self._Ap, run, self._a)
-                wp.launch(step_length, dim=self.batch, inputs=[self._a, s], outputs=[run], device=device)
-                wp.launch(update_iterate, dim=x.shape, inputs=[self._p, self._Ap, s, run], outputs=[x, residual], device=device)
-                preconditioner.apply(residual, run, self._z)
-                self._dot(residual, residual, run, self._a)
-                self._dot(residual, self._z, run, self._b)
-                wp.launch(
-                    next_scalars,
-                    dim=self.batch,
-                    inputs=[self._a, self._b, tolerance, max_iterations, s],
-                    outputs=[run],
-                    device=device,
-                )
-                done += 1
-            if not run.numpy().any():
-                break
+        if not device.is_cuda:
+            while any_set(run):
+                self._iterate(system, contacts, rows, preconditioner, residual, x, tolerance, max_iterations)
+            return PcgResult(s.iterations.numpy().copy(), s.negative.numpy().astype(bool))
+        # A look at the flags costs a synchronisation and a launch costs more than most of these kernels, so several iterations are
+        # recorded once as a graph and replayed; environments that are done do nothing. Recorded again when a buffer has grown.
+        room = contacts.row.shape[1]
+        key = (contacts.row.ptr, room, residual.ptr, x.ptr, tolerance, max_iterations, id(preconditioner))
+        if self._graph is None or self._graph_key != key:
+            # Once as plain launches, which loads every kernel; recording must not.
+            self._iterate(system, contacts, room, preconditioner, residual, x, tolerance, max_iterations)
+            with wp.ScopedCapture(device=device) as capture:
+                for _ in range(GRAPH_ITERATIONS):
+                    self._iterate(system, contacts, room, preconditioner, residual, x, tolerance, max_iterations)
+            self._graph, self._graph_key = capture.graph, key
+        while any_set(run):
+            wp.capture_launch(self._graph)
         return PcgResult(s.iterations.numpy().copy(), s.negative.numpy().astype(bool))

@@ -28,10 +28,8 @@ class Settings:
         friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
-        preconditioner: ``"rest"`` (rest-stiffness inverse with a low-rank contact update), ``"jacobi"`` (3×3 blocks) or ``"auto"``.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
-        rest_limit: ``"auto"`` takes ``"rest"`` up to so many unknown vertices of one bonded body (its inverse is dense).
     """
 
     dt: float = 0.01
@@ -47,10 +45,8 @@ class Settings:
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-3
     max_linear: int = 2000
-    preconditioner: Literal["auto", "rest", "jacobi"] = "auto"
     max_line_search: int = 30
     motion_fraction: float = 0.8
-    rest_limit: int = 400
 
     def __post_init__(self) -> None:
         for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):
@@ -69,7 +65,5 @@ class Settings:
             raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
         if self.integrator not in ("euler", "bdf2"):
             raise IpcError(f"integrator = {self.integrator!r}: choose 'euler' or 'bdf2'")
-        if self.preconditioner not in ("auto", "rest", "jacobi"):
-            raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'rest' or 'jacobi'")
         if not 0 < self.motion_fraction < 1:
             raise IpcError(f"motion_fraction = {self.motion_fraction}: it must lie between 0 and 1")

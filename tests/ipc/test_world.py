@@ -212,3 +212,20 @@ def test_bad_input_is_refused_before_anything_changes() -> None:
         ipc.World([world.bodies[0], world.bodies[0]], device="cpu")
     with pytest.raises(ipc.IpcError, match="nothing can move"):
         ipc.World([world.bodies[1]], device="cpu")
+
+
+def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CUDA's loop of small kernels, run on the CPU, takes the iterations and gives the press of the CPU's own."""
+    from ipc import linear
+
+    ends = []
+    for batched in (False, True):
+        if batched:
+            monkeypatch.setattr(
+                linear, "BlockJacobi", type("Other", (), {})
+            )  # solve() no longer knows it and takes the general way
+        world = make_world(num_envs=2, friction=0.3)
+        reports = press(world, np.array([0.3e-3, 0.4e-3]), 2)
+        ends.append((world.positions("pad"), reports[-1].linear))
+    assert (ends[0][1] > 0).all() and np.abs(ends[0][1] - ends[1][1]).max() <= 1
+    assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-12
