@@ -40,13 +40,13 @@ class Args(CommonOptions):
 
 
 YOUNG, POISSON = 1e5, 0.3
-RADIUS = 10e-3
+RADIUS = 20e-3
 CONTACT = 1e-3
 """Radius of the contact circle that meshes are made for [m]."""
 PLANE_STRAIN = YOUNG / (1 - POISSON**2)
 
 
-def graded_side(cell: float, reach: float, growth: float = 1.5) -> np.ndarray:
+def graded_side(cell: float, reach: float, growth: float = 1.35) -> np.ndarray:
     """Coordinates from 0 [m]: cells of ``cell`` over 1.3 contact radii, then growing until ``reach``."""
     line = list(np.arange(0.0, 1.3 * CONTACT + 1e-12, cell))
     while line[-1] < reach:
@@ -56,8 +56,8 @@ def graded_side(cell: float, reach: float, growth: float = 1.5) -> np.ndarray:
 
 
 def half_space_block(refine: float) -> ipc.SoftBody:
-    """A block of 60 contact radii to each side and down, fine under the contact, bonded on all sides but the top."""
-    side = graded_side(CONTACT / (4 * refine), 60 * CONTACT)
+    """A block of 40 contact radii to each side and down, fine under the contact, bonded on all sides but the top."""
+    side = graded_side(CONTACT / (4 * refine), 40 * CONTACT)
     line = np.concatenate([-side[:0:-1], side])
     mesh = ipc.box_mesh(line, line, -side[::-1], mirrored=True)
     v, edge = mesh.vertices, side[-1]
@@ -155,7 +155,7 @@ def main(args: Args) -> None:
         raise SystemExit(f"--parts {args.parts}: choose from hertz, punch, block")
     metrics: dict[str, Metric] = {"refine": args.refine, "young_pa": YOUNG, "poisson": POISSON}
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-    d_hat = 0.04 * CONTACT / args.refine
+    d_hat = 0.02 * CONTACT / args.refine
     shares = np.arange(1, args.steps + 1) / args.steps
     cases = {
         "hertz": (
@@ -165,7 +165,7 @@ def main(args: Args) -> None:
         ),
         "punch": (
             disc(CONTACT, int(8 * args.refine)),
-            shares * 0.1 * CONTACT,
+            shares * 0.05 * CONTACT,
             lambda depth: 2 * CONTACT * PLANE_STRAIN * depth,
         ),
     }
