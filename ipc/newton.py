@@ -135,6 +135,11 @@ def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2
         y[env, i] = y1[env, i]
 
 
+# Said here, so that the module is compiled once and not again at each new type.
+for _type in (wp.vec3d, wp.mat33d):
+    wp.overload(take, [wp.array2d(dtype=_type), wp.array(dtype=wp.int32), wp.array2d(dtype=_type)])
+
+
 @wp.kernel
 def difference(a: wp.array2d(dtype=wp.vec3d), b: wp.array2d(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec3d)):
     """out = a − b."""

@@ -197,6 +197,10 @@ class World:
         """Advance every environment that has not failed by ``settings.dt``."""
         solver = self._solver
         alive = ~self._failed
+        # Who is told to stay where it is has no way to go.
+        self._moving &= (_host(solver.goal_p) != _host(solver.frame_p)).any(axis=(1, 2)) | (
+            _host(solver.goal_q) != _host(solver.frame_q)
+        ).any(axis=(1, 2))
         counts = solver.step(alive, self._moving & alive)
         # Frames that got where they were told are at rest from now on; blocked ones keep trying.
         self._moving &= counts.blocked > 0
