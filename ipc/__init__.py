@@ -1,13 +1,65 @@
 """Incremental potential contact for soft gel pads: a package of its own that never imports ``raytac``.
 
-The solver is not written yet; this package holds its place and its marker.
+Bodies go into a :class:`World`, ``World.step`` returns a :class:`StepReport`, and positions, forces and contacts come out as NumPy
+arrays whose first axis is the environment. SI units; see ``ipc/README.md``.
 """
 
 from __future__ import annotations
 
-__all__ = ["RAYTAC_IPC_MARKER", "__version__"]
+from typing import TYPE_CHECKING, Any
+
+from ipc.bodies import AffineBody, HalfSpace, KinematicBody, Pose, SoftBody, vertices_in_box, vertices_near
+from ipc.errors import IpcError, OverlapError, SolverError
+from ipc.materials import Material, Stiff
+from ipc.meshes import TetMesh, TriMesh, box_mesh, box_surface, domed_pad, graded, icosphere
+from ipc.report import ContactPairs, StepReport, Wrench
+from ipc.settings import Settings
+from ipc.tetwild import tetrahedralize
+
+if TYPE_CHECKING:
+    from ipc.world import State, World
+
+__all__ = [
+    "RAYTAC_IPC_MARKER",
+    "AffineBody",
+    "ContactPairs",
+    "HalfSpace",
+    "IpcError",
+    "KinematicBody",
+    "Material",
+    "OverlapError",
+    "Pose",
+    "Settings",
+    "SoftBody",
+    "SolverError",
+    "State",
+    "StepReport",
+    "Stiff",
+    "TetMesh",
+    "TriMesh",
+    "World",
+    "Wrench",
+    "__version__",
+    "box_mesh",
+    "box_surface",
+    "domed_pad",
+    "graded",
+    "icosphere",
+    "tetrahedralize",
+    "vertices_in_box",
+    "vertices_near",
+]
 
 RAYTAC_IPC_MARKER = "raytac-ipc"
 """Tells this package from the other ``ipc`` packages that can be installed; ``raytac`` looks for it."""
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Import the solver, and with it Warp, only when it is asked for."""
+    if name in ("World", "State"):
+        from ipc import world
+
+        return getattr(world, name)
+    raise AttributeError(f"module 'ipc' has no attribute {name!r}")

@@ -1,0 +1,125 @@
+"""What a world is made of: soft, affine and kinematic bodies, half-spaces, and the queries that find bonded vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ipc.errors import IpcError
+from ipc.materials import Material, Stiff
+from ipc.meshes import TetMesh, TriMesh
+
+__all__ = ["AffineBody", "Body", "HalfSpace", "KinematicBody", "Pose", "SoftBody", "vertices_in_box", "vertices_near"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """``world_from_body``: x_world = R(rotation) x_body + position.
+
+    Attributes:
+        position: origin of the body in the world [m].
+        rotation: unit quaternion (w, x, y, z).
+    """
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.position).all():
+            raise IpcError(f"position = {self.position}: it must be finite")
+        if not abs(np.linalg.norm(self.rotation) - 1) < 1e-6:
+            raise IpcError(f"rotation = {self.rotation}: a quaternion (w, x, y, z) must have length 1")
+
+
+@dataclass(frozen=True)
+class SoftBody:
+    """A deformable solid.
+
+    Attributes:
+        name: unique name.
+        mesh: tetrahedra in the body's frame.
+        material: elastic material.
+        bonded: indices of the vertices that are fixed to the body's frame, exactly: they move with its pose and are no unknowns.
+        pose: ``world_from_body`` at the start. With bonded vertices the frame is driven (see ``World.set_target``); without, it only
+            places the body.
+        self_contact: whether the body's surface may touch itself.
+    """
+
+    name: str
+    mesh: TetMesh
+    material: Material
+    bonded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    pose: Pose = Pose()
+    self_contact: bool = False
+
+    def __post_init__(self) -> None:
+        bonded = np.unique(np.asarray(self.bonded, dtype=np.int64))
+        if len(bonded) and (bonded[0] < 0 or bonded[-1] >= len(self.mesh.vertices)):
+            raise IpcError(f"{self.name}: bonded names vertices {bonded[0]} to {bonded[-1]}: there are {len(self.mesh.vertices)}")
+        object.__setattr__(self, "bonded", bonded)
+
+
+@dataclass(frozen=True)
+class AffineBody:
+    """A near-rigid solid with twelve unknowns: x = A X + p, A kept orthogonal by a stiff energy (Lan et al. 2022).
+
+    Attributes:
+        name: unique name.
+        surface: closed surface in the body's frame; mass and inertia come from its volume.
+        material: stiffness and density.
+        pose: ``world_from_body`` at the start.
+    """
+
+    name: str
+    surface: TriMesh
+    material: Stiff = field(default_factory=Stiff)
+    pose: Pose = Pose()
+
+
+@dataclass(frozen=True)
+class KinematicBody:
+    """A rigid surface that goes where it is told (see ``World.set_target``); it may be open.
+
+    Attributes:
+        name: unique name.
+        surface: triangles in the body's frame.
+        pose: ``world_from_body`` at the start.
+    """
+
+    name: str
+    surface: TriMesh
+    pose: Pose = Pose()
+
+
+@dataclass(frozen=True)
+class HalfSpace:
+    """The solid half-space z ≤ 0 of its own frame; it may move.
+
+    Attributes:
+        name: unique name.
+        pose: ``world_from_body`` at the start; the frame's z axis is the outward normal.
+    """
+
+    name: str
+    pose: Pose = Pose()
+
+
+Body = SoftBody | AffineBody | KinematicBody | HalfSpace
+
+
+def vertices_in_box(mesh: TetMesh, low: ArrayLike, high: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.int64]:
+    """Vertices of ``mesh`` inside the box from ``low`` to ``high`` [m], to within ``tolerance`` [m]; use ±inf for an open side."""
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    inside = ((mesh.vertices >= low - tolerance) & (mesh.vertices <= high + tolerance)).all(axis=1)
+    return np.flatnonzero(inside)
+
+
+def vertices_near(mesh: TetMesh, points: ArrayLike, distance: float) -> NDArray[np.int64]:
+    """Vertices of ``mesh`` within ``distance`` [m] of any of ``points`` [m], shape (P, 3)."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    near = np.zeros(len(mesh.vertices), bool)
+    for chunk in np.array_split(points, max(1, len(points) // 256)):
+        near |= (((mesh.vertices[:, None] - chunk[None]) ** 2).sum(-1) <= distance**2).any(axis=1)
+    return np.flatnonzero(near)

@@ -1,0 +1,291 @@
+"""Frames, inertia and the way between nodes (unknowns, in their body's frame) and vertices (surface points, in the world).
+
+Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n + h v_n + h² a. BDF2 has x̃ = (4 x_n − x_{n−1})/3 +
+(8 v_n − 2 v_{n−1}) h/9 + (4/9) h² a and h² → (4/9) h²; then v_{n+1} = (3 x_{n+1} − 4 x_n + x_{n−1})/(2h).
+Because a frame's rotation keeps lengths, the same energy holds in frame coordinates with ỹ = Rᵀ(x̃ − t): no fictitious forces, and a
+bonded vertex is a constant.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+__all__ = [
+    "advance_nodes",
+    "frames_at",
+    "inertia_change",
+    "inertia_target",
+    "kinetic_energy",
+    "new_velocity",
+    "node_gradient",
+    "node_world",
+    "predict",
+    "vertex_motion",
+    "vertex_positions",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def frames_at(
+    start_q: wp.array2d(dtype=wp.quatd),
+    start_p: wp.array2d(dtype=wp.vec3d),
+    end_q: wp.array2d(dtype=wp.quatd),
+    end_p: wp.array2d(dtype=wp.vec3d),
+    share: wp.array(dtype=wp.float64),
+    # outputs
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    now_q: wp.array2d(dtype=wp.quatd),
+):
+    """Frames a share of the way from start to end: positions along a line, rotations along the shorter arc."""
+    env, b = wp.tid()
+    s = share[env]
+    q0 = start_q[env, b]
+    sign = wp.float64(1.0)
+    if wp.dot(q0, end_q[env, b]) < wp.float64(0.0):
+        sign = wp.float64(-1.0)
+    q1 = sign * end_q[env, b]
+    q = sign * end_q[env, b]
+    if s < wp.float64(1.0) and wp.dot(q0, q1) < wp.float64(0.99999999999999):
+        q = wp.normalize(wp.quat_slerp(q0, q1, s))
+    now_q[env, b] = q
+    R[env, b] = wp.quat_to_matrix(q)
+    t[env, b] = start_p[env, b] + s * (end_p[env, b] - start_p[env, b])
+    if s == wp.float64(1.0):
+        t[env, b] = end_p[env, b]
+
+
+@wp.kernel
+def vertex_positions(
+    y: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    vert_body: wp.array(dtype=wp.int32),
+    vert_count: wp.array(dtype=wp.int32),
+    vert_nodes: wp.array2d(dtype=wp.int32),
+    vert_weight: wp.array2d(dtype=wp.float64),
+    vert_local: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    x: wp.array2d(dtype=wp.vec3d),
+):
+    """World positions of the vertices."""
+    env, v = wp.tid()
+    local = wp.vec3d()
+    if vert_count[v] == 0:
+        local = vert_local[0, v]
+    for k in range(vert_count[v]):
+        local += vert_weight[v, k] * y[env, vert_nodes[v, k]]
+    x[env, v] = R[env, vert_body[v]] * local + t[env, vert_body[v]]
+
+
+@wp.kernel
+def vertex_motion(
+    p: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    vert_body: wp.array(dtype=wp.int32),
+    vert_count: wp.array(dtype=wp.int32),
+    vert_nodes: wp.array2d(dtype=wp.int32),
+    vert_weight: wp.array2d(dtype=wp.float64),
+    # outputs
+    dx: wp.array2d(dtype=wp.vec3d),
+):
+    """World displacements of the vertices for the node displacements p."""
+    env, v = wp.tid()
+    local = wp.vec3d()
+    for k in range(vert_count[v]):
+        local += vert_weight[v, k] * p[env, vert_nodes[v, k]]
+    dx[env, v] = R[env, vert_body[v]] * local
+
+
+@wp.kernel
+def node_world(
+    y: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    node_body: wp.array(dtype=wp.int32),
+    # outputs
+    xw: wp.array2d(dtype=wp.vec3d),
+):
+    """World positions of the nodes."""
+    env, i = wp.tid()
+    xw[env, i] = R[env, node_body[i]] * y[env, i] + t[env, node_body[i]]
+
+
+@wp.kernel
+def predict(
+    xw: wp.array2d(dtype=wp.vec3d),
+    v: wp.array2d(dtype=wp.vec3d),
+    xw_before: wp.array2d(dtype=wp.vec3d),
+    v_before: wp.array2d(dtype=wp.vec3d),
+    second_order: wp.array(dtype=wp.int32),
+    acceleration: wp.array(dtype=wp.vec3d),
+    h: wp.float64,
+    # outputs
+    target: wp.array2d(dtype=wp.vec3d),
+):
+    """x̃ of the nodes, world frame."""
+    env, i = wp.tid()
+    if second_order[env] != 0:
+        a, b = wp.float64(1.0) / wp.float64(3.0), wp.float64(2.0) / wp.float64(9.0)
+        four = wp.float64(4.0)
+        target[env, i] = (
+            a * (four * xw[env, i] - xw_before[env, i])
+            + (b * h) * (four * v[env, i] - v_before[env, i])
+            + (four / wp.float64(9.0) * h * h) * acceleration[env]
+        )
+    else:
+        target[env, i] = xw[env, i] + h * v[env, i] + h * h * acceleration[env]
+
+
+@wp.kernel
+def inertia_target(
+    target: wp.array2d(dtype=wp.vec3d),
+    xw: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    node_body: wp.array(dtype=wp.int32),
+    # outputs
+    local_target: wp.array2d(dtype=wp.vec3d),
+    local_start: wp.array2d(dtype=wp.vec3d),
+):
+    """ỹ and the start position of the nodes in the frames as they are now."""
+    env, i = wp.tid()
+    Rt = wp.transpose(R[env, node_body[i]])
+    local_target[env, i] = Rt * (target[env, i] - t[env, node_body[i]])
+    local_start[env, i] = Rt * (xw[env, i] - t[env, node_body[i]])
+
+
+@wp.kernel
+def node_gradient(
+    y: wp.array2d(dtype=wp.vec3d),
+    local_target: wp.array2d(dtype=wp.vec3d),
+    local_start: wp.array2d(dtype=wp.vec3d),
+    row_start: wp.array(dtype=wp.int32),
+    col: wp.array(dtype=wp.int32),
+    mass: wp.array(dtype=wp.float64),
+    drag: wp.array(dtype=wp.float64),
+    inertia_scale: wp.array(dtype=wp.float64),
+    vert_gradient: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    node_body: wp.array(dtype=wp.int32),
+    node_free: wp.array(dtype=wp.int32),
+    node_vert_start: wp.array(dtype=wp.int32),
+    node_vert: wp.array(dtype=wp.int32),
+    node_vert_weight: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    residual: wp.array2d(dtype=wp.vec3d),
+    force_size: wp.array2d(dtype=wp.float64),
+):
+    """Adds inertia, drag and contact to the elastic gradient; the residual is its negative on the unknowns, zero on bonded nodes.
+
+    ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
+    """
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    g = gradient[env, i]
+    elastic = wp.length(g)
+    for k in range(row_start[i], row_start[i + 1]):
+        j = col[k]
+        if mass[k] != wp.float64(0.0):
+            g += (mass[k] * inertia_scale[env]) * (y[env, j] - local_target[env, j]) + drag[k] * (y[env, j] - local_start[env, j])
+    contact = wp.vec3d()
+    for k in range(node_vert_start[i], node_vert_start[i + 1]):
+        contact += node_vert_weight[k] * vert_gradient[env, node_vert[k]]
+    g += wp.transpose(R[env, node_body[i]]) * contact
+    force_size[env, i] = elastic + wp.length(contact)
+    gradient[env, i] = g
+    if node_free[i] != 0:
+        residual[env, i] = -g
+    else:
+        residual[env, i] = wp.vec3d()
+
+
+@wp.kernel
+def inertia_change(
+    y0: wp.array2d(dtype=wp.vec3d),
+    y1: wp.array2d(dtype=wp.vec3d),
+    local_target: wp.array2d(dtype=wp.vec3d),
+    local_start: wp.array2d(dtype=wp.vec3d),
+    row_start: wp.array(dtype=wp.int32),
+    col: wp.array(dtype=wp.int32),
+    mass: wp.array(dtype=wp.float64),
+    drag: wp.array(dtype=wp.float64),
+    inertia_scale: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    change: wp.array2d(dtype=wp.float64),
+):
+    """Change of the inertial and drag energy from y0 to y1 [J], (y1 − y0)·M((y1 + y0)/2 − ỹ)/h² node by node."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    half = wp.float64(0.5)
+    f = wp.vec3d()
+    for k in range(row_start[i], row_start[i + 1]):
+        j = col[k]
+        if mass[k] != wp.float64(0.0):
+            mean = half * (y0[env, j] + y1[env, j])
+            f += (mass[k] * inertia_scale[env]) * (mean - local_target[env, j]) + drag[k] * (mean - local_start[env, j])
+    change[env, i] = wp.dot(y1[env, i] - y0[env, i], f)
+
+
+@wp.kernel
+def new_velocity(
+    xw_new: wp.array2d(dtype=wp.vec3d),
+    xw: wp.array2d(dtype=wp.vec3d),
+    xw_before: wp.array2d(dtype=wp.vec3d),
+    second_order: wp.array(dtype=wp.int32),
+    h: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    v: wp.array2d(dtype=wp.vec3d),
+    v_before: wp.array2d(dtype=wp.vec3d),
+):
+    """Velocities at the end of the step, world frame."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    v_before[env, i] = v[env, i]
+    if second_order[env] != 0:
+        three, four, two = wp.float64(3.0), wp.float64(4.0), wp.float64(2.0)
+        v[env, i] = (three * xw_new[env, i] - four * xw[env, i] + xw_before[env, i]) / (two * h)
+    else:
+        v[env, i] = (xw_new[env, i] - xw[env, i]) / h
+
+
+@wp.kernel
+def kinetic_energy(
+    v: wp.array2d(dtype=wp.vec3d),
+    row_start: wp.array(dtype=wp.int32),
+    col: wp.array(dtype=wp.int32),
+    mass: wp.array(dtype=wp.float64),
+    # outputs
+    energy: wp.array2d(dtype=wp.float64),
+):
+    """½ v·M v node by node [J]."""
+    env, i = wp.tid()
+    f = wp.vec3d()
+    for k in range(row_start[i], row_start[i + 1]):
+        f += mass[k] * v[env, col[k]]
+    energy[env, i] = wp.float64(0.5) * wp.dot(v[env, i], f)
+
+
+@wp.kernel
+def advance_nodes(
+    y: wp.array2d(dtype=wp.vec3d),
+    p: wp.array2d(dtype=wp.vec3d),
+    alpha: wp.array(dtype=wp.float64),
+    y1: wp.array2d(dtype=wp.vec3d),
+):
+    """y1 = y + alpha p."""
+    env, i = wp.tid()
+    y1[env, i] = y[env, i] + alpha[env] * p[env, i]

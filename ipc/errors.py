@@ -1,0 +1,17 @@
+"""The errors that this package raises; each names the value, the rule and the choices."""
+
+from __future__ import annotations
+
+__all__ = ["IpcError", "OverlapError", "SolverError"]
+
+
+class IpcError(ValueError):
+    """Input that breaks a rule of the solver."""
+
+
+class OverlapError(IpcError):
+    """Surfaces that touch or cross before the first step, or after a state was set by hand."""
+
+
+class SolverError(RuntimeError):
+    """A solve that could not go on, for a reason that is not one environment's state (a buffer that cannot grow, say)."""

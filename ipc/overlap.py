@@ -1,0 +1,113 @@
+"""Finds surfaces that cross, touch or contain each other, and says which primitives and how deep. Plain NumPy: it runs once a start."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipc.layout import Layout, rotation_matrix
+
+__all__ = ["find_overlap", "world_vertices"]
+
+Floats = NDArray[np.float64]
+
+
+def world_vertices(layout: Layout, y: Floats, rotation: Floats, position: Floats) -> Floats:
+    """World positions [m] of all surface vertices (V, 3) of one environment: nodes y (N, 3), frames (bodies, 4) and (bodies, 3)."""
+    local = np.where(
+        (layout.vert_count == 0)[:, None], layout.vert_local, np.einsum("vk,vki->vi", layout.vert_weight, y[layout.vert_nodes])
+    )
+    R = rotation_matrix(rotation)
+    return np.einsum("vij,vj->vi", R[layout.vert_body], local) + position[layout.vert_body]
+
+
+def _box_pairs(a_low: Floats, a_high: Floats, b_low: Floats, b_high: Floats) -> tuple[NDArray, NDArray]:
+    """Indices of overlapping boxes."""
+    reach_a = (a_low <= b_high.max(axis=0)).all(axis=1) & (a_high >= b_low.min(axis=0)).all(axis=1)
+    reach_b = (b_low <= a_high.max(axis=0)).all(axis=1) & (b_high >= a_low.min(axis=0)).all(axis=1)
+    ia, ib = np.flatnonzero(reach_a), np.flatnonzero(reach_b)
+    first, second = [np.zeros(0, int)], [np.zeros(0, int)]
+    for chunk in np.array_split(ia, max(1, len(ia) * len(ib) // 1_000_000)):
+        hit = (a_low[chunk, None] <= b_high[None, ib]).all(-1) & (a_high[chunk, None] >= b_low[None, ib]).all(-1)
+        i, j = np.nonzero(hit)
+        first.append(chunk[i])
+        second.append(ib[j])
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int, float] | None:
+    """The crossing of an edge and a triangle that goes deepest: edge, face, and depth of the edge's end behind the face [m]."""
+    ends, corners = x[edges], x[faces]
+    i, j = _box_pairs(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
+    apart = (edges[i][:, :, None] != faces[j][:, None, :]).all(axis=(1, 2))
+    i, j = i[apart], j[apart]
+    if len(i) == 0:
+        return None
+    p, q = ends[i, 0], ends[i, 1]
+    a, b, c = (corners[j, k] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(size, 1e-300)
+    hp, hq = ((p - a) * normal).sum(axis=1), ((q - a) * normal).sum(axis=1)
+    across = (hp * hq <= 0) & (hp != hq)
+    s = np.where(across, hp / np.where(across, hp - hq, 1.0), 0.0)[:, None]
+    point = p + s * (q - p)
+    inside = across.copy()
+    for u, v in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(v - u, point - u) * normal).sum(axis=1) >= 0
+    if not inside.any():
+        return None
+    depth = np.where(inside, -np.minimum(hp, hq), -np.inf)
+    worst = int(np.argmax(depth))
+    return int(i[worst]), int(j[worst]), float(depth[worst])
+
+
+def _contains(x: Floats, faces: NDArray, point: Floats) -> bool:
+    """Whether a closed surface winds around the point (van Oosterom, Strackee 1983); false for an open surface seen from outside."""
+    a, b, c = (x[faces[:, k]] - point for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    top = (a * np.cross(b, c)).sum(axis=1)
+    bottom = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return abs(2 * np.arctan2(top, bottom).sum()) > 3 * np.pi
+
+
+def _is_closed(faces: NDArray) -> bool:
+    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return bool((np.unique(sides, axis=0, return_counts=True)[1] == 2).all())
+
+
+def find_overlap(layout: Layout, y: Floats, rotation: Floats, position: Floats) -> str | None:
+    """Describe the first overlap of one environment, or None.
+
+    Args:
+        layout: the flat arrays.
+        y: node positions [m] (N, 3), in their frames.
+        rotation, position: frames, quaternions (bodies, 4) and [m] (bodies, 3).
+    """
+    x = world_vertices(layout, y, rotation, position)
+    normals = rotation_matrix(rotation)[:, :, 2]
+    for a, b in layout.pairs:
+        na, nb = layout.names[a], layout.names[b]
+        va = slice(layout.vert_start[a], layout.vert_start[a + 1])
+        if layout.half_space[b]:
+            height = (x[va] - position[b]) @ normals[b]
+            low = int(np.argmin(height))
+            if height[low] <= 0:
+                return f"vertex {low} of {na!r} lies {-height[low]:.3g} m inside the half-space {nb!r}"
+            continue
+        for first, second in ((a, b), (b, a)) if a != b else ((a, b),):
+            edges = layout.edges[layout.edge_start[first] : layout.edge_start[first + 1]]
+            faces = layout.faces[layout.face_start[second] : layout.face_start[second + 1]]
+            hit = _edge_face_hits(x, edges, faces)
+            if hit is not None:
+                e, f = edges[hit[0]] - layout.vert_start[first], hit[1]
+                return (
+                    f"edge {hit[0]} (vertices {e[0]}, {e[1]}) of {layout.names[first]!r} goes {hit[2]:.3g} m through "
+                    f"triangle {f} of {layout.names[second]!r}: start with the surfaces apart"
+                )
+        if a != b:
+            for inner, outer in ((a, b), (b, a)):
+                faces = layout.faces[layout.face_start[outer] : layout.face_start[outer + 1]]
+                if _is_closed(faces) and _contains(x, faces, x[layout.vert_start[inner]]):
+                    return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}: start with the surfaces apart"
+    return None

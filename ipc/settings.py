@@ -1,0 +1,69 @@
+"""The numbers that steer a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ipc.errors import IpcError
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a world; every one has a default that suits a gel pad of some millimetres.
+
+    Attributes:
+        dt: time step h [s].
+        gravity: acceleration [m/s²], world frame.
+        integrator: ``"euler"`` (backward Euler) or ``"bdf2"`` (second order; its first step, and the one after a reset, is Euler).
+        velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
+        max_newton: Newton iterations a step; reaching it is reported, and the state so far is kept.
+        d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
+        kappa: barrier stiffness κ [Pa]; None: the largest Young's modulus of the soft bodies (1e5 Pa without one).
+        friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
+        friction_velocity: ε_v [m/s]; below this sliding speed friction grows smoothly from zero.
+        friction_relags: how often a step may renew the lagged normal forces and tangents after its first solve.
+        friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
+        linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
+        max_linear: PCG iterations a solve.
+        max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
+        motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
+    """
+
+    dt: float = 0.01
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    integrator: Literal["euler", "bdf2"] = "euler"
+    velocity_tolerance: float = 1e-4
+    max_newton: int = 100
+    d_hat: float | None = None
+    kappa: float | None = None
+    friction: float = 0.0
+    friction_velocity: float = 1e-4
+    friction_relags: int = 2
+    friction_tolerance: float = 0.01
+    linear_tolerance: float = 1e-3
+    max_linear: int = 2000
+    max_line_search: int = 30
+    motion_fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):
+            if not getattr(self, name) > 0:
+                raise IpcError(f"{name} = {getattr(self, name)}: it must be positive")
+        for name in ("max_newton", "max_linear", "max_line_search"):
+            if getattr(self, name) < 1:
+                raise IpcError(f"{name} = {getattr(self, name)}: at least one is needed")
+        for name in ("d_hat", "kappa"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise IpcError(f"{name} = {value}: it must be positive, or None for the default")
+        if not self.friction >= 0:
+            raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
+        if self.friction_relags < 0:
+            raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
+        if self.integrator not in ("euler", "bdf2"):
+            raise IpcError(f"integrator = {self.integrator!r}: choose 'euler' or 'bdf2'")
+        if not 0 < self.motion_fraction < 1:
+            raise IpcError(f"motion_fraction = {self.motion_fraction}: it must lie between 0 and 1")

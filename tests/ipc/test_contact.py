@@ -1,0 +1,176 @@
+"""Contact energy, forces, Hessian and friction of whole surfaces against ipctk and finite differences."""
+
+from __future__ import annotations
+
+import ipctk
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import ipc
+from ipc.layout import build_layout
+from ipc.newton import Newton
+from tests.ipc.conftest import unit_cell
+
+D_HAT, KAPPA, MU, EPS = 0.05, 3e4, 0.4, 1e-3
+
+
+class Scene:
+    """Two cubes, one turned and tilted above the other, as bare contact terms."""
+
+    def __init__(self, gap: float, tilt: tuple[float, float, float], friction: float = 0.0) -> None:
+        a, b = unit_cell(2), unit_cell(2, 0.7)
+        angle = np.linalg.norm(tilt)
+        axis = np.array(tilt) / max(angle, 1e-300)
+        K = np.cross(np.eye(3), axis) * -1
+        R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+        v = (b.vertices - 0.35) @ R.T + [0.5, 0.5, 0.0]
+        v[:, 2] += 1.0 + gap - v[:, 2].min()
+        bodies = [ipc.SoftBody("a", a, ipc.Material(1e5)), ipc.SoftBody("b", ipc.TetMesh(v, b.tets), ipc.Material(1e5))]
+        self.layout = build_layout(bodies, friction, {}, [])
+        settings = ipc.Settings(dt=1.0, friction_velocity=EPS)
+        self.solver = Newton(self.layout, settings, 1, D_HAT, KAPPA, wp.get_device("cpu"))
+        self.solver.y.assign(self.layout.node_rest[None])
+        self.solver.frame_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
+        self.solver.goal_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
+        self.solver.set_frames(self.solver.share, self.solver.R, self.solver.t)
+        self.solver.active.fill_(1)
+        self.x = self.place(self.layout.node_rest)
+        self.mesh = ipctk.CollisionMesh(self.x, self.layout.edges, self.layout.faces)
+        self.potential = ipctk.BarrierPotential(D_HAT, KAPPA, True)
+
+    def place(self, nodes: np.ndarray) -> np.ndarray:
+        self.solver.y.assign(nodes[None])
+        self.solver.place_vertices(self.solver.y, self.solver.R, self.solver.t, self.solver.x)
+        return self.solver.x.numpy()[0].copy()
+
+    def evaluate(self, x: np.ndarray, start: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+        """Barrier energy and gradient (V, 3) of barrier and friction."""
+        s = self.solver
+        s.x.assign(x[None])
+        s.x_start.assign((x if start is None else start)[None])
+        s.dx.zero_()
+        s.collision.refresh(s.x, s.dx, s.active)
+        s.collision.assemble(s.x, s.x_start, s.R, s.t, s.kappa, EPS, s.active, s.vert_gradient, s.barrier_energy)
+        return float(s.barrier_energy.numpy()[0]), s.vert_gradient.numpy()[0].copy()
+
+    def hessian(self) -> np.ndarray:
+        """Σ q qᵀ of the last evaluation, (3V, 3V)."""
+        contacts = self.solver.collision.contacts
+        rows = int(contacts.row_count.numpy()[0])
+        n = len(self.x)
+        verts, q = contacts.row_verts.numpy()[0, :rows], contacts.row.numpy()[0, :rows]
+        Q = np.zeros((rows, n, 3))
+        for r in range(rows):
+            for k in range(4):
+                if verts[r, k] >= 0:
+                    Q[r, verts[r, k]] += q[r, :, k]
+        Q = Q.reshape(rows, 3 * n)
+        return Q.T @ Q
+
+    def collisions(self, x: np.ndarray) -> ipctk.NormalCollisions:
+        found = ipctk.NormalCollisions()
+        found.use_area_weighting = True
+        found.build(self.mesh, np.asfortranarray(x), D_HAT)
+        return found
+
+
+TILTS = {"flat": (0.0, 0.0, 0.0), "turned": (0.0, 0.0, 0.4), "corner": (0.5, 0.4, 0.3), "edge": (0.3, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+@pytest.mark.parametrize("gap", [0.002, 0.03])
+def test_energy_and_gradient_match_ipctk(tilt: str, gap: float) -> None:
+    scene = Scene(gap, TILTS[tilt])
+    energy, gradient = scene.evaluate(scene.x)
+    found = scene.collisions(scene.x)
+    x = np.asfortranarray(scene.x)
+    expected = scene.potential(found, scene.mesh, x)
+    expected_gradient = scene.potential.gradient(found, scene.mesh, x).reshape(-1, 3)
+    assert len(found) > 0 and np.linalg.norm(gradient) > 1e-8
+    assert energy == pytest.approx(expected, rel=1e-10)
+    assert np.abs(gradient - expected_gradient).max() < 1e-10 * np.abs(expected_gradient).max()
+    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
+
+
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+def test_hessian_is_definite_and_near_ipctk(tilt: str) -> None:
+    """Along the normal it is ipctk's, exactly where no pair is mollified; clamping 2×2 instead of 12×12 adds up to a tenth there."""
+    scene = Scene(0.02, TILTS[tilt])
+    scene.evaluate(scene.x)
+    H = scene.hessian()
+    found = scene.collisions(scene.x)
+    exact = scene.potential.hessian(found, scene.mesh, np.asfortranarray(scene.x), ipctk.PSDProjectionMethod.CLAMP)
+    exact = scipy.sparse.csr_matrix(exact).toarray()
+    assert np.linalg.eigvalsh(H)[0] > -1e-10 * np.linalg.eigvalsh(H)[-1]
+    u = np.zeros_like(scene.x)
+    u[:, 2] = scene.x[:, 2] > 1.001
+    u = u.ravel()
+    mollified = tilt == "flat"
+    assert u @ H @ u == pytest.approx(u @ exact @ u, rel=0.1 if mollified else 1e-3)
+    assert np.linalg.norm(H - exact) < 0.2 * np.linalg.norm(exact)
+
+
+def test_gradient_matches_finite_differences_near_parallel_edges(rng: np.random.Generator) -> None:
+    """Mollified pairs included: the energy is smooth, and its gradient is what is applied."""
+    scene = Scene(0.01, (0.0, 0.0, 0.01))
+    x = scene.x + 1e-3 * rng.standard_normal(scene.x.shape)
+    _, g = scene.evaluate(x)
+    for _ in range(6):
+        u = rng.standard_normal(x.shape)
+        h = 1e-7
+        slope = (scene.evaluate(x + h * u)[0] - scene.evaluate(x - h * u)[0]) / (2 * h)
+        assert abs((g * u).sum()) > 1e-3
+        assert slope == pytest.approx((g * u).sum(), rel=2e-6)
+
+
+@pytest.mark.parametrize("slide", [0.3 * EPS, 5 * EPS])
+def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
+    scene = Scene(0.02, TILTS["corner"], friction=MU)
+    scene.evaluate(scene.x)
+    scene.solver.collision.lag(scene.solver.active)
+    _, normal = scene.evaluate(scene.x)
+    moved = scene.x.copy()
+    moved[scene.x[:, 2] > 1.001] += slide * np.array([0.6, 0.8, 0.1])
+    moved += 0.05 * slide * rng.standard_normal(moved.shape)
+    energy0, _ = scene.evaluate(moved, start=scene.x)
+    friction = scene.solver.vert_gradient.numpy()[0] - barrier_gradient(moved)
+    found = scene.collisions(scene.x)
+    tangential = ipctk.TangentialCollisions()
+    tangential.build(scene.mesh, np.asfortranarray(scene.x), found, scene.potential, MU)
+    potential = ipctk.FrictionPotential(EPS)
+    expected = potential.gradient(tangential, scene.mesh, np.asfortranarray(moved - scene.x)).reshape(-1, 3)
+    assert np.linalg.norm(expected) > 1e-6 and energy0 >= 0
+    assert np.abs(friction - expected).max() < 1e-9 * np.abs(expected).max()
+    assert np.abs(normal).max() > 0
+
+
+def barrier_gradient(x: np.ndarray) -> np.ndarray:
+    """The barrier gradient alone."""
+    bare = Scene(0.02, TILTS["corner"])
+    return bare.evaluate(x)[1]
+
+
+def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -> None:
+    scene = Scene(0.02, TILTS["corner"], friction=MU)
+    scene.evaluate(scene.x)
+    scene.solver.collision.lag(scene.solver.active)
+    far = scene.x.copy()
+    far[scene.x[:, 2] > 1.001] += [0.4 * EPS, 0.1 * EPS, 0.0]
+    bare = Scene(0.02, TILTS["corner"])
+
+    def friction_gradient(x: np.ndarray) -> np.ndarray:
+        return scene.evaluate(x, start=scene.x)[1] - bare.evaluate(x)[1]
+
+    scene.evaluate(far, start=scene.x)
+    H = scene.hessian()
+    bare.evaluate(far)
+    H = H - bare.hessian()
+    for _ in range(3):
+        u = rng.standard_normal(far.shape)
+        h = 1e-3 * EPS
+        expected = (friction_gradient(far + h * u) - friction_gradient(far - h * u)).ravel() / (2 * h)
+        got = H @ u.ravel()
+        assert np.abs(expected).max() > 1e-3
+        assert np.abs(got - expected).max() < 1e-4 * np.abs(expected).max()

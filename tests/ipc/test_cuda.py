@@ -1,0 +1,40 @@
+"""The same press on the CPU and on CUDA."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ipc
+from tests.ipc.conftest import bonded_pad, small_pad
+
+pytestmark = pytest.mark.gpu
+
+
+def press(device: str, num_envs: int) -> ipc.World:
+    radius = 4e-3
+    ball = ipc.KinematicBody("ball", ipc.icosphere(radius, 2), ipc.Pose((1e-4, 2e-4, radius + 1.2e-4)))
+    settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-9, linear_tolerance=1e-8, friction_relags=1)
+    world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=num_envs, device=device)
+    depth = np.linspace(0.3e-3, 0.6e-3, 4)[:num_envs]
+    for k in range(1, 7):
+        move = np.stack([0 * depth, 0 * depth, -depth * k / 6], axis=1)
+        world.set_target("ball", world._start.frame_position[:, 1] + move)
+        report = world.step()
+        assert report.converged.all() and not report.failed.any()
+    return world
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
+def test_cuda_agrees_with_the_cpu() -> None:
+    one, other = press("cpu", 4), press("cuda", 4)
+    difference = np.abs(one.positions("pad") - other.positions("pad")).max()
+    assert difference <= 1e-6 * one.d_hat, f"positions differ by {difference:.3g} m"
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
+def test_batch_on_cuda_equals_a_single_world() -> None:
+    batch, single = press("cuda", 4), press("cuda", 1)
+    difference = np.abs(batch.positions("pad")[0] - single.positions("pad")[0]).max()
+    assert difference <= 1e-9, f"positions differ by {difference:.3g} m"

@@ -1,0 +1,184 @@
+"""Free bodies: momentum, energy, falls, slopes, affine bodies, half-spaces."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+import ipc
+from tests.ipc.conftest import unit_cell
+
+THETA = np.arctan(0.5)
+
+
+def block_on_slope(mu: float, kind: str, theta: float = THETA, dt: float = 0.01) -> ipc.World:
+    """A 0.1 m block of 1 kg on a plane; the slope is in the direction of gravity."""
+    size = 0.1
+    pose = ipc.Pose((0.0, 0.0, size / 2 + 0.8e-3))
+    if kind == "affine":
+        body: ipc.AffineBody | ipc.SoftBody = ipc.AffineBody(
+            "block", ipc.box_surface((size, size, size)), ipc.Stiff(1e8, 1000.0), pose
+        )
+    else:
+        mesh = unit_cell(1, size)
+        body = ipc.SoftBody("block", ipc.TetMesh(mesh.vertices - [0, 0, size / 2], mesh.tets), ipc.Material(1e7, 0.3), pose=pose)
+    gravity = (9.81 * np.sin(theta), 0.0, -9.81 * np.cos(theta))
+    settings = ipc.Settings(
+        dt=dt,
+        gravity=gravity,
+        d_hat=1e-3,
+        kappa=1e5,
+        friction=mu,
+        friction_velocity=1e-4,
+        velocity_tolerance=1e-8,
+        friction_relags=20,
+        friction_tolerance=1e-6,
+    )
+    return ipc.World([body, ipc.HalfSpace("slope")], settings, device="cpu")
+
+
+@pytest.mark.parametrize("kind", ["affine", "soft"])
+@pytest.mark.parametrize("mu", [0.5, 0.51, 0.8])
+def test_block_sticks_with_the_creep_of_the_mollifier(kind: str, mu: float) -> None:
+    """Under the share r of its friction limit it creeps at ε_v (1 − √(1 − r)); at r = 1 exactly it keeps a speed of the size of ε_v."""
+    world = block_on_slope(mu, kind, theta=0.0)
+    speeds = []
+    for k in range(50):
+        # Pressed on first, pulled along little by little: at the threshold itself nothing would stop a block that once slid.
+        world.set_gravity((9.81 * np.sin(THETA) * np.clip((k - 10) / 25, 0, 1), 0.0, -9.81 * np.cos(THETA)))
+        before = world.positions("block")[0].mean(axis=0)[0]
+        report = world.step()
+        speeds.append((world.positions("block")[0].mean(axis=0)[0] - before) / world.settings.dt)
+        assert report.converged[0] and report.min_gap[0] > 0
+    predicted = 1e-4 * (1 - np.sqrt(1 - 0.5 / mu))
+    if mu == 0.5:
+        assert predicted <= speeds[-1] < 2 * predicted
+        assert speeds[-1] == pytest.approx(speeds[-6], rel=0.01)
+    else:
+        assert speeds[-1] == pytest.approx(predicted, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", ["affine", "soft"])
+def test_block_slides_with_the_right_acceleration(kind: str) -> None:
+    world = block_on_slope(0.49, kind)
+    speeds = []
+    for _ in range(80):
+        before = world.positions("block")[0].mean(axis=0)[0]
+        assert world.step().converged[0]
+        speeds.append((world.positions("block")[0].mean(axis=0)[0] - before) / world.settings.dt)
+    acceleration = (speeds[-1] - speeds[39]) / (40 * world.settings.dt)
+    expected = 9.81 * (np.sin(THETA) - 0.49 * np.cos(THETA))
+    assert acceleration == pytest.approx(expected, rel=0.01)
+    wrench = world.wrench("slope").force[0]
+    weight = 9.81 * np.cos(THETA)
+    assert wrench[2] == pytest.approx(-weight, rel=1e-3)
+    assert wrench[0] == pytest.approx(0.49 * weight, rel=1e-3)
+
+
+def test_collision_keeps_momentum_and_energy_never_rises() -> None:
+    """Two soft cubes meet off-centre, without gravity: momentum drifts by less than 1e-8 of what is exchanged."""
+    a, b = unit_cell(2, 0.02), unit_cell(2, 0.02)
+    bodies = [
+        ipc.SoftBody("a", a, ipc.Material(1e5, 0.4)),
+        ipc.SoftBody("b", ipc.TetMesh(b.vertices + np.array([0.023, 0.006, 0.004]), b.tets), ipc.Material(2e5, 0.4)),
+    ]
+    settings = ipc.Settings(dt=2e-3, d_hat=1e-3, friction=0.3, velocity_tolerance=1e-11, linear_tolerance=1e-8)
+    world = ipc.World(bodies, settings, device="cpu")
+    world.set_velocity("a", (1.0, 0.0, 0.0))
+    mass = 0.02**3 * 1000
+    lumped = [
+        np.bincount(m.tets.ravel(), weights=np.full(m.tets.size, mass / m.tets.size), minlength=len(m.vertices)) for m in (a, b)
+    ]
+
+    def momentum() -> np.ndarray:
+        return np.sum([w @ world.velocities(n)[0] for w, n in zip(lumped, "ab", strict=True)], axis=0)
+
+    start, energies, touched = momentum(), [0.5 * mass], False
+    for _ in range(15):
+        report = world.step()
+        assert report.converged[0]
+        touched |= bool(report.pairs[0])
+        energies.append(float(report.elastic[0] + report.kinetic[0] + report.barrier[0]))
+        drift = np.abs(momentum() - start).max() / mass
+        assert drift < 1e-8, f"momentum drifted by {drift:.3g} of that of the moving cube"
+    assert touched and np.abs(world.velocities("b")[0].mean(axis=0)[0]) > 0.1
+    assert (np.diff(energies) <= 1e-9 * energies[0]).all(), f"energy rose by {np.diff(energies).max():.3g} J"
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("bdf2", 2)])
+def test_fall_and_order_of_convergence(integrator: Literal["euler", "bdf2"], order: int) -> None:
+    """A soft cube bonded on one side and let go: the other side's way converges with the order of the integrator."""
+    mesh = ipc.box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
+    tips = []
+    for steps in (10, 20, 40):
+        settings = ipc.Settings(
+            dt=0.02 / steps, gravity=(0, 0, -2.0), integrator=integrator, velocity_tolerance=1e-10, linear_tolerance=1e-8
+        )
+        bonded = ipc.vertices_in_box(mesh, (0, -1, -1), (0, 1, 1))
+        world = ipc.World([ipc.SoftBody("bar", mesh, ipc.Material(2e3, 0.3), bonded=bonded)], settings, device="cpu")
+        for _ in range(steps):
+            world.step()
+        tips.append(world.positions("bar")[0, -1])
+    rate = np.log2(np.linalg.norm(tips[1] - tips[0]) / np.linalg.norm(tips[2] - tips[1]))
+    assert np.linalg.norm(tips[0] - mesh.vertices[-1]) > 5e-5
+    assert rate == pytest.approx(order, abs=0.35), f"order {rate:.2f}"
+
+
+def test_affine_body_falls_turns_and_stays_rigid() -> None:
+    """Free flight of a spinning box: its centre falls freely, its angular momentum stays, its map stays near a rotation."""
+    box = ipc.box_surface((0.04, 0.02, 0.03))
+    body = ipc.AffineBody("box", box, ipc.Stiff(1e7, 500.0), ipc.Pose((0.1, 0.0, 0.2), (np.cos(0.2), 0.0, np.sin(0.2), 0.0)))
+    h, steps = 1e-3, 40
+    settings = ipc.Settings(dt=h, gravity=(0.0, 0.0, -9.81), velocity_tolerance=1e-12, linear_tolerance=1e-10)
+    world = ipc.World([body], settings, device="cpu")
+    A, p = world.affine_pose("box")
+    assert np.abs(A[0] @ A[0].T - np.eye(3)).max() < 1e-12 and p[0] == pytest.approx([0.1, 0, 0.2], abs=1e-15)
+    state = world.save()
+    omega = np.array([0.0, 0.0, 10.0])
+    nodes = state.y[0]
+    state.velocity[0] = np.cross(omega, nodes - p[0]) + np.array([0.3, 0, 0])
+    world.restore(state)
+
+    def angular() -> np.ndarray:
+        mass, y, v = world.layout.mass.reshape(4, 4), world.save().y[0], world.velocities("box")[0]
+        centre, speed = mass.sum(0) @ y / mass.sum(), mass.sum(0) @ v / mass.sum()
+        return np.einsum("kl,kli->i", mass, np.cross((y - centre)[:, None], (v - speed)[None]))
+
+    start = angular()
+    for _ in range(steps):
+        assert world.step().converged[0]
+    A, p = world.affine_pose("box")
+    fall = -9.81 * h * h * steps * (steps + 1) / 2  # backward Euler's own parabola
+    assert p[0] == pytest.approx([0.1 + 0.3 * h * steps, 0, 0.2 + fall], abs=1e-9)
+    assert np.abs(A[0] @ A[0].T - np.eye(3)).max() < 1e-3
+    assert np.linalg.norm(angular() - start) < 0.2 * np.linalg.norm(start)  # backward Euler damps spin
+    assert world.layout.mass.sum() == pytest.approx(500 * 0.04 * 0.02 * 0.03, rel=1e-12)
+
+
+def test_affine_mass_is_that_of_the_solid() -> None:
+    """Centre of mass and second moments of a box from its surface alone."""
+    size, density = np.array([0.04, 0.02, 0.03]), 700.0
+    from ipc.layout import build_layout
+
+    layout = build_layout([ipc.AffineBody("box", ipc.box_surface((0.04, 0.02, 0.03)), ipc.Stiff(1e7, density))], 0.0, {}, [])
+    mass, y = layout.mass.reshape(4, 4), layout.node_rest
+    total = density * size.prod()
+    assert np.abs(mass.sum(axis=0) @ y).max() < 1e-15
+    assert np.einsum("kl,ki,lj->ij", mass, y, y) == pytest.approx(np.diag(total * size**2 / 12), abs=1e-12 * total)
+
+
+def test_fast_ball_does_not_tunnel() -> None:
+    """An affine ball at 60 m/s meets a thin bonded pad: a step is far longer than the pad is thick."""
+    mesh = ipc.domed_pad((12e-3, 12e-3), 2e-3, (np.inf, np.inf), (4, 4, 1))
+    pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.4), bonded=ipc.vertices_in_box(mesh, (-1, -1, -2e-3), (1, 1, -2e-3)))
+    ball = ipc.AffineBody("ball", ipc.icosphere(2e-3, 1), ipc.Stiff(1e7, 1000.0), ipc.Pose((2e-4, 1e-4, 5e-3)))
+    world = ipc.World([pad, ball], ipc.Settings(dt=1e-3, d_hat=2e-4, max_newton=200), device="cpu")
+    world.set_velocity("ball", (0.0, 0.0, -60.0))
+    lowest = np.inf
+    for _ in range(8):
+        report = world.step()
+        assert report.min_gap[0] > 0 and report.min_det[0] > 0 and not report.failed[0]
+        lowest = min(lowest, world.positions("ball")[0, :, 2].min())
+    assert -2e-3 < lowest < 0, f"lowest point {lowest:.3g} m"
