@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,6 +16,14 @@ from ipc.errors import IpcError
 from ipc.meshes import TetMesh, TriMesh, tet_volumes
 
 __all__ = ["tetrahedralize"]
+
+_FILL = """
+import sys
+import numpy as np, pytetwild
+given = np.load("surface.npz")
+found = pytetwild.tetrahedralize(given["vertices"], given["faces"], edge_length_abs=float(sys.argv[1]), quiet=True)
+np.savez("tets.npz", vertices=np.asarray(found[0], np.float64), tets=np.asarray(found[1], np.int32))
+"""
 
 
 def _default_cache() -> Path:
@@ -29,7 +40,7 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
         cache: folder of finished meshes, named by the SHA-256 of surface and target; by default under the user's cache folder.
 
     Raises:
-        IpcError: without pytetwild (``pip install "raytac[ipc]"``), or if the target is not positive.
+        IpcError: without pytetwild (``pip install "raytac[ipc]"``), if the target is not positive, or if pytetwild fails.
     """
     if not edge_length > 0:
         raise IpcError(f"edge_length = {edge_length} m: it must be positive")
@@ -41,14 +52,7 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
     if path.is_file():
         with np.load(path) as stored:
             return TetMesh(stored["vertices"], stored["tets"])
-    try:
-        import pytetwild
-    except ImportError as error:
-        raise IpcError('tetrahedralize needs pytetwild: pip install "raytac[ipc]", or pass tetrahedra') from error
-    vertices, tets = pytetwild.tetrahedralize(  # pyright: ignore[reportPrivateImportUsage]
-        surface.vertices, surface.faces.astype(np.int32), edge_length_abs=edge_length, quiet=True
-    )[:2]
-    vertices, tets = np.asarray(vertices, dtype=np.float64), np.asarray(tets, dtype=np.int32)
+    vertices, tets = _fill(surface, edge_length)
     negative = tet_volumes(vertices, tets) < 0
     tets[negative] = tets[negative][:, [0, 1, 3, 2]]
     mesh = TetMesh(vertices, tets)
@@ -58,3 +62,17 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
         np.savez(handle, vertices=mesh.vertices, tets=mesh.tets)
     Path(handle.name).replace(path)
     return mesh
+
+
+def _fill(surface: TriMesh, edge_length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and tetrahedra, from a process of its own: fTetWild leaves a file in the working directory and may abort."""
+    if importlib.util.find_spec("pytetwild") is None:
+        raise IpcError('tetrahedralize needs pytetwild: pip install "raytac[ipc]", or pass tetrahedra')
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "surface.npz", vertices=surface.vertices, faces=surface.faces.astype(np.int32))
+        done = subprocess.run([sys.executable, "-c", _FILL, repr(float(edge_length))], cwd=folder, capture_output=True, text=True)
+        if done.returncode != 0:
+            last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+            raise IpcError(f"pytetwild could not fill the surface with an edge length of {edge_length} m: {last[0]}")
+        with np.load(Path(folder) / "tets.npz") as found:
+            return found["vertices"], found["tets"]

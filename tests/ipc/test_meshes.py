@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -62,12 +60,12 @@ def test_tetwild_fills_a_surface_and_reads_its_cache(tmp_path: Path, monkeypatch
     box = ipc.box_surface((1.0, 1.0, 1.0))
     calls = []
 
-    def fake(vertices: np.ndarray, faces: np.ndarray, **options: object) -> tuple[np.ndarray, np.ndarray]:
-        calls.append(options["edge_length_abs"])
+    def fake(surface: ipc.TriMesh, edge_length: float) -> tuple[np.ndarray, np.ndarray]:
+        calls.append(edge_length)
         mesh = ipc.box_mesh([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])
         return mesh.vertices, mesh.tets[:, [0, 2, 1, 3]]
 
-    monkeypatch.setitem(sys.modules, "pytetwild", types.SimpleNamespace(tetrahedralize=fake))
+    monkeypatch.setattr("ipc.tetwild._fill", fake)
     for _ in range(2):
         mesh = tetrahedralize(box, 0.5, cache=tmp_path)
         assert tet_volumes(mesh.vertices, mesh.tets).sum() == pytest.approx(1.0)
