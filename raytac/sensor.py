@@ -273,6 +273,10 @@ class TactileSensor:
         return object_height(self._pad.parts, surface.pad_from_object, surface.grid.x, surface.grid.y)
 
     def _surface(self, state: ContactState) -> GelSurface:
+        if not hasattr(state, "pad_from_object"):
+            raise InputError(
+                "state", value=type(state).__name__, rule="must be a GelSurface, or a state of the physics that load() returned"
+            )
         if self._pad is None:
             raise InputError("state", value=type(state).__name__, rule="needs a scene: call load() first, or give a GelSurface")
         if state.scene is not None and state.scene != self._pad.scene:

@@ -69,7 +69,11 @@ class PressArgs(CommonOptions):
             optics_options=self._optics_options(),
         )
         scene = load_press(self.scene)
-        out = self.out if self.out is not None else Path("runs") / "press" / scene.name
+        out = (
+            self.out
+            if self.out is not None
+            else Path("runs") / "press" / (scene.name + ("" if self.optics == "raytrace" else f"-{self.optics}"))
+        )
         for path in run_press(sensor, scene, out, outputs=outputs, start=start):
             print(path)
         return 0
