@@ -4,16 +4,15 @@ The forward model is raytac's own: the ball pressed into the rigid pad, the ``fa
 sensor's response. Light is additive, so one rendering with every LED in a layer of its own gives the derivatives by a parameter of
 all LEDs at once, and derivatives by powers are exact. Every third press is left out of the fit and scored.
 
-    python experiments/fit_lights.py --data DIR --out runs/fit_lights
+    python experiments/fit_lights.py --data DIR --out runs/fit_lights                   # about 5 minutes on two cores
+    python experiments/fit_lights.py --data DIR --iterations 0 --depth-factor 1.1       # scores the sensor as it is
 
-DIR holds ``background.png``, ``labels.csv`` (columns ``diameter``, ``index``, ``cx_px``, ``cy_px``, ``r_px``, ``fully_visible``) and
-``DIAMETER_INDEX.png``, all at the sensor's resolution. Written: ``lights.toml``, ``sensor.toml`` (the numbers of the sensor file that
+raytac/report/ball_presses.py says what DIR holds. Written: ``lights.toml``, ``sensor.toml`` (the numbers of the sensor file that
 belong to it), ``presses.png`` and ``metrics.json``. A fit that is interrupted leaves what it reached in ``lights.toml``.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import sys
 import time
@@ -25,18 +24,16 @@ import tyro
 from tqdm import tqdm
 
 from raytac.errors import InputError, RaytacError
-from raytac.gel.elastic import PYRAMID_SIGMAS, ElasticSurround
-from raytac.gel.object_height import object_height
-from raytac.gel.pad import make_grid, rest_height
-from raytac.gel.part import primitive
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import CommonOptions
-from raytac.io.png import read_png
 from raytac.optics.lamp import Lamp
 from raytac.optics.raytrace import RayTracer
+from raytac.report.ball_presses import Photographs, encode, press_balls, read_photographs
 from raytac.specs import LedSpec, LightsSpec, SensorSpec, load_sensor, with_lights
+from raytac.specs.lights_text import lights_text
 from raytac.specs.sensor_check import led_corners
 
 CHANNELS = ("red", "green", "blue")
@@ -63,103 +60,12 @@ class Args(CommonOptions):
     """Depth of a press over that of a ball whose overlap with the resting gel is the labelled circle (docs/rigid-pad.md)."""
     surround_scale: float = 1.0
     """Widths of the elastic surround over Taxim's."""
-    led_size_mm: tuple[float, float] | None = None
-    """Size of every LED; None keeps that of the sensor's lights."""
     iterations: int = 30
     """Steps of the solver at each of the two resolutions."""
     background_weight: float = 0.7
     """Weight of a pixel of the image at rest against one of a press."""
     quick: bool = False
-    """Few presses, small images, two steps: shows that all runs."""
-
-
-@dataclass(frozen=True)
-class Photographs:
-    """Images in linear full scale: ``background`` (H, W, 3), ``presses`` (N, H, W, 3); ``circles`` (N, 3): x, y, radius [px] at the
-    sensor's resolution; ``radius``: of the ball [m]."""
-
-    background: np.ndarray
-    presses: np.ndarray
-    circles: np.ndarray
-    radius: float
-
-    def take(self, index: np.ndarray) -> Photographs:
-        return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index])
-
-    def shrunk(self, factor: int) -> Photographs:
-        """Mean of every ``factor`` × ``factor`` pixels."""
-
-        def mean(image: np.ndarray) -> np.ndarray:
-            *batch, height, width, _ = image.shape
-            return image.reshape(*batch, height // factor, factor, width // factor, factor, 3).mean((-4, -2))
-
-        return dataclasses.replace(self, background=mean(self.background), presses=mean(self.presses))
-
-    def distance(self, sensor: SensorSpec) -> np.ndarray:
-        """Distance of every pixel from the circle's centre over its radius, (N, H, W)."""
-        height, width = self.background.shape[:2]
-        v, u = (np.mgrid[:height, :width] + 0.5) * sensor.camera.resolution[0] / width
-        x, y, r = self.circles.T[:, :, None, None]
-        return np.hypot(u - x, v - y) / r
-
-
-def encode(linear: np.ndarray, gamma: float) -> np.ndarray:
-    """8-bit levels, not rounded; the lower end keeps slopes finite."""
-    return 255 * np.clip(linear, 1e-6, 1) ** (1 / gamma)
-
-
-def read_photographs(folder: Path, sensor: SensorSpec) -> Photographs:
-    """The fully visible presses of a folder.
-
-    Raises:
-        InputError: no such folder, a missing file, an image of another size, more than one ball, or no fully visible press.
-    """
-    for needed in (folder, folder / "labels.csv", folder / "background.png"):
-        if not needed.exists():
-            raise InputError("data", value=str(needed), rule="must exist: background.png, labels.csv and photographs, see --help")
-    with (folder / "labels.csv").open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["fully_visible"] == "1"]
-    balls = {row["diameter"] for row in rows}
-    if len(balls) != 1:
-        raise InputError("data", value=sorted(balls), rule="must hold fully visible presses of one ball")
-    width, height = sensor.camera.resolution
-
-    def image(path: Path) -> np.ndarray:
-        pixels = read_png(path)
-        if pixels.shape != (height, width, 3):
-            raise InputError("data", value=f"{path.name}: {pixels.shape}", rule=f"must have the sensor's shape ({height}, {width}, 3)")
-        return (pixels / 255) ** sensor.response.gamma
-
-    ball = balls.pop()
-    presses = np.stack([image(folder / f"{ball}_{int(row['index']):02d}.png") for row in rows])
-    circles = np.array([[float(row[key]) for key in ("cx_px", "cy_px", "r_px")] for row in rows])
-    return Photographs(image(folder / "background.png"), presses, circles, float(ball.removesuffix("mm")) / 2e3)
-
-
-def press_balls(sensor: SensorSpec, grid: PadGrid, shots: Photographs, depth_factor: float, scale: float) -> GelSurface:
-    """The pad at rest (first environment) and pressed by the ball at each labelled circle.
-
-    A ball of radius R overlaps a dome of radius R_d in a circle of radius a at depth a² (1/R + 1/R_d) / 2 and higher orders; that depth,
-    times ``depth_factor``, is taken along the normal of the dome under the circle's centre.
-    """
-    camera, pad = sensor.camera, sensor.gelpad
-    distance, (px, py) = -camera.position[2], camera.pixel_pitch
-    poses = np.tile(np.eye(4), (len(shots.circles) + 1, 1, 1))
-    poses[0, 2, 3] = 1.0  # far above: no contact
-    for pose, (u, v, r) in zip(poses[1:], shots.circles, strict=True):
-        z, eps = 0.0, 1e-5
-        for _ in range(5):  # the pixel's ray meets the dome
-            x = camera.position[0] + (u - camera.principal_point[0]) * px * (1 + z / distance)
-            y = camera.position[1] + (v - camera.principal_point[1]) * py * (1 + z / distance)
-            around = rest_height(pad, x + eps * np.array([0, 1, -1, 0, 0]), y + eps * np.array([0, 0, 0, 1, -1]))
-            z = float(around[0])
-        normal = np.array([around[2] - around[1], around[4] - around[3], 2 * eps])
-        a = r * px * (1 + z / distance)
-        dome = np.mean([1 / pad.dome_radius[0], 1 / pad.dome_radius[1]])
-        depth = depth_factor * (shots.radius - np.sqrt(shots.radius**2 - a * a) + 0.5 * a * a * dome)
-        pose[:3, 3] = np.array([x, y, z]) + normal / np.linalg.norm(normal) * (shots.radius - depth)
-    surround = ElasticSurround(grid, sigmas=tuple(scale * s for s in PYRAMID_SIGMAS))
-    return surround.surface(object_height([primitive("sphere", (shots.radius,))], poses, grid.x, grid.y), poses)
+    """Six presses, small images, ten steps at most: shows that all runs."""
 
 
 # ------------------------------------------------------------------------------------------------------------ parameters
@@ -185,7 +91,9 @@ class Parameters:
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
-                raise InputError("led.layer", value=led.layer, rule="must be a camera channel, the LED's colour", choices=CHANNELS)
+                raise InputError(
+                    "led.layer", value=led.layer, rule="must be a camera channel, the LED's colour", choices=CHANNELS
+                )
             x, y, z = led.axis
             leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(z), led.lobe])
             own, *others = (led.power[c] for c in channels(led))
@@ -250,7 +158,9 @@ class Problem:
     """Residuals in 8-bit levels: the presses with the real background as flat field (disc and ring up to twice the labelled radius), the
     image at rest, and a penalty [500 levels/mm] where an LED leaves its place or its cut-off comes near the view."""
 
-    def __init__(self, sensor: SensorSpec, shots: Photographs, surface: GelSurface, p: Parameters, weight: float, device: str) -> None:
+    def __init__(
+        self, sensor: SensorSpec, shots: Photographs, surface: GelSurface, p: Parameters, weight: float, device: str
+    ) -> None:
         """``weight`` of a pixel at rest; the light that comes over the case is that of ``p`` and stays."""
         self.sensor, self.shots, self.surface, self.weight = sensor, shots, surface, weight
         height, width = shots.background.shape[:2]
@@ -377,21 +287,6 @@ def score(sensor: SensorSpec, surface: GelSurface, shots: Photographs, device: s
     return errors, flat
 
 
-def light_file(lights: LightsSpec, header: str) -> str:
-    """TOML of a light file."""
-
-    def row(values: tuple[float, ...], scale: float, digits: str) -> str:
-        return ", ".join(f"{scale * value:{digits}}" for value in values)
-
-    tables = [
-        f'[[led]]\nname = "{led.name}"\nlayer = "{led.layer}"\nposition_mm = [{row(led.position, 1e3, ".2f")}]\n'
-        f"axis = [{row(led.axis, 1, '.4f')}]\nsize_mm = [{row(led.size, 1e3, '.2f')}]\nlobe = {led.lobe:.2f}\n"
-        f"power_w_per_sr = [{row(led.power, 1, '.3e')}]\n"
-        for led in lights.leds
-    ]
-    return header + "\n".join(["", *tables])
-
-
 def draw(real: np.ndarray, simulated: np.ndarray, path: Path) -> None:
     """Photographs, simulated images and their difference, a press a column; images (N, H, W, 3) in levels."""
     import matplotlib
@@ -425,11 +320,7 @@ def main(args: Args) -> None:
     grid = make_grid(sensor.gelpad, 0.3e-3 if args.quick else 0.12e-3)
     pressed, unseen = (press_balls(sensor, grid, part, args.depth_factor, args.surround_scale) for part in (train, test))
 
-    start = sensor
-    if args.led_size_mm is not None:
-        size = (args.led_size_mm[0] / 1e3, args.led_size_mm[1] / 1e3)
-        start = dataclasses.replace(sensor, lights=LightsSpec(tuple(dataclasses.replace(led, size=size) for led in sensor.lights.leds)))
-    p, iterations = Parameters.of(start), 2 if args.quick else args.iterations
+    p, iterations = Parameters.of(sensor), min(args.iterations, 10) if args.quick else args.iterations
     for factor in (8,) if args.quick else (8, 4):  # a new ray tracer each: the light from the case follows the LEDs
         problem = Problem(sensor, train.shrunk(factor), pressed, p, args.background_weight, args.device)
         p = solve(problem, p, iterations, f"at 1/{factor}")
@@ -439,17 +330,17 @@ def main(args: Args) -> None:
     device = RayTracer(sensor, resolution=(8, 6), outputs=("depth",), device=args.device).device
     metrics: dict[str, int | float | str] = {"experiment": "fit_lights", "device": device, "seed": args.seed, **versions()}
     metrics |= {"presses.fitted": len(train.presses), "presses.held_out": len(test.presses), "depth_factor": args.depth_factor}
-    factor = 4 if args.quick else 1
-    small = test.shrunk(factor)
+    touching = unseen.contact[1:].sum((1, 2)) * grid.pitch[0] * grid.pitch[1]
+    labelled = test.circles[:, 2] * sensor.camera.pixel_pitch[0]
+    metrics["contact_radius_over_label"] = float(np.mean(np.sqrt(touching / np.pi) / labelled))
+    small = test.shrunk(4 if args.quick else 1)
     for name, spec in (("start", sensor), ("fitted", fitted)):
-        errors, images = score(spec, unseen, small, args.device)
-        metrics |= {f"{name}.{key}": value for key, value in errors.items()}
+        fitted_errors, images = score(spec, unseen, small, args.device)
+        metrics |= {f"{name}.{key}": value for key, value in fitted_errors.items()}
     with result_folder(args.out or Path("runs") / "fit_lights") as folder:
-        header = (
-            f"# Lights fitted by experiments/fit_lights.py to {len(train.presses)} presses; mean absolute error on {len(test.presses)} others:\n"
-            f"# {metrics['fitted.flat_field.contact_mae']:.2f} levels in the contact, {metrics['fitted.flat_field.ring_mae']:.2f} around it.\n"
-        )
-        (folder / "lights.toml").write_text(light_file(fitted.lights, header), "utf-8")
+        error = " and ".join(f"{fitted_errors[f'flat_field.{part}_mae']:.2f} ({part})" for part in ("contact", "ring"))
+        comment = f"Fitted by experiments/fit_lights.py to {len(train.presses)} presses.\nMean absolute error on others: {error} of 255."
+        (folder / "lights.toml").write_text(lights_text(fitted.lights, comment), "utf-8")
         numbers = f"[response]\nexposure = {response.exposure}\nvignetting = [{p.vignette:.4f}, 0.0, 0.0]\n"
         (folder / "sensor.toml").write_text("# Numbers of the sensor file that belong to lights.toml.\n" + numbers, "utf-8")
         shown = np.unique(np.linspace(0, len(images) - 1, 5).astype(int))
