@@ -47,6 +47,8 @@ LOOK: dict[str, tuple[str, str, Any]] = {
     "peer": ("#000000", "|", ":"),
     "peer_shadow": ("#000000", "|", "--"),
 }
+NAMED_BELOW = ("fast_4_rays", "taxim_shadow", "peer_shadow")
+"""Modes that lie close to the one that they vary: their names go below the point."""
 SHORT = {"fast": "fast", "fast_4_rays": "4 rays", "taxim": "table", "taxim_shadow": "+ shadow", "phong": "Phong"}
 """Labels of points that are not part of a sweep."""
 PANELS = (("frame_mae", "whole frame"), ("contact_mae", "contact"), ("ring_mae", "shadow ring"))
@@ -116,6 +118,8 @@ def _panel(axes: Axes, rows: Sequence[Row], column: str) -> None:
             # To the left where the right half of the panel would cut it off.
             if s.spp is None and s.ms > math.sqrt(axes.get_xlim()[0] * axes.get_xlim()[1]):
                 place |= {"xytext": (-3.5, 2.5), "ha": "right"}
+            if s.family in NAMED_BELOW:
+                place["xytext"] = (place["xytext"][0], -8.0)
             axes.annotate(label, (s.ms, s.errors[column]), fontsize=6, color=colour, zorder=4, **place)
         x, y = [s.ms for s in points], [s.errors[column] for s in points]
         axes.plot(x, y, color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=4.5, zorder=3)
