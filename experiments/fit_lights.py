@@ -294,7 +294,7 @@ def draw(real: np.ndarray, simulated: np.ndarray, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = (("real", real), ("simulated", simulated), ("difference × 4 + 128", 128 + 4 * (simulated - real)))
+    rows = (("real", real), ("simulated", simulated), ("4 × difference", 128 + 4 * (simulated - real)))
     with plt.rc_context({"font.size": 8}):
         height, width = real.shape[1:3]
         figure, axes = plt.subplots(
