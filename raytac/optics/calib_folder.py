@@ -52,7 +52,7 @@ def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> Po
     folder = Path(folder)
     absent = [name for name in ("polycalib.npz", "dataPack.npz") if not (folder / name).is_file()]
     if absent:
-        rule = f"must be a folder with polycalib.npz, dataPack.npz and (from raytac or the package) params.json; absent: {', '.join(absent)}"
+        rule = f"must be a folder with polycalib.npz, dataPack.npz and mostly params.json; absent: {', '.join(absent)}"
         raise CalibrationError(rule, file=folder)
     if pixel_pitch is not None and not (math.isfinite(pixel_pitch) and pixel_pitch > 0):
         raise InputError("pixel_pitch", value=pixel_pitch, rule="must be finite and > 0 [m]")
