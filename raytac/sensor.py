@@ -16,7 +16,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS, TactileFrame
 from raytac.gel.object_height import object_height
-from raytac.gel.pad import make_grid
+from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.io.options import parse_resolution
 from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS
@@ -36,8 +36,6 @@ LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02
 """How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
-COARSEST_PITCH = 0.1e-3
-"""Spacing of the pad's grid where the image does not ask for a finer one [m]."""
 
 
 class TactileSensor:
@@ -134,7 +132,7 @@ class TactileSensor:
         self.resolution = size if size is not None else self.spec.camera.resolution
         _warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
-        self._pitch = self._pixel_pitch() if pitch is None else pitch
+        self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._optics_options = dict(optics_options or {})
         if optics == "taxim" and isinstance(self._optics_options.get("calibration"), (str, Path)):
@@ -148,11 +146,6 @@ class TactileSensor:
             optics.label if not isinstance(optics, str) else "raytrace-" + integrator if optics == "raytrace" else optics
         )
         self._pad: RigidPad | None = None
-
-    def _pixel_pitch(self) -> float:
-        camera = self.spec.camera
-        pixels = (p * n / m for p, n, m in zip(camera.pixel_pitch, camera.resolution, self.resolution, strict=True))
-        return min(COARSEST_PITCH, *pixels)
 
     @property
     def label(self) -> str:

@@ -10,7 +10,15 @@ from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["make_grid", "rest_height"]
+__all__ = ["COARSEST_PITCH", "grid_pitch", "make_grid", "rest_height"]
+
+COARSEST_PITCH = 0.1e-3
+"""Spacing of the pad's grid where the image does not ask for a finer one [m]."""
+
+
+def grid_pitch(pixel: tuple[float, float]) -> float:
+    """Spacing [m] of the nodes for an image whose pixels cover ``pixel`` (x, y) [m] of the pad: as fine as the image."""
+    return min(COARSEST_PITCH, *pixel)
 
 
 def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:

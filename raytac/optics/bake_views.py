@@ -9,7 +9,7 @@ from itertools import islice
 import drjit as dr
 import numpy as np
 
-from raytac.gel.pad import make_grid
+from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.image_mode import see_heights
 from raytac.optics.raytrace import RayTracer
@@ -17,8 +17,6 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Calibration", "Views"]
 
-COARSEST_PITCH = 0.1e-3
-"""Spacing of the pad's grid where the image does not ask for a finer one [m], as in ``TactileSensor``."""
 _BATCH = {"cpu": 8, "cuda": 32}
 
 
@@ -55,11 +53,9 @@ class Calibration:
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
         options = {"resolution": resolution, "outputs": ("rgb",), "device": device, "bounce": False}
         self._direct = [RayTracer(sensor, shadows=shadows, **options) for shadows in (True, False)]
-        camera, native = self.tracer.camera, sensor.camera
-        px, py = (p * n / m for p, n, m in zip(native.pixel_pitch, native.resolution, camera.resolution, strict=True))
-        self.pitch = (px, py)
+        self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
-        self.grid: PadGrid = make_grid(sensor.gelpad, min(COARSEST_PITCH, px, py))
+        self.grid: PadGrid = make_grid(sensor.gelpad, grid_pitch(self.pitch))
         """Nodes of the presses, as fine as the image."""
         rest = GelSurface.at_rest(self.grid)
         rgb = self.tracer.render(rest).rgb

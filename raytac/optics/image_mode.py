@@ -137,9 +137,7 @@ class ImageMode(ABC):
         self.sensor, self.outputs = sensor, tuple(outputs)
         slab = Slab.from_spec(sensor)
         self.camera = Pinhole.from_spec(sensor.camera, resolution, slab)
-        native = sensor.camera
-        px, py = (p * n / m for p, n, m in zip(native.pixel_pitch, native.resolution, self.camera.resolution, strict=True))
-        self.pitch = (px, py)
+        self.pitch = sensor.camera.pitch_at(self.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
         self._memory = total_memory(self.device)
         self._grid: PadGrid | None = None

@@ -119,9 +119,8 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
     size = _image_size(frame)
     if size is not None:
         metrics["image.width_px"], metrics["image.height_px"] = size
-        camera = sensor.spec.camera
-        for axis, pitch, native, pixels in zip("xy", camera.pixel_pitch, camera.resolution, size, strict=True):
-            metrics[f"image.pixel_{axis}_mm"] = 1e3 * pitch * native / pixels
+        for axis, pitch in zip("xy", sensor.spec.camera.pitch_at(size), strict=True):
+            metrics[f"image.pixel_{axis}_mm"] = 1e3 * pitch
     if np.isfinite(surface.contact_centre[0]).all():
         metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"] = (1e3 * float(v) for v in surface.contact_centre[0])
     if frame.force_law_area is not None:

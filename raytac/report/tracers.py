@@ -50,9 +50,7 @@ class Tracers:
 
     def regions(self, size: tuple[int, int], surface: GelSurface) -> dict[str, np.ndarray]:
         """Masks of ``raytac.report.image_error.regions`` for environment 0."""
-        camera = self.spec.camera
-        pitch = [p * n / m for p, n, m in zip(camera.pixel_pitch, camera.resolution, size, strict=True)]
-        return regions(self.contact(size, surface), (pitch[0], pitch[1]))
+        return regions(self.contact(size, surface), self.spec.camera.pitch_at(size))
 
 
 def path_trace(tracer: RayTracer, surface: GelSurface, spp: int, seed: int) -> np.ndarray:

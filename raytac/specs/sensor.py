@@ -95,6 +95,11 @@ class CameraSpec:
     principal_point: Vec2
     """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
 
+    def pitch_at(self, resolution: tuple[int, int]) -> Vec2:
+        """Size along x and y [m] of a pixel on the plane z = 0 where the whole image has ``resolution`` (width, height) [px]."""
+        (px, py), (nx, ny), (width, height) = self.pixel_pitch, self.resolution, resolution
+        return px * nx / width, py * ny / height
+
 
 @dataclass(frozen=True)
 class ResponseSpec:
