@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from raytac.specs.marker_motion import MarkerMotionSpec
+
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
@@ -123,7 +125,9 @@ class MarkerSpec:
     """A regular grid of dots printed on the coat; rows = columns = 0 means none."""
 
     rows: int
+    """Number of dots along y."""
     columns: int
+    """Number of dots along x."""
     pitch: Vec2
     """Spacing along x (columns) and y (rows) [m]."""
     offset: Vec2
@@ -198,5 +202,7 @@ class SensorSpec:
     markers: MarkerSpec
     refraction: RefractionSpec
     lights: LightsSpec
+    marker_motion: MarkerMotionSpec | None = None
+    """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
     source: Path | None = None
     """File that it was read from."""
