@@ -17,6 +17,7 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
 __all__ = [
+    "BONDED",
     "CameraSpec",
     "CaseSpec",
     "CoatSpec",
@@ -28,6 +29,9 @@ __all__ = [
     "ResponseSpec",
     "SensorSpec",
 ]
+
+BONDED = ("back", "back_and_sides")
+"""Faces of a gelpad that the case can hold."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class GelpadSpec:
     """Mass density ρ [kg/m³]."""
     friction: float
     """Coulomb friction coefficient μ against the object."""
+    bonded: str = "back"
+    """What the case holds, one of ``BONDED``; only the soft pad knows it."""
 
     def sag(self, x: Any, y: Any) -> Any:
         """How far the surface at rest lies below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays that broadcast.

@@ -10,6 +10,7 @@ from typing import Any, Final
 from raytac.specs.files import find_file
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.sensor import (
+    BONDED,
     CameraSpec,
     CaseSpec,
     CoatSpec,
@@ -38,6 +39,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "poisson_ratio": Number("[0, 0.5)"),
         "density_kg_m3": Number("[100, 10000]"),
         "friction": Number("[0, 10]"),
+        "bonded": Text(choices=BONDED, default="back"),
     },
     "coat": {
         "reflectance": Number("[0, 1]", length=3),
