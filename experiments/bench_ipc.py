@@ -4,7 +4,7 @@
     python experiments/bench_ipc.py --device cuda --sizes 300,1400,5300,18000 --envs 1,128,1024
     python experiments/bench_ipc.py --device cuda --pads peg --envs 256,4096 --out runs/bench_ipc_peg
 
-Press: a bonded pad of 20.75 × 25.25 × 4 mm (E = 0.1 MPa, ν = 0.45) and a sphere of 4 mm radius that is driven to 1 mm depth in 20 steps of
+Press: a bonded pad of 20.75 × 25.25 × 4 mm (E = 0.1 MPa, ν = 0.45) and a sphere of 4 mm radius that is driven down 1 mm in 20 steps of
 10 ms and then held for 5; d̂ = 0.1 mm, μ = 0.5, velocity tolerance 1e-4 m/s. Peg: see ``bench_ipc_scenes.peg_world``.
 
 The first step (first lists, and what was not compiled yet) is told apart. Memory: on CUDA, bytes in use in Warp's memory pool, on the

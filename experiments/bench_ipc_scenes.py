@@ -24,6 +24,7 @@ __all__ = [
     "RADIUS",
     "SIZE",
     "THICKNESS",
+    "TRAVEL",
     "ball_height",
     "ball_surface",
     "peg_drive",
@@ -38,8 +39,8 @@ SIZE, THICKNESS = (20.75e-3, 25.25e-3), 4e-3
 CELLS = {300: (8, 10, 2), 1400: (16, 20, 3), 5300: (26, 32, 5), 18000: (40, 48, 8)}
 """Cells in x, y and z by about how many vertices: 297, 1,428, 5,346 and 18,081."""
 MATERIAL = ipc.Material(young=1e5, poisson=0.45, density=1000.0)
-RADIUS, GAP, DEPTH = 4e-3, 1.1e-4, 1e-3
-"""The sphere, its distance from the pad at the start, and how far it goes below the pad's rest surface [m]."""
+RADIUS, GAP, TRAVEL = 4e-3, 1.1e-4, 1e-3
+"""The sphere, its distance from the pad at the start, and how far it is driven down [m]."""
 PRESS, HOLD, DT, D_HAT, FRICTION = 20, 5, 0.01, 1e-4, 0.5
 """Steps down, steps at rest, time step [s], d̂ [m] and μ."""
 
@@ -57,7 +58,7 @@ def ball_surface() -> ipc.TriMesh:
 
 def ball_height(step: int) -> float:
     """Height of the sphere's centre [m] at the end of step 0, 1, …: down for ``PRESS`` steps, then at rest."""
-    return RADIUS + GAP - (GAP + DEPTH) * min(step + 1, PRESS) / PRESS
+    return RADIUS + GAP - TRAVEL * min(step + 1, PRESS) / PRESS
 
 
 def press_world(cells: tuple[int, int, int], settings: ipc.Settings, num_envs: int, device: str) -> ipc.World:
