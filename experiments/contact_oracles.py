@@ -83,9 +83,9 @@ class BondedLayer:
     def __init__(self, solid: Elastic, thickness: float, nodes: int = 40) -> None:
         self.solid, self.thickness = solid, thickness
         self._unit, self._weight = np.polynomial.legendre.leggauss(nodes)
-        u, w = np.polynomial.legendre.leggauss(400)
-        self._wave, wave_weight = 20 * (u + 1), 20 * w  # k t from 0 to 40, where 1 − L is below 1e-15
-        self._spectrum = wave_weight * (layer_compliance(solid.poisson, self._wave) - 1)
+        u, w = np.polynomial.legendre.leggauss(10)
+        self._wave = (np.arange(40)[:, None] + (u + 1) / 2).ravel()  # k t from 0 to 40, where 1 − L is below 1e-15
+        self._spectrum = np.tile(w / 2, 40) * (layer_compliance(solid.poisson, self._wave) - 1)
 
     def _solve(self, right: Floats, s: Floats, weights: Floats) -> Floats:
         cosines = np.cos(np.outer(s / self.thickness, self._wave))
@@ -113,7 +113,7 @@ class BondedLayer:
     def sphere_force(self, sphere_radius: float, depth: float) -> float:
         """Force [N] of a paraboloid at ``depth`` [m], by bisection on the contact radius."""
         low, high = 0.0, 2 * np.sqrt(sphere_radius * depth)
-        for _ in range(60):
+        for _ in range(45):
             middle = (low + high) / 2
             low, high = (middle, high) if self.sphere(sphere_radius, middle)[0] < depth else (low, middle)
         return self.sphere(sphere_radius, high)[1]
