@@ -84,8 +84,8 @@ class BondedLayer:
         self.solid, self.thickness = solid, thickness
         self._unit, self._weight = np.polynomial.legendre.leggauss(nodes)
         u, w = np.polynomial.legendre.leggauss(10)
-        self._wave = (np.arange(40)[:, None] + (u + 1) / 2).ravel()  # k t from 0 to 40, where 1 − L is below 1e-15
-        self._spectrum = np.tile(w / 2, 40) * (layer_compliance(solid.poisson, self._wave) - 1)
+        self._wave = (np.arange(96)[:, None] + (u + 1) / 2).ravel() / 4  # k t from 0 to 24, where 1 − L is below 1e-15
+        self._spectrum = np.tile(w / 8, 96) * (layer_compliance(solid.poisson, self._wave) - 1)
 
     def _solve(self, right: Floats, s: Floats, weights: Floats) -> Floats:
         cosines = np.cos(np.outer(s / self.thickness, self._wave))
