@@ -111,9 +111,11 @@ class BondedLayer:
         return float(depth), float(np.pi * self.solid.plane_strain * (w @ (depth * flat - bowl)))
 
     def sphere_force(self, sphere_radius: float, depth: float) -> float:
-        """Force [N] of a paraboloid at ``depth`` [m], by bisection on the contact radius."""
-        low, high = 0.0, 2 * np.sqrt(sphere_radius * depth)
-        for _ in range(45):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self.sphere(sphere_radius, middle)[0] < depth else (low, middle)
-        return self.sphere(sphere_radius, high)[1]
+        """Force [N] of a paraboloid at ``depth`` [m]."""
+        contact = np.sqrt(sphere_radius * depth)
+        for _ in range(60):
+            found, force = self.sphere(sphere_radius, contact)
+            if abs(found - depth) < 1e-12 * depth:
+                return force
+            contact *= np.sqrt(depth / found)  # depth grows about as a², on a half-space and on a thin layer
+        raise ArithmeticError(f"no contact radius found for a depth of {depth} m")
