@@ -65,6 +65,7 @@ class GelSurface:
     contact.
     pad_from_object, shape (B, 4, 4): pose of the object, or None when there is no object.
     coat: the same surface as a mesh that moves sideways too, where the physics simulates the gel; None elsewhere.
+    ink, shape (B, Ny, Nx), float32: share of the skin that marker dots cover around each node, in [0, 1]; None without dots.
     """
 
     grid: PadGrid
@@ -73,6 +74,7 @@ class GelSurface:
     contact_centre: np.ndarray
     pad_from_object: np.ndarray | None = None
     coat: DeformedCoat | None = None
+    ink: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return summary(self)
