@@ -197,6 +197,7 @@ def node_elastic_gradient(
 
 @wp.kernel
 def block_hessian(
+    upper: wp.array2d(dtype=wp.int32),
     part_start: wp.array(dtype=wp.int32),
     part: wp.array(dtype=wp.int32),
     grads: wp.array2d(dtype=wp.vec3d),
@@ -213,10 +214,14 @@ def block_hessian(
     # outputs
     blocks: wp.array2d(dtype=wp.mat33d),
 ):
-    """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements."""
-    env, k = wp.tid()
+    """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements.
+
+    Each row of ``upper`` names a block on or above the diagonal, where it is to lie, and where its transpose.
+    """
+    env, u = wp.tid()
     if active[env] == 0:
         return
+    k = upper[u, 0]
     one = wp.identity(n=3, dtype=wp.float64)
     H = (mass[k] * inertia_scale[env] + drag[k]) * one
     for s in range(part_start[k], part_start[k + 1]):
@@ -239,7 +244,9 @@ def block_hessian(
                 + lam[e] * wp.outer(C * ga, C * gb)
                 - f[1] * wp.skew(F * wp.cross(ga, gb))
             )
-    blocks[env, k] = H
+    blocks[env, upper[u, 1]] = H
+    if upper[u, 2] != upper[u, 1]:
+        blocks[env, upper[u, 2]] = wp.transpose(H)
 
 
 @wp.kernel

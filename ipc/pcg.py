@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 ROUNDS = 4
 """Iterations between two looks at whether any environment still runs."""
 ROW_CHUNKS = 4
-"""Blocks of threads that share an environment's contact rows."""
+"""Blocks of threads that share the contact rows of an environment, if there are few environments."""
 
 
 @wp.struct
@@ -255,7 +255,7 @@ class Pcg:
         self._by_blocks, self._rr, self._rz = (
             wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
         )
-        self._by_rows = wp.zeros((batch, ROW_CHUNKS), dtype=wp.float64, device=device)
+        self._by_rows = wp.zeros((batch, ROW_CHUNKS if batch < 64 else 1), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
         self.scalars = Scalars()

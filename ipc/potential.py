@@ -14,11 +14,14 @@ import warp as wp
 from ipc import dynamics, elasticity
 from ipc.collision import Collision
 from ipc.layout import Layout
-from ipc.linear import SystemView, push_blocks, push_rows
+from ipc.linear import SystemView, push_blocks, push_rows, slice_rows
 from ipc.reduce import MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
 
 __all__ = ["Potential"]
+
+_SLICE = 32
+"""Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
 
 
 class Potential:
@@ -60,7 +63,7 @@ class Potential:
         self.elastic = [floats(layout.volume), ints(layout.model), floats(layout.mu), floats(layout.lam)]
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         self.row_start, self.col = ints(layout.row_start), ints(layout.col)
-        rows = np.repeat(np.arange(nodes), np.diff(layout.row_start))
+        rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
         drag = np.zeros(len(layout.col))
         drag[diagonal] = layout.node_damping / settings.dt
@@ -103,10 +106,19 @@ class Potential:
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
         self.system = SystemView()
-        self.system.row_start, self.system.col, self.system.diagonal = self.row_start, self.col, ints(diagonal)
+        width = _SLICE if device.is_cuda else 1
+        base, self.where = slice_rows(layout.row_start, width)
+        columns = np.zeros(int(self.where.max()) + 1, np.int32)
+        columns[self.where] = layout.col
+        above = np.flatnonzero(layout.col >= rows)
+        mirror = np.searchsorted(rows * nodes + layout.col, layout.col[above].astype(np.int64) * nodes + rows[above])
+        self.upper = ints(np.stack([above, self.where[above], self.where[mirror]], axis=1))
+        self.system.row_base, self.system.row_length = ints(base), ints(np.diff(layout.row_start))
+        self.system.stride = width
+        self.system.col, self.system.diagonal = ints(columns), ints(self.where[diagonal])
         self.system.free, self.system.node_body = self.node_free, self.node_body
         self.system.vert_body, self.system.vert_count, self.system.vert_nodes, self.system.vert_weight = self.vert_map
-        self.system.blocks = matrices(len(layout.col))
+        self.system.blocks = matrices(len(columns))
         self.system.R = self.R
 
     def launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
@@ -193,10 +205,10 @@ class Potential:
     def fill_matrix(self, active: wp.array) -> None:
         """The block matrix of inertia and elasticity from what :meth:`elements` left."""
         inputs = [
-            *(self.part_start, self.part, self.grads, *self.elastic, self.inertia, self.drag, self.inertia_scale),
+            *(self.upper, self.part_start, self.part, self.grads, *self.elastic, self.inertia, self.drag, self.inertia_scale),
             *(self.el_F, self.el_mck, active),
         ]
-        self.launch(elasticity.block_hessian, self.system.blocks.shape, inputs, [self.system.blocks])
+        self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
 
     def try_step(self, alpha: wp.array) -> None:
         """y1 = y + alpha p and its vertices, in the frames as they are."""

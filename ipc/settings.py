@@ -45,7 +45,7 @@ class Settings:
     friction_velocity: float = 1e-4
     friction_relags: int = 2
     friction_tolerance: float = 0.01
-    linear_tolerance: float = 1e-3
+    linear_tolerance: float = 1e-2
     max_linear: int = 2000
     max_line_search: int = 30
     motion_fraction: float = 0.8
