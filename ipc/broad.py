@@ -18,7 +18,17 @@ import warp as wp
 
 from ipc.contact import Candidates, Surface
 
-__all__ = ["body_boxes", "clear_body_boxes", "find_ee", "find_pt", "leaves_box", "reset_lists", "select_prims", "vertex_boxes"]
+__all__ = [
+    "body_boxes",
+    "check_candidates",
+    "clear_body_boxes",
+    "find_ee",
+    "find_pt",
+    "leaves_box",
+    "reset_lists",
+    "select_prims",
+    "vertex_boxes",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,8 +42,9 @@ def leaves_box(
     active: wp.array(dtype=wp.int32),
     # outputs
     stale: wp.array(dtype=wp.int32),
+    any_stale: wp.array(dtype=wp.int32),
 ):
-    """Marks environments in which x or x + dx lies outside its vertex's box."""
+    """Marks environments in which x or x + dx lies outside its vertex's box, and whether there is one."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -42,6 +53,15 @@ def leaves_box(
     a, b = wp.min(p, q), wp.max(p, q)
     if not (a[0] >= lo[0] and a[1] >= lo[1] and a[2] >= lo[2] and b[0] <= hi[0] and b[1] <= hi[1] and b[2] <= hi[2]):
         stale[env] = 1
+        any_stale[0] = 1
+
+
+@wp.kernel
+def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if a list did not fit."""
+    env = wp.tid()
+    if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
+        overflow[0] = 1
 
 
 @wp.kernel

@@ -24,6 +24,8 @@ __all__ = [
     "Candidates",
     "Contacts",
     "Surface",
+    "check_contacts",
+    "clear",
     "contact_ee",
     "contact_plane",
     "contact_pt",
@@ -152,6 +154,33 @@ def push_simple(
     wp.atomic_add(energy, env, scale * barrier(D, Dh))
     push_contact(out, env, verts, coef, n, d, -slope, pair)
     push_row(out, env, verts, (k * coef[0]) * n, (k * coef[1]) * n, (k * coef[2]) * n, (k * coef[3]) * n)
+
+
+@wp.kernel
+def clear(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """No forces, contacts or rows in the active environments."""
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    gradient[env, v] = wp.vec3d()
+    if v == 0:
+        energy[env] = wp.float64(0.0)
+        out.count[env] = 0
+        out.row_count[env] = 0
+
+
+@wp.kernel
+def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if contacts or rows did not fit."""
+    env = wp.tid()
+    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
+        overflow[0] = 1
 
 
 @wp.kernel

@@ -19,7 +19,17 @@ import warp as wp
 
 from ipc.contact import Contacts, push_row
 
-__all__ = ["Lagged", "friction_change", "friction_rows", "lag_contacts", "lag_difference"]
+__all__ = [
+    "Lagged",
+    "clear_change",
+    "friction_change",
+    "friction_rows",
+    "keep_lagged",
+    "lag_contacts",
+    "lag_difference",
+    "share_of_change",
+    "size_of_change",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,28 +83,34 @@ def sliding(
 
 
 @wp.kernel
+def keep_lagged(lagged: Lagged, active: wp.array(dtype=wp.int32), out: Lagged):
+    """Copies the lagged pairs of the active environments."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        out.count[env] = lagged.count[env]
+    if i < lagged.count[env]:
+        out.verts[env, i] = lagged.verts[env, i]
+        out.coef[env, i] = lagged.coef[env, i]
+        out.normal[env, i] = lagged.normal[env, i]
+        out.limit[env, i] = lagged.limit[env, i]
+
+
+@wp.kernel
 def lag_contacts(
     contacts: Contacts,
     mu: wp.array(dtype=wp.float64),
-    old: Lagged,
     active: wp.array(dtype=wp.int32),
     # outputs
     out: Lagged,
 ):
-    """Freezes the contacts of the active environments; the others keep what they had."""
+    """Freezes the contacts of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
-        if i == 0:
-            out.count[env] = old.count[env]
-        if i < old.count[env]:
-            out.verts[env, i] = old.verts[env, i]
-            out.coef[env, i] = old.coef[env, i]
-            out.normal[env, i] = old.normal[env, i]
-            out.limit[env, i] = old.limit[env, i]
-            out.pair[env, i] = old.pair[env, i]
         return
     if i == 0:
-        out.count[env] = contacts.count[env]
+        out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
     if i < contacts.count[env]:
         out.verts[env, i] = contacts.verts[env, i]
         out.coef[env, i] = contacts.coef[env, i]
@@ -186,3 +202,35 @@ def lag_difference(
             wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
     if sign > wp.float64(0.0):
         wp.atomic_add(size, env, lagged.limit[env, i])
+
+
+@wp.kernel
+def clear_change(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    change: wp.array2d(dtype=wp.vec3d),
+    force: wp.array(dtype=wp.float64),
+    changed: wp.array(dtype=wp.float64),
+):
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    change[env, v] = wp.vec3d()
+    if v == 0:
+        force[env] = wp.float64(0.0)
+        changed[env] = wp.float64(0.0)
+
+
+@wp.kernel
+def size_of_change(change: wp.array2d(dtype=wp.vec3d), active: wp.array(dtype=wp.int32), size: wp.array2d(dtype=wp.float64)):
+    env, v = wp.tid()
+    if active[env] != 0:
+        size[env, v] = wp.length(change[env, v])
+
+
+@wp.kernel
+def share_of_change(force: wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.float64)):
+    """changed ← changed / Σ μ λ."""
+    env = wp.tid()
+    if active[env] != 0:
+        changed[env] = changed[env] / wp.max(force[env], wp.float64(1.0e-300))

@@ -30,6 +30,8 @@ class Settings:
         max_linear: PCG iterations a solve.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
+        cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
+            ``World.timers``.
     """
 
     dt: float = 0.01
@@ -43,10 +45,11 @@ class Settings:
     friction_velocity: float = 1e-4
     friction_relags: int = 2
     friction_tolerance: float = 0.01
-    linear_tolerance: float = 1e-3
+    linear_tolerance: float = 1e-2
     max_linear: int = 2000
     max_line_search: int = 30
     motion_fraction: float = 0.8
+    cuda_graph: bool = True
 
     def __post_init__(self) -> None:
         for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):

@@ -10,7 +10,7 @@ import warp as wp
 
 import ipc
 from ipc.layout import build_layout
-from ipc.newton import Newton
+from ipc.potential import Potential
 from tests.ipc.conftest import unit_cell
 
 D_HAT, KAPPA, MU, EPS = 0.05, 3e4, 0.4, 1e-3
@@ -30,12 +30,11 @@ class Scene:
         bodies = [ipc.SoftBody("a", a, ipc.Material(1e5)), ipc.SoftBody("b", ipc.TetMesh(v, b.tets), ipc.Material(1e5))]
         self.layout = build_layout(bodies, friction, {}, [])
         settings = ipc.Settings(dt=1.0, friction_velocity=EPS)
-        self.solver = Newton(self.layout, settings, 1, D_HAT, KAPPA, wp.get_device("cpu"))
+        self.solver = Potential(self.layout, settings, 1, D_HAT, KAPPA, wp.get_device("cpu"))
         self.solver.y.assign(self.layout.node_rest[None])
         self.solver.frame_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
         self.solver.goal_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
-        self.solver.set_frames(self.solver.share, self.solver.R, self.solver.t)
-        self.solver.active.fill_(1)
+        self.solver.set_frames(wp.zeros(1, dtype=wp.float64, device="cpu"), self.solver.R, self.solver.t)
         self.x = self.place(self.layout.node_rest)
         self.mesh = ipctk.CollisionMesh(self.x, self.layout.edges, self.layout.faces)
         self.potential = ipctk.BarrierPotential(D_HAT, KAPPA, True)
@@ -51,9 +50,9 @@ class Scene:
         s.x.assign(x[None])
         s.x_start.assign((x if start is None else start)[None])
         s.dx.zero_()
-        s.collision.refresh(s.x, s.dx, s.active)
-        s.collision.assemble(s.x, s.x_start, s.R, s.t, s.kappa, EPS, s.active, s.vert_gradient, s.barrier_energy)
-        return float(s.barrier_energy.numpy()[0]), s.vert_gradient.numpy()[0].copy()
+        s.collision.refresh(s.x, s.dx, s.everyone)
+        s.collision.assemble(s.x, s.x_start, s.R, s.t, s.kappa, EPS, s.everyone, s.vert_gradient, s.barrier)
+        return float(s.barrier.numpy()[0]), s.vert_gradient.numpy()[0].copy()
 
     def hessian(self) -> np.ndarray:
         """Σ q qᵀ of the last evaluation, (3V, 3V)."""
@@ -129,7 +128,7 @@ def test_gradient_matches_finite_differences_near_parallel_edges(rng: np.random.
 def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.active)
+    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
     _, normal = scene.evaluate(scene.x)
     moved = scene.x.copy()
     moved[scene.x[:, 2] > 1.001] += slide * np.array([0.6, 0.8, 0.1])
@@ -155,7 +154,7 @@ def barrier_gradient(x: np.ndarray) -> np.ndarray:
 def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.active)
+    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
     far = scene.x.copy()
     far[scene.x[:, 2] > 1.001] += [0.4 * EPS, 0.1 * EPS, 0.0]
     bare = Scene(0.02, TILTS["corner"])
