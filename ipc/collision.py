@@ -6,6 +6,8 @@ Nothing here waits for the device: launches cover the buffers, counts are read b
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -138,7 +140,9 @@ class Collision:
                 new = wp.zeros((self.batch, room), dtype=dtype, device=self.device)
                 before = getattr(lagged, name)
                 if before is not None:
-                    wp.copy(new[:, : before.shape[1]], before)
+                    values = new.numpy()
+                    values[:, : min(room, before.shape[1])] = before.numpy()[:, :room]
+                    new.assign(values)
                 setattr(lagged, name, new)
 
     def grow(self) -> None:
@@ -200,7 +204,7 @@ class Collision:
 
     # --- contact ---------------------------------------------------------------------------------------------------------------
 
-    def _narrow(self, kernels: tuple[wp.Kernel, wp.Kernel], inputs: list, outputs: list) -> None:
+    def _narrow(self, kernels: tuple[Any, Any], inputs: list, outputs: list) -> None:
         """Launch the point-triangle and the edge-edge kernel over the candidates."""
         if self._searches:
             for kernel, items in zip(kernels, (self.candidates.pt, self.candidates.ee), strict=True):

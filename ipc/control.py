@@ -10,6 +10,8 @@ Flags of one element say whether any environment needs a branch; they are the co
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
@@ -489,7 +491,7 @@ class Control:
         """All flags but ``halt`` become 0."""
         self._flags.zero_()
 
-    def launch(self, kernel: wp.Kernel, *inputs: object) -> None:
+    def launch(self, kernel: Any, *inputs: object) -> None:
         """Launch a kernel of this module, one thread an environment; decisions, and flags where it takes them, come last."""
         last: list = [self.decisions]
         if any(a.label == "f" for a in kernel.adj.args):

@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -52,7 +53,7 @@ class Newton:
         self.preconditioner: Preconditioner = BlockJacobi(self.batch, len(layout.node_rest), self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
-        self._graphs: dict[str, wp.Graph] = {}
+        self._graphs: dict[str, Any] = {}
         self._recording = False
         self.timers: dict[str, float] = {}
 

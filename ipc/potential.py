@@ -8,6 +8,8 @@ recorded as one CUDA graph. Only buffers of :class:`ipc.collision.Collision` may
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -121,7 +123,7 @@ class Potential:
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R
 
-    def launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
+    def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs or [], device=self.device)
 

@@ -38,3 +38,23 @@ def test_batch_on_cuda_equals_a_single_world() -> None:
     batch, single = press("cuda", 4), press("cuda", 1)
     difference = np.abs(batch.positions("pad")[0] - single.positions("pad")[0]).max()
     assert difference <= 1e-9, f"positions differ by {difference:.3g} m"
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
+def test_a_recorded_step_equals_single_launches_and_survives_growth() -> None:
+    """One graph, the same kernels launched one by one, and buffers that must grow under a recording."""
+    results = []
+    for graph, room in ((True, None), (False, None), (True, 1)):
+        ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((1e-4, 2e-4, 4e-3 + 1.2e-4)))
+        settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-8, linear_tolerance=1e-8, cuda_graph=graph)
+        world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=3, device="cuda")
+        if room:
+            world._potential.collision._size_candidates(room, room)
+            world._potential.collision._size_contacts(room, room)
+        for k in range(5):
+            world.set_target("ball", (1e-4, 2e-4, 4e-3 + 1.2e-4 - 1e-4 * (k + 1)))
+            assert world.step().converged.all()
+        results.append(world.positions("pad"))
+    for other in results[1:]:
+        difference = np.abs(results[0] - other).max()
+        assert difference < 1e-9, f"positions differ by {difference:.3g} m"
