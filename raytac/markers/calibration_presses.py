@@ -118,4 +118,4 @@ def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "c
             raise RaytacError(f"the press {press} did not settle")
         load = {"indent": "normal", "start": "start"}.get(state.kind, state.kind)
         by_geometry = rigid.surface_from_pose(np.asarray(state.pad_from_object))
-        yield PressFrame(press, load, replace(by_geometry, coat=state.coat))
+        yield PressFrame(press, load, replace(by_geometry, coat=soft.surface(state).coat))

@@ -59,14 +59,14 @@ class ContactCells:
         (kx, ky), batch = self.nodes, surface.batch
         depth = np.zeros((batch, len(self.y), len(self.x)), dtype=np.float32)
         contact = np.zeros(depth.shape, bool)
-        anywhere = surface.contact[0] if batch == 1 else surface.contact.any(axis=0)
+        anywhere = np.asarray(surface.contact[0] if batch == 1 else surface.contact.any(axis=0))
         rows, columns = np.flatnonzero(anywhere.any(axis=1)), np.flatnonzero(anywhere.any(axis=0))
         if len(rows) == 0:
             return ContactSamples(self, depth, contact, (0, 0, 0, 0))
         r0, r1, c0, c1 = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
         r0, r1, c0, c1 = r0 // ky, r1 // ky + 1, c0 // kx, c1 // kx + 1
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
-        touched = surface.contact[part]
+        touched = np.asarray(surface.contact)[part]
         found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
         broken = ~np.isfinite(found).all(axis=(1, 2))
         if broken.any():

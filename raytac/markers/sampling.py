@@ -39,7 +39,8 @@ def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, n
     z = (1 - wy) * ((1 - wx) * a + wx * b) + wy * ((1 - wx) * c + wx * d)
     along_x = ((1 - wy) * (b - a) + wy * (d - c)) / dx
     along_y = ((1 - wx) * (c - a) + wx * (d - b)) / dy
-    touched = surface.contact[env, row + (wy > 0.5), column + (wx > 0.5)]
+    contact = np.asarray(surface.contact)
+    touched = contact[env, row + (wy > 0.5), column + (wx > 0.5)]
     return z, np.stack([along_x, along_y], axis=-1), touched
 
 

@@ -13,8 +13,8 @@ from raytac.optics.coat import CoatLayout
 from raytac.specs.sensor import SensorSpec
 
 SPECULAR = 0.57
-"""q of ``darkened``. From the reference integrator on the untouched Mini with 7 x 9 dots, 64 samples a pixel: a dot of albedo 0.05 on a coat
-of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of the channels and dots; 0.20 to 0.38 across the pad; 2026-11-21)."""
+"""q of ``darkened``. From the reference integrator on the untouched Mini with 7 x 9 dots, 64 samples a pixel: a dot of albedo 0.05 on a
+coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21)."""
 
 __all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
 
@@ -59,11 +59,10 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     coat, response = sensor.coat, sensor.response
     s = coat.specular
     found = []
-    for level, albedo, dotted, black in zip(
-        levels, coat.reflectance, inked_albedo(sensor, ink), response.black_level, strict=True
-    ):
+    for c, dotted in enumerate(inked_albedo(sensor, ink)):
+        level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
         share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
-        linear = dr.power(dr.maximum(level, 0) / 255, response.gamma) - black
-        dark = 255 * dr.power(dr.maximum(black + linear * share, 0), 1 / response.gamma)
+        linear: Any = dr.power(dr.maximum(level, 0) / 255, response.gamma) - black
+        dark: Any = dr.power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255
         found.append(dr.select(ink > 0, dark, level))
     return found

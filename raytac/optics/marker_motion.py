@@ -1,7 +1,8 @@
 """FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
 
 Zhao, Qian, Duan and Luo, FOTS, RA-L 2024, section III-B, in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
-contact points C_i of depth Δh_i and contacts c of centre G_c that the object has dragged by Δs_c and turned by Δθ_c:
+contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c, G_c being the place at rest of the skin
+under the contact's centre, which is that centre less the drag:
 
     dilate   Δd_d = g Σ_i a Δh_i (M − C_i) exp(−λ_d ‖M − C_i‖²)
     shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                     e_c = exp(−λ_s ‖M − G_c‖²)
@@ -160,11 +161,11 @@ def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple
     def add(n: Any, es: Any, shear: Any, et: Any, twist: Any) -> tuple[Any, ...]:
         a = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n))
         b = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n) + 1)
-        out = place - mi.Point2f(a.y, a.z)
-        r2 = dr.squared_norm(out)
-        ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
         way = mi.Vector2f(a.w, b.x)
         way *= dr.minimum(1, smax / dr.maximum(dr.norm(way), 1e-12))
+        out = place - (mi.Point2f(a.y, a.z) - way)
+        r2 = dr.squared_norm(out)
+        ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
         angle = dr.clip(b.y, -tmax, tmax)
         s = dr.sin(angle)
         half = dr.sin(0.5 * angle)
