@@ -25,6 +25,8 @@ __all__ = [
     "find_ee",
     "find_pt",
     "leaves_box",
+    "put_back",
+    "rank_candidates",
     "reset_lists",
     "select_prims",
     "vertex_boxes",
@@ -250,3 +252,40 @@ def find_ee(
                     slot = wp.atomic_add(candidates.ee_count, env, 1)
                     if slot < candidates.ee.shape[1]:
                         candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+
+
+@wp.func
+def comes_before(a: wp.vec3i, b: wp.vec3i) -> wp.bool:
+    return a[0] < b[0] or (a[0] == b[0] and a[1] < b[1])
+
+
+@wp.kernel
+def rank_candidates(
+    items: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    ordered: wp.array2d(dtype=wp.vec3i),
+):
+    """Puts every pair where its rank says; pairs are unique, so their order no longer depends on who found them first."""
+    env, i = wp.tid()
+    if stale[env] == 0 or i >= count[env]:
+        return
+    rank = wp.int32(0)
+    for k in range(wp.min(count[env], items.shape[1])):
+        if comes_before(items[env, k], items[env, i]):
+            rank += 1
+    ordered[env, rank] = items[env, i]
+
+
+@wp.kernel
+def put_back(
+    ordered: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    items: wp.array2d(dtype=wp.vec3i),
+):
+    env, i = wp.tid()
+    if stale[env] != 0 and i < count[env]:
+        items[env, i] = ordered[env, i]

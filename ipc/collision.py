@@ -28,11 +28,15 @@ class Collision:
         batch: number of environments.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
+        deterministic: sort the lists, and add up in their order.
         device: Warp device.
     """
 
-    def __init__(self, layout: Layout, batch: int, d_hat: float, margin: float, device: wp.Device) -> None:
+    def __init__(self, layout: Layout, batch: int, d_hat: float, margin: float, deterministic: bool, device: wp.Device) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
+        # Pairs of an environment are shared by so many threads. One alone adds forces up in the order of the lists.
+        self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
+        self._sort = deterministic and device.is_cuda
         verts, bodies = int(layout.vert_start[-1]), len(layout.names)
         plane_vert, plane_body, plane_pair = [], [], []
         meshes = []
@@ -124,6 +128,7 @@ class Collision:
 
     def _size_candidates(self, pt: int, ee: int) -> None:
         self.candidates.pt, self.candidates.ee = (wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee))
+        self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
         for name, dtype in {
@@ -200,15 +205,26 @@ class Collision:
                 *(first, second, pair, stale),
             ]
             wp.launch(kernel, dim=(self.batch, size), inputs=inputs, outputs=[self.candidates], device=device)
+        if self._sort:
+            for items, count in ((self.candidates.pt, self.candidates.pt_count), (self.candidates.ee, self.candidates.ee_count)):
+                ordered = self._ordered[items.shape[1]]
+                inputs, outputs = [items, count, stale], [ordered]
+                wp.launch(broad.rank_candidates, dim=items.shape, inputs=inputs, outputs=outputs, device=device)
+                wp.launch(broad.put_back, dim=items.shape, inputs=[ordered, count, stale], outputs=[items], device=device)
         wp.launch(broad.check_candidates, dim=self.batch, inputs=[self.candidates], outputs=[self.overflow], device=device)
 
     # --- contact ---------------------------------------------------------------------------------------------------------------
 
+    def _each(self, kernel: Any, inputs: list, outputs: list) -> None:
+        """Launch a kernel whose threads go over the lists of an environment together."""
+        inputs = [*inputs, self.lanes]
+        wp.launch(kernel, dim=(self.batch, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
+
     def _narrow(self, kernels: tuple[Any, Any], inputs: list, outputs: list) -> None:
         """Launch the point-triangle and the edge-edge kernel over the candidates."""
         if self._searches:
-            for kernel, items in zip(kernels, (self.candidates.pt, self.candidates.ee), strict=True):
-                wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=outputs, device=self.device)
+            for kernel in kernels:
+                self._each(kernel, inputs, outputs)
 
     def assemble(
         self,
@@ -233,11 +249,11 @@ class Collision:
         self._narrow(kernels, [x, self.surface, self.candidates, kappa, active], outputs)
         if self.planes:
             inputs = [x, self.surface, R, t, kappa, active]
-            wp.launch(contact.contact_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=outputs, device=device)
+            self._each(contact.contact_plane, inputs, outputs)
         if self.friction:
             inputs = [x, start, self.lagged, friction_eps, active]
             outputs = [gradient, self.contacts]
-            wp.launch(friction.friction_rows, dim=self.lagged.limit.shape, inputs=inputs, outputs=outputs, device=device)
+            self._each(friction.friction_rows, inputs, outputs)
         wp.launch(contact.check_contacts, dim=self.batch, inputs=[self.contacts], outputs=[self.overflow], device=device)
 
     def energy_change(
@@ -256,11 +272,9 @@ class Collision:
         kernels = (contact.energy_pt, contact.energy_ee)
         self._narrow(kernels, [x0, x1, self.surface, self.candidates, kappa, active], [change])
         if self.planes:
-            inputs = [x0, x1, self.surface, R, t, kappa, active]
-            wp.launch(contact.energy_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[change], device=self.device)
+            self._each(contact.energy_plane, [x0, x1, self.surface, R, t, kappa, active], [change])
         if self.friction:
-            inputs, dim = [x0, x1, start, self.lagged, friction_eps, active], self.lagged.limit.shape
-            wp.launch(friction.friction_change, dim=dim, inputs=inputs, outputs=[change], device=self.device)
+            self._each(friction.friction_change, [x0, x1, start, self.lagged, friction_eps, active], [change])
 
     def limit_step(
         self,
@@ -274,7 +288,10 @@ class Collision:
         alpha: wp.array,
     ) -> None:
         """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m]."""
-        self._narrow((ccd.ccd_pt, ccd.ccd_ee), [x, dx, self.surface, self.candidates, slack, floor, active], [alpha])
+        if self._searches:
+            for kernel, items in ((ccd.ccd_pt, self.candidates.pt), (ccd.ccd_ee, self.candidates.ee)):
+                inputs = [x, dx, self.surface, self.candidates, slack, floor, active]
+                wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
         if self.planes:
             inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, active]
             wp.launch(ccd.ccd_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[alpha], device=self.device)
@@ -299,7 +316,7 @@ class Collision:
         )
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
             inputs, outputs = [lagged, sign, active], [self._change, self._force]
-            wp.launch(friction.lag_difference, dim=dim, inputs=inputs, outputs=outputs, device=device)
+            self._each(friction.lag_difference, inputs, outputs)
         inputs, outputs = [self._change, active], [self._change_size]
         wp.launch(friction.size_of_change, dim=self._change.shape, inputs=inputs, outputs=outputs, device=device)
         self._reduce(self._change_size, active, SUM, changed)

@@ -183,22 +183,19 @@ def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
         overflow[0] = 1
 
 
-@wp.kernel
-def contact_pt(
+@wp.func
+def add_pt(
+    env: wp.int32,
+    i: wp.int32,
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
     """Point-triangle pairs."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.pt_count[env]:
-        return
     item = candidates.pt[env, i]
     v, f = item[0], item[1]
     f0, f1, f2 = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
@@ -213,21 +210,41 @@ def contact_pt(
 
 
 @wp.kernel
-def contact_ee(
+def contact_pt(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
-    """Edge-edge pairs, mollified where they are nearly parallel."""
+    """Point-triangle pairs."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.ee_count[env]:
+    if active[env] == 0:
         return
+    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+    while i < n:
+        add_pt(env, i, x, surface, candidates, kappa, gradient, energy, out)
+        i += lanes
+
+
+@wp.func
+def add_ee(
+    env: wp.int32,
+    i: wp.int32,
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Edge-edge pairs, mollified where they are nearly parallel."""
     item = candidates.ee[env, i]
     ea, eb = item[0], item[1]
     verts = wp.vec4i(surface.edges[ea, 0], surface.edges[ea, 1], surface.edges[eb, 0], surface.edges[eb, 1])
@@ -302,22 +319,42 @@ def contact_ee(
 
 
 @wp.kernel
-def contact_plane(
+def contact_ee(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
+    candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
-    """Points above half-spaces."""
+    """Edge-edge pairs, mollified where they are nearly parallel."""
     env, i = wp.tid()
     if active[env] == 0:
         return
+    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    while i < n:
+        add_ee(env, i, x, surface, candidates, kappa, gradient, energy, out)
+        i += lanes
+
+
+@wp.func
+def add_plane(
+    env: wp.int32,
+    i: wp.int32,
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Points above half-spaces."""
     v, body = surface.plane_vert[i], surface.plane_body[i]
     R = frame_R[env, body]
     n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
@@ -341,6 +378,30 @@ def contact_plane(
         )
 
 
+@wp.kernel
+def contact_plane(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Points above half-spaces."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    n = surface.plane_vert.shape[0]
+    while i < n:
+        add_plane(env, i, x, surface, frame_R, frame_t, kappa, gradient, energy, out)
+        i += lanes
+
+
 @wp.func
 def pt_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, v: wp.int32, f: wp.int32) -> wp.float64:
     p = x[env, v]
@@ -360,6 +421,24 @@ def ee_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ea
     return edge_weight(surface, ea, eb) * b * mollifier(cross_squared(a0, a1, b0, b1), mollifier_threshold(surface, ea, eb))
 
 
+@wp.func
+def add_energy_pt(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the point-triangle energy from x0 to x1 [J]."""
+    item = candidates.pt[env, i]
+    e = pt_energy(x1, surface, env, item[0], item[1]) - pt_energy(x0, surface, env, item[0], item[1])
+    if e != wp.float64(0.0):
+        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+
+
 @wp.kernel
 def energy_pt(
     x0: wp.array2d(dtype=wp.vec3d),
@@ -368,15 +447,34 @@ def energy_pt(
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the point-triangle energy from x0 to x1 [J]."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.pt_count[env]:
+    if active[env] == 0:
         return
-    item = candidates.pt[env, i]
-    e = pt_energy(x1, surface, env, item[0], item[1]) - pt_energy(x0, surface, env, item[0], item[1])
+    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+    while i < n:
+        add_energy_pt(env, i, x0, x1, surface, candidates, kappa, change)
+        i += lanes
+
+
+@wp.func
+def add_energy_ee(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the edge-edge energy from x0 to x1 [J]."""
+    item = candidates.ee[env, i]
+    e = ee_energy(x1, surface, env, item[0], item[1]) - ee_energy(x0, surface, env, item[0], item[1])
     if e != wp.float64(0.0):
         wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
 
@@ -389,16 +487,41 @@ def energy_ee(
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the edge-edge energy from x0 to x1 [J]."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.ee_count[env]:
+    if active[env] == 0:
         return
-    item = candidates.ee[env, i]
-    e = ee_energy(x1, surface, env, item[0], item[1]) - ee_energy(x0, surface, env, item[0], item[1])
-    if e != wp.float64(0.0):
+    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    while i < n:
+        add_energy_ee(env, i, x0, x1, surface, candidates, kappa, change)
+        i += lanes
+
+
+@wp.func
+def add_energy_plane(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the point-plane energy from x0 to x1 [J]."""
+    v, body = surface.plane_vert[i], surface.plane_body[i]
+    R = frame_R[env, body]
+    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+    d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
+    d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
+    if d0 < surface.d_hat or d1 < surface.d_hat:
+        Dh = surface.d_hat * surface.d_hat
+        e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
         wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
 
 
@@ -411,6 +534,7 @@ def energy_plane(
     frame_t: wp.array2d(dtype=wp.vec3d),
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
@@ -418,12 +542,7 @@ def energy_plane(
     env, i = wp.tid()
     if active[env] == 0:
         return
-    v, body = surface.plane_vert[i], surface.plane_body[i]
-    R = frame_R[env, body]
-    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-    d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
-    d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
-    if d0 < surface.d_hat or d1 < surface.d_hat:
-        Dh = surface.d_hat * surface.d_hat
-        e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
-        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+    n = surface.plane_vert.shape[0]
+    while i < n:
+        add_energy_plane(env, i, x0, x1, surface, frame_R, frame_t, kappa, change)
+        i += lanes

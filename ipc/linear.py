@@ -167,19 +167,41 @@ def multiply_rows(
     contacts: Contacts,
     p: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     out: wp.array2d(dtype=wp.vec3d),
     partial: wp.array2d(dtype=wp.float64),
 ):
-    """out += Σ q (q·p), and the shares of Σ (q·p)²; bonded nodes have p = 0 and get nothing. Threads as in multiply_blocks."""
+    """out += Σ q (q·p), and the shares of Σ (q·p)²; bonded nodes have p = 0 and get nothing.
+
+    Threads as in multiply_blocks, of which ``lanes`` in all share the rows of an environment.
+    """
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
-    if active[env] != 0:
-        r = c * BLOCK + lane
+    r = c * BLOCK + lane
+    if active[env] != 0 and r < lanes:
         while r < wp.min(contacts.row_count[env], contacts.row.shape[1]):
             total += add_row(system, contacts, env, r, p, out)
-            r += partial.shape[1] * BLOCK
+            r += lanes
     wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
+
+
+@wp.func
+def push_row_ahead(
+    env: wp.int32,
+    r: wp.int32,
+    system: SystemView,
+    contacts: Contacts,
+    dx: wp.array2d(dtype=wp.vec3d),
+    residual: wp.array2d(dtype=wp.vec3d),
+):
+    """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
+    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    s = wp.float64(0.0)
+    for k in range(4):
+        if verts[k] >= 0:
+            s += wp.dot(row_column(row, k), dx[env, verts[k]])
+    spread_row(system, verts, row, env, -s, residual)
 
 
 @wp.kernel
@@ -188,19 +210,18 @@ def push_rows(
     contacts: Contacts,
     dx: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     residual: wp.array2d(dtype=wp.vec3d),
 ):
     """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
     env, r = wp.tid()
-    if active[env] == 0 or r >= contacts.row_count[env]:
+    if active[env] == 0:
         return
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    s = wp.float64(0.0)
-    for k in range(4):
-        if verts[k] >= 0:
-            s += wp.dot(row_column(row, k), dx[env, verts[k]])
-    spread_row(system, verts, row, env, -s, residual)
+    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    while r < n:
+        push_row_ahead(env, r, system, contacts, dx, residual)
+        r += lanes
 
 
 @wp.kernel
@@ -224,12 +245,8 @@ def diagonal_blocks(system: SystemView, active: wp.array(dtype=wp.int32), out: w
         out[env, i] = system.blocks[env, system.diagonal[i]]
 
 
-@wp.kernel
-def diagonal_rows(system: SystemView, contacts: Contacts, active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.mat33d)):
-    """Adds the diagonal blocks of Σ q qᵀ."""
-    env, r = wp.tid()
-    if active[env] == 0 or r >= contacts.row_count[env]:
-        return
+@wp.func
+def add_row_to_diagonal(env: wp.int32, r: wp.int32, system: SystemView, contacts: Contacts, out: wp.array2d(dtype=wp.mat33d)):
     verts, row = contacts.row_verts[env, r], contacts.row[env, r]
     for k in range(4):
         v = verts[k]
@@ -238,6 +255,25 @@ def diagonal_rows(system: SystemView, contacts: Contacts, active: wp.array(dtype
             for m in range(system.vert_count[v]):
                 w = system.vert_weight[v, m]
                 wp.atomic_add(out, env, system.vert_nodes[v, m], (w * w) * wp.outer(q, q))
+
+
+@wp.kernel
+def diagonal_rows(
+    system: SystemView,
+    contacts: Contacts,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    out: wp.array2d(dtype=wp.mat33d),
+):
+    """Adds the diagonal blocks of Σ q qᵀ."""
+    env, r = wp.tid()
+    if active[env] == 0:
+        return
+    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    while r < n:
+        add_row_to_diagonal(env, r, system, contacts, out)
+        r += lanes
 
 
 @wp.kernel
@@ -285,16 +321,18 @@ class Preconditioner(Protocol):
 
 
 class BlockJacobi:
-    """Inverses of the 3×3 diagonal blocks, contact rows included."""
+    """Inverses of the 3×3 diagonal blocks, contact rows included; ``lanes`` threads share the rows of an environment."""
 
-    def __init__(self, batch: int, nodes: int, device: wp.Device) -> None:
+    def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
+        self.lanes = lanes
         self.inverse = wp.zeros((batch, nodes), dtype=wp.mat33d, device=device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         device, dim = self.inverse.device, self.inverse.shape
         wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self.inverse], device=device)
         if rows:
-            wp.launch(diagonal_rows, dim=(dim[0], rows), inputs=[system, contacts, active], outputs=[self.inverse], device=device)
+            inputs = [system, contacts, active, self.lanes]
+            wp.launch(diagonal_rows, dim=(dim[0], self.lanes), inputs=inputs, outputs=[self.inverse], device=device)
         wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:

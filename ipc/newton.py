@@ -49,8 +49,9 @@ class Newton:
         self.potential, self.settings = potential, settings
         self.batch, self.device = potential.batch, potential.device
         self.control = Control(self.batch, potential.project, potential.collision.overflow, self.device)
-        self.pcg = Pcg(self.batch, len(layout.node_rest), self.device)
-        self.preconditioner: Preconditioner = BlockJacobi(self.batch, len(layout.node_rest), self.device)
+        nodes, lanes = len(layout.node_rest), potential.collision.lanes
+        self.pcg = Pcg(self.batch, nodes, lanes, self.device)
+        self.preconditioner: Preconditioner = BlockJacobi(self.batch, nodes, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._graphs: dict[str, Any] = {}

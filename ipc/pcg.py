@@ -24,8 +24,6 @@ wp.set_module_options({"enable_backward": False})
 
 ROUNDS = 4
 """Iterations between two looks at whether any environment still runs."""
-ROW_CHUNKS = 4
-"""Blocks of threads that share the contact rows of an environment, if there are few environments."""
 
 
 @wp.struct
@@ -246,16 +244,17 @@ class Pcg:
     Args:
         batch: environments, B.
         nodes: unknowns of each, N, three numbers each.
+        lanes: threads that share the contact rows of an environment.
         device: Warp device.
     """
 
-    def __init__(self, batch: int, nodes: int, device: wp.Device) -> None:
-        self.batch, self.nodes, self.device = batch, nodes, device
+    def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
+        self.batch, self.nodes, self.lanes, self.device = batch, nodes, lanes, device
         self._p, self._Ap, self._z = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(3))
         self._by_blocks, self._rr, self._rz = (
             wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
         )
-        self._by_rows = wp.zeros((batch, ROW_CHUNKS if batch < 64 else 1), dtype=wp.float64, device=device)
+        self._by_rows = wp.zeros((batch, max(1, lanes // BLOCK)), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
         self.scalars = Scalars()
@@ -298,7 +297,7 @@ class Pcg:
                 inputs = [system, self._p, run]
                 outputs = [self._Ap, self._by_blocks]
                 wp.launch(multiply_blocks, dim=blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
-                inputs, outputs = [system, contacts, self._p, run], [self._Ap, self._by_rows]
+                inputs, outputs = [system, contacts, self._p, run, self.lanes], [self._Ap, self._by_rows]
                 wp.launch(multiply_rows, dim=row_blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
                 inputs = [self._p, self._Ap, self._by_blocks, self._by_rows, parity]
                 wp.launch(update_iterate, dim=dim, inputs=inputs, outputs=[s, run, x, residual], device=device)

@@ -57,7 +57,7 @@ class Potential:
         def numbers(*shape: int) -> wp.array:
             return wp.zeros(shape or batch, dtype=wp.float64, device=device)
 
-        self.collision = Collision(layout, batch, d_hat, margin=d_hat, device=device)
+        self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device)
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
         self.tets = ints(layout.tets)
@@ -178,7 +178,8 @@ class Potential:
     def push_ahead(self, mask: wp.array) -> None:
         """Residual −= H (what look_ahead found), with the matrix filled: what moves under orders pushes the unknowns ahead of it."""
         contacts = self.collision.contacts
-        self.launch(push_rows, contacts.row_verts.shape, [self.system, contacts, self.dx, mask], [self.residual])
+        lanes = self.collision.lanes
+        self.launch(push_rows, (self.batch, lanes), [self.system, contacts, self.dx, mask, lanes], [self.residual])
         if self.grips:
             self.launch(push_blocks, self.y.shape, [self.system, self.lift, mask], [self.residual])
 

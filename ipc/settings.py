@@ -32,6 +32,8 @@ class Settings:
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
             ``World.timers``.
+        deterministic: on CUDA, add contact forces and rows in a fixed order, one thread an environment: the same call gives the same
+            bits, and an environment of a batch those of a world of its own. Slower; a CPU does it anyway.
     """
 
     dt: float = 0.01
@@ -50,6 +52,7 @@ class Settings:
     max_line_search: int = 30
     motion_fraction: float = 0.8
     cuda_graph: bool = True
+    deterministic: bool = False
 
     def __post_init__(self) -> None:
         for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):
