@@ -108,7 +108,7 @@ def test_batch_equals_singles() -> None:
         single = make_world(friction=0.5)
         press(single, depth, 5, side=2e-4)
         difference = np.abs(single.positions("pad")[0] - batch.positions("pad")[i]).max()
-        assert difference <= 1e-12, f"environment {i} is off by {difference:.3g} m"
+        assert difference == 0.0, f"environment {i} is off by {difference:.3g} m"
 
 
 def test_reset_in_contact_is_a_fresh_start() -> None:
