@@ -107,11 +107,16 @@ def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
 
 
 @wp.func
-def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
+def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d):
     slot = wp.atomic_add(out.row_count, env, 1)
     if slot < out.row.shape[1]:
         out.row_verts[env, slot] = verts
-        out.row[env, slot] = wp.matrix_from_cols(q0, q1, q2, q3)
+        out.row[env, slot] = row
+
+
+@wp.func
+def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
+    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3))
 
 
 @wp.func
@@ -279,14 +284,23 @@ def add_ee(
     wp.atomic_add(gradient, env, verts[3], (slope * coef[3]) * n + (f * m1) * gb)
     wp.atomic_add(energy, env, m * f)
     push_contact(out, env, verts, coef, n, d, -slope, item[2])
-    # 2×2 Hessian in (d/d̂, c/eps), so that clamping its eigenvalues does not depend on units.
-    dh = surface.d_hat
-    h00, h01, h11 = m * f_dd * dh * dh, f_d * m1 * dh * eps, f * m2 * eps * eps
-    mean, half = (h00 + h11) / two, (h00 - h11) / two
-    radius = wp.sqrt(half * half + h01 * h01)
-    ex, ey = half + radius, h01  # eigenvector of mean + radius
+    # As a function of d and c alone, m f has the Hessian [h00 h01; h01 h11] over their gradients. It is clamped as the matrix that it is
+    # in the space of the four vertices, over the orthonormal e1, e2 that span the gradients: ∇d = g e1, ∇c = s e1 + rest e2.
+    h00, h01, h11 = m * f_dd, f_d * m1, f * m2
+    g = wp.length(coef)
+    e1 = wp.matrix_from_cols((coef[0] / g) * n, (coef[1] / g) * n, (coef[2] / g) * n, (coef[3] / g) * n)
+    e2 = wp.matrix_from_cols(-ga, ga, -gb, gb)
+    s = wp.ddot(e1, e2)
+    e2 = e2 - s * e1
+    rest = wp.sqrt(wp.ddot(e2, e2))
+    if rest > zero:
+        e2 = e2 / rest
+    k00, k01, k11 = g * g * h00 + two * g * s * h01 + s * s * h11, rest * (g * h01 + s * h11), rest * rest * h11
+    mean, half = (k00 + k11) / two, (k00 - k11) / two
+    radius = wp.sqrt(half * half + k01 * k01)
+    ex, ey = half + radius, k01  # eigenvector of mean + radius
     if half < zero:
-        ex, ey = h01, radius - half
+        ex, ey = k01, radius - half
     size = wp.sqrt(ex * ex + ey * ey)
     if size > zero:
         ex, ey = ex / size, ey / size
@@ -299,17 +313,7 @@ def add_ee(
             value = mean - radius
             px, py = -ey, ex
         if value > zero:
-            r = wp.sqrt(value)
-            qd, qc = r * px / dh, r * py / eps
-            push_row(
-                out,
-                env,
-                verts,
-                (qd * coef[0]) * n - qc * ga,
-                (qd * coef[1]) * n + qc * ga,
-                (qd * coef[2]) * n - qc * gb,
-                (qd * coef[3]) * n + qc * gb,
-            )
+            push_matrix(out, env, verts, wp.sqrt(value) * (px * e1 + py * e2))
     r = wp.sqrt(two * f * m1)
     for k in range(3):
         axis = wp.vec3d(zero, zero, zero)
