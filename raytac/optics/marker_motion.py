@@ -1,15 +1,16 @@
 """FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
 
 Zhao, Qian, Duan and Luo, FOTS, RA-L 2024, section III-B, in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
-contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c, G_c being the place at rest of the skin
-under the contact's centre, which is that centre less the drag:
+contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
 
-    dilate   Δd_d = g Σ_i a Δh_i (M − C_i) exp(−λ_d ‖M − C_i‖²)
-    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                     e_c = exp(−λ_s ‖M − G_c‖²)
-    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)   e_c = exp(−λ_t ‖M − G_c‖²)
+    dilate   Δd_d = g Σ_i a Δh_i (M' − C_i) exp(−λ_d ‖M' − C_i‖²)    M' = M + Δd_s + Δd_t
+    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                        e_c = exp(−λ_s ‖M − G_c‖²)
+    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)      e_c = exp(−λ_t ‖M − G_c‖²)
 
-w_c = e_c / max(1, Σ e_c): the published factor for one contact, and no more than one motion in all where contacts are close. a is the area
-of a sample and g the gain [1/m³] that the published sum over pixels hides in its unit of length.
+Both sides of a difference are taken on the same skin: G_c is where the skin under the contact's centre was at rest, that centre less the
+drag; the dilation, whose contact points are where they are now, sees the marker as it was dragged. w_c = e_c / max(1, Σ e_c): the
+published factor for one contact, and no more than one motion in all where contacts are close. a is the area of a sample and g the gain
+[1/m³] that the published sum over pixels hides in its unit of length.
 """
 
 from __future__ import annotations
@@ -117,9 +118,9 @@ class FotsKernel:
         env = i // count
         place = dr.gather(mi.Point2f, xy, i)
         gain, ld, ls, smax, lt, tmax = (dr.gather(mi.Float, constants, n) for n in range(6))
-        dilate = self._dilate(env, place, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
-        moved = dilate + _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax))
-        return dr.ravel(moved)
+        drag = _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax))
+        dilate = self._dilate(env, place + drag, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
+        return dr.ravel(dilate + drag)
 
     def _dilate(self, env: Any, place: Any, depth: Any, boxes: Any, ld: Any) -> Any:
         """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker."""
