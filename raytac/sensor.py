@@ -13,23 +13,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.device import resolve_device
-from raytac.errors import InputError
+from raytac.errors import BackendError, InputError
 from raytac.frame import OUTPUTS, TactileFrame
-from raytac.gel.object_height import object_height
 from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.io.options import parse_resolution
 from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
+from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-    from raytac.physics.rigid import ContactState, RigidPad
+    from raytac.physics.contact_state import ContactState
+    from raytac.physics.rigid import RigidPad
+    from raytac.physics.soft import SoftPad
+    from raytac.physics.soft_mesh import PadMesh
 
-__all__ = ["INTEGRATORS", "OPTICS", "PHYSICS", "TactileSensor", "sensor_outputs"]
+__all__ = ["INTEGRATORS", "OPTICS", "PADS", "PHYSICS", "TactileSensor", "sensor_outputs"]
 
-PHYSICS = ("rigid",)
-"""Names that ``physics=`` accepts."""
 OPTICS = ("raytrace", "taxim", "phong")
 """Names that ``optics=`` accepts."""
 LARGEST_SIDE = 8192
@@ -56,12 +57,15 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    physics: str
+    """How the gel deforms: as asked for, else as the scene that was loaded last asks, else ``rigid``."""
 
     def __init__(
         self,
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
-        physics: str = "rigid",
+        physics: str | None = None,
+        pad: str | PadMesh | None = None,
         optics: str | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
@@ -77,7 +81,9 @@ class TactileSensor:
 
         Args:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
-            physics: how the gel deforms, one of ``PHYSICS``.
+            physics: how the gel deforms, one of ``PHYSICS``: ``rigid`` (by geometry and Gaussians) or ``ipc`` (simulated); None is as the
+                scene asks, else ``rigid``.
+            pad: how finely a simulated pad is cut, one of ``PADS``, or a mesh of one's own; None is as the scene asks, else ``coarse``.
             optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
                 outputs and device).
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
@@ -97,7 +103,12 @@ class TactileSensor:
             SpecError: the sensor, light or calibration file breaks a rule.
             BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
-        _check_name("physics", physics, PHYSICS)
+        if physics is not None:
+            _check_name("physics", physics, PHYSICS)
+        if isinstance(pad, str):
+            _check_name("pad", pad, PADS)
+        if pad is not None and physics == "rigid":
+            raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
         if isinstance(optics, str):
             _check_name("optics", optics, OPTICS)
         _check_name("integrator", integrator, INTEGRATORS)
@@ -127,13 +138,16 @@ class TactileSensor:
         if not isinstance(sensor, (str, Path, SensorSpec)):
             raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
         self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
-        self.physics, self.integrator, self.spp = physics, integrator, spp
+        self.integrator, self.spp = integrator, spp
+        self._asked_physics, self._asked_pad = physics, pad
+        self.physics = physics or ("ipc" if pad is not None else "rigid")
         self.outputs = tuple(name for name in OUTPUTS if name in outputs)
         self.resolution = size if size is not None else self.spec.camera.resolution
         _warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.seed, self.num_envs = device, int(seed), num_envs
         self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
+        self._level: str | PadMesh = pad or PADS[0]
         self._optics_options = dict(optics_options or {})
         if optics == "taxim" and isinstance(self._optics_options.get("calibration"), (str, Path)):
             from raytac.optics.calib_folder import load_calibration
@@ -145,7 +159,7 @@ class TactileSensor:
         self._optics_name = (
             optics.label if not isinstance(optics, str) else "raytrace-" + integrator if optics == "raytrace" else optics
         )
-        self._pad: RigidPad | None = None
+        self._pad: RigidPad | SoftPad | None = None
 
     @property
     def label(self) -> str:
@@ -154,7 +168,15 @@ class TactileSensor:
         The optical mode names itself once it is built, which options such as a denoiser change.
         """
         optics = self._optics_name if self._mode is None else self._mode.label
-        return f"{self.physics}+{optics}" if self._optical_outputs else self.physics
+        physics = "ipc-" + self.pad if self.physics == "ipc" else self.physics
+        return f"{physics}+{optics}" if self._optical_outputs else physics
+
+    @property
+    def pad(self) -> str:
+        """How finely a simulated pad is cut: a level of ``PADS``, or ``own`` for a mesh of one's own; empty for the rigid pad."""
+        if self.physics != "ipc":
+            return ""
+        return self._level if isinstance(self._level, str) else "own"
 
     @property
     def sampling(self) -> dict[str, int | str]:
@@ -190,14 +212,14 @@ class TactileSensor:
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, offsets=offsets, depths=depths)
-        state = pad.peak(pad.run())
+        state = pad.peak(pad.run())  # type: ignore[arg-type]
         physics_ms = 1e3 * (time.perf_counter() - start)
         frame = self.update(state)
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
 
     def load(
         self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
-    ) -> RigidPad:
+    ) -> RigidPad | SoftPad:
         """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
 
         Args:
@@ -208,13 +230,20 @@ class TactileSensor:
         Raises:
             InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule.
+            BackendError: a simulated pad is asked for, and its solver cannot run here.
+            RaytacError: the object overlaps a simulated pad where it starts.
         """
-        from raytac.physics.rigid import RigidPad
-
         press = _press_scene(scene)
-        self._pad = RigidPad(
-            self.spec, press, pitch=self._pitch, num_envs=self.num_envs, seed=self.seed, offsets=offsets, depths=depths
-        )
+        self.physics = self._asked_physics or ("ipc" if self._asked_pad is not None else press.physics or "rigid")
+        self._level = self._asked_pad or press.pad or PADS[0]
+        settings: dict[str, Any] = {"pitch": self._pitch, "num_envs": self.num_envs, "seed": self.seed}
+        settings |= {"offsets": offsets, "depths": depths}
+        if self.physics == "ipc":
+            self._pad = _soft_pad()(self.spec, press, pad=self._level, device=_solver_device(self.device), **settings)
+        else:
+            from raytac.physics.rigid import RigidPad
+
+            self._pad = RigidPad(self.spec, press, **settings)
         return self._pad
 
     def update(self, state: ContactState | GelSurface) -> TactileFrame:
@@ -226,14 +255,19 @@ class TactileSensor:
         start = time.perf_counter()
         if isinstance(state, GelSurface):
             surface, force, area, failed = state, None, None, None
+            forces: dict[str, Any] = {}
         else:
-            surface, area, failed = self._surface(state), state.force_law_area, state.failed
+            surface, failed = self._surface(state), state.failed
+            area = state.force_law_area if self.physics == "rigid" else None
+            forces = self._forces(state, surface)
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         height = surface.height if "height" in self.outputs else None
         if not self._optical_outputs:
-            return TactileFrame(surface, height=height, force=force, force_law_area=area, failed=failed, time_ms=time_ms)
+            return TactileFrame(
+                surface, height=height, force=force, force_law_area=area, failed=failed, time_ms=time_ms, **forces
+            )
         images = self.optical_mode.render(surface)
         time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(
@@ -250,6 +284,7 @@ class TactileSensor:
             force_law_area=area,
             failed=failed,
             time_ms=time_ms,
+            **forces,
         )
 
     def rest(self) -> TactileFrame:
@@ -261,9 +296,20 @@ class TactileSensor:
 
         None if the surface has no object.
         """
-        if self._pad is None or surface.pad_from_object is None:
-            return None
-        return object_height(self._pad.parts, surface.pad_from_object, surface.grid.x, surface.grid.y)
+        return None if self._pad is None else self._pad.object_height(surface)
+
+    def _forces(self, state: ContactState, surface: GelSurface) -> dict[str, Any]:
+        """Wrench, traction and contact area, as far as they are asked for."""
+        pad, found = self._pad, {}
+        assert pad is not None
+        if "wrench" in self.outputs:
+            found["wrench"] = pad.wrench(state)
+        if "traction" in self.outputs:
+            found["traction"] = pad.traction(state)
+        if found:
+            cell = surface.grid.pitch[0] * surface.grid.pitch[1]
+            found["contact_area"] = np.where(state.failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
+        return found
 
     def _surface(self, state: ContactState) -> GelSurface:
         if not hasattr(state, "pad_from_object"):
@@ -306,6 +352,19 @@ class TactileSensor:
                 rule = f"is no option of optics={self._optics!r}, or an argument of TactileSensor itself"
                 raise InputError(f"optics_options[{name!r}]", value=value, rule=rule, choices=known)
         return Mode(self.spec, **settings, **self._optics_options)
+
+
+def _soft_pad() -> type[SoftPad]:
+    try:
+        from raytac.physics.soft import SoftPad
+    except ImportError as error:
+        raise BackendError(f"physics='ipc' needs the contact solver ({error}): `pip install raytac[ipc]`") from error
+    return SoftPad
+
+
+def _solver_device(device: str) -> str:
+    """``cpu`` or ``cuda`` for the solver, which traces no rays and needs no OptiX."""
+    return resolve_device(device, ray_tracing=False)
 
 
 def sensor_outputs(optics: str) -> tuple[str, ...]:
