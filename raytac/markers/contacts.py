@@ -68,7 +68,7 @@ class ContactCells:
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
         touched = np.asarray(surface.contact)[part]
         found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
-        broken = ~np.isfinite(found).all(axis=(1, 2))
+        broken = ~np.all(np.isfinite(found), axis=(1, 2))
         if broken.any():
             touched = touched & ~broken[:, None, None]
         found = np.where(touched, np.maximum(found, 0), np.float32(0))

@@ -57,4 +57,4 @@ def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
     c, s = np.cos(angle) - 1.0, np.sin(angle)
     turned = np.stack([c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]], axis=-1)
     way = contacts.shear[rows, nearest] + turned
-    return np.where(contacts.active.any(axis=1)[:, None, None], way, 0.0)
+    return np.where(np.any(contacts.active, axis=1)[:, None, None], way, 0.0)

@@ -181,10 +181,10 @@ def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple
 
 def _boxes(contact: np.ndarray) -> np.ndarray:
     """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
-    columns, rows = contact.any(axis=1), contact.any(axis=2)
+    columns, rows = np.any(contact, axis=1), np.any(contact, axis=2)
     box = np.zeros((len(contact), 4), dtype=np.uint32)
     for first, along in ((0, columns), (2, rows)):
         box[:, first] = along.argmax(axis=1)
         box[:, first + 1] = along.shape[1] - along[:, ::-1].argmax(axis=1)
-    box[~rows.any(axis=1)] = 0
+    box[~np.any(rows, axis=1)] = 0
     return box

@@ -152,7 +152,7 @@ def test_batch_is_single(grid: PadGrid) -> None:
             np.concatenate([env[k].height for env in envs]),
             np.concatenate([env[k].contact for env in envs]),
             np.concatenate([env[k].contact_centre for env in envs]),
-            np.concatenate([env[k].pad_from_object for env in envs if env[k].pad_from_object is not None]),
+            np.concatenate([np.asarray(env[k].pad_from_object) for env in envs]),
         )
         for k in range(3)
     ]
