@@ -86,6 +86,8 @@ class StandOff:
         borne = sandwich(self._hat_y, np.maximum(pressure, 0.0).reshape(shape), self._hat_x.T)
         shift = np.zeros(len(upwards))
         there = np.isfinite(underside)
+        if not (there.any() and borne.any()):
+            return ContactFit(float("nan"), shift)
         gap = np.where(there, underside, 0.0) - self.heights(self._surface.rise(places, upwards))
         near = there & (borne > 0.0) & (gap < self._reach + _SAG * self._bulge(underside, there))
         weight = np.where(near, borne, 0.0)
