@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from raytac.gel.surface import GelSurface, summary
+
+if TYPE_CHECKING:
+    from raytac.markers import MarkerFrame
 
 __all__ = ["OUTPUTS", "TactileFrame"]
 
@@ -39,6 +43,8 @@ class TactileFrame:
     uncovered: np.ndarray | None = None
     """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact; None
     for other modes, and where the table does not tell its coverage."""
+    markers: MarkerFrame | None = None
+    """Where the markers have gone, in metres and pixels; None unless the sensor was given a marker model."""
     wrench: np.ndarray | None = None
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
     traction: np.ndarray | None = None
@@ -54,7 +60,7 @@ class TactileFrame:
     failed: np.ndarray | None = None
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
-    """Wall time of ``physics``, ``surface`` and ``optics`` for the whole batch [ms]."""
+    """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 
     def __repr__(self) -> str:
         return summary(self)

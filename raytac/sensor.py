@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,8 @@ from raytac.frame import OUTPUTS, TactileFrame
 from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.io.options import parse_resolution
+from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
+from raytac.markers.pattern import MarkerPattern
 from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
 from raytac.specs.press import PADS, PHYSICS
@@ -75,6 +77,8 @@ class TactileSensor:
         seed: int = 0,
         num_envs: int = 1,
         pitch: float | None = None,
+        markers: str | None = None,
+        marker_perturbation: MarkerPerturbation | None = None,
         optics_options: dict[str, Any] | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
@@ -95,6 +99,9 @@ class TactileSensor:
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
+            markers: how the sensor's markers move, one of ``MARKER_MODELS``; frames then hold them, and images show the dots. None leaves
+                them out, and images show a plain coat.
+            marker_perturbation: noise, losses and shifts of the markers; None is none.
             optics_options: further keyword arguments of the optical mode, such as ``calibration`` and ``shadow`` of ``taxim``;
                 their values are checked when it is built.
 
@@ -130,6 +137,13 @@ class TactileSensor:
             if isinstance(optics, str) and name not in sensor_outputs(optics):
                 rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
                 raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
+        if markers is not None:
+            _check_name("markers", markers, MARKER_MODELS)
+            if markers == "surface" and physics == "rigid":
+                rule = "tracks the surface of a simulated gel; physics='rigid' has none"
+                raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
+        elif marker_perturbation is not None:
+            raise InputError("marker_perturbation", value=marker_perturbation, rule="needs a marker model: markers=…")
         _check_whole("num_envs", num_envs)
         _check_whole("spp", 1 if spp is None else spp)
         size = _checked_resolution(resolution)
@@ -148,6 +162,10 @@ class TactileSensor:
         self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._level: str | PadMesh = pad or PADS[0]
+        self.markers, self._marker_perturbation = markers, marker_perturbation
+        if markers is not None:
+            MarkerPattern.of(self.spec, self.resolution)  # a pattern that cannot be seen is told now
+        self._tracker: MarkerTracker | None = None
         self._optics_options = dict(optics_options or {})
         if optics == "taxim" and isinstance(self._optics_options.get("calibration"), (str, Path)):
             from raytac.optics.calib_folder import load_calibration
@@ -212,7 +230,7 @@ class TactileSensor:
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, offsets=offsets, depths=depths)
-        state = pad.peak(pad.run())  # type: ignore[arg-type]
+        state = pad.peak(self._followed(pad.run()))  # type: ignore[arg-type]
         physics_ms = 1e3 * (time.perf_counter() - start)
         frame = self.update(state)
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
@@ -244,10 +262,14 @@ class TactileSensor:
             from raytac.physics.rigid import RigidPad
 
             self._pad = RigidPad(self.spec, press, **settings)
+        if self._tracker is not None:
+            self._tracker.reset()
         return self._pad
 
     def update(self, state: ContactState | GelSurface) -> TactileFrame:
         """Frame of a gel surface, or of a state of the physics that ``load`` or ``press`` set up.
+
+        With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
 
         Raises:
             InputError: a state, and no scene was loaded, or another one than the state is of.
@@ -263,11 +285,20 @@ class TactileSensor:
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
+        markers = None
+        if self.markers is not None:
+            markers = self.marker_tracker.update(surface)
+            surface, done = self._dotted(surface, markers), time.perf_counter()
+            time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
+        return self._frame(surface, markers, done, time_ms, force=force, force_law_area=area, failed=failed, **forces)
+
+    def _frame(
+        self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
+    ) -> TactileFrame:
+        """The frame with the images that are asked for; ``done``: when the surface was there."""
         height = surface.height if "height" in self.outputs else None
         if not self._optical_outputs:
-            return TactileFrame(
-                surface, height=height, force=force, force_law_area=area, failed=failed, time_ms=time_ms, **forces
-            )
+            return TactileFrame(surface, height=height, markers=markers, time_ms=time_ms, **fields)
         images = self.optical_mode.render(surface)
         time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(
@@ -280,16 +311,67 @@ class TactileSensor:
             height=height,
             contact=images.contact,
             uncovered=images.uncovered,
-            force=force,
-            force_law_area=area,
-            failed=failed,
+            markers=markers,
             time_ms=time_ms,
-            **forces,
+            **fields,
         )
 
     def rest(self) -> TactileFrame:
-        """Frame of one untouched pad (B = 1), what every difference image is taken from."""
-        return self.update(GelSurface.at_rest(self.grid))
+        """Frame of one untouched pad (B = 1), what every difference image is taken from; markers keep their history."""
+        start, surface, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+        if self.markers is not None:
+            markers = self.marker_tracker.at_rest()
+            surface = self._dotted(surface, markers)
+        done = time.perf_counter()
+        return self._frame(surface, markers, done, {"surface": 1e3 * (done - start)})
+
+    @property
+    def marker_tracker(self) -> MarkerTracker:
+        """The marker model with its history, built on first use.
+
+        Raises:
+            InputError: the sensor was given no marker model, or lacks what the model needs.
+            BackendError: the model's backend does not work here.
+        """
+        if self.markers is None:
+            raise InputError("markers", value=None, rule="was not asked for", choices=MARKER_MODELS)
+        if self._tracker is None:
+            self._tracker = MarkerTracker(
+                self.spec,
+                self.markers,
+                self.grid,
+                num_envs=self.num_envs,
+                resolution=self.resolution,
+                device=self.device,
+                seed=self.seed,
+                perturbation=self._marker_perturbation,
+            )
+        return self._tracker
+
+    def reset_markers(self, envs: np.ndarray | list[int] | None = None) -> None:
+        """Forget what the markers of environments (a mask (B,), a list, or None for all) went through; draws their placement anew.
+
+        ``load`` and ``press`` do it for all.
+
+        Raises:
+            InputError: no marker model was asked for, or an environment that does not exist.
+        """
+        self.marker_tracker.reset(envs)
+
+    def _followed(self, states: Iterable[ContactState]) -> Iterator[ContactState]:
+        """The same states, while markers that need it see every one of them."""
+        for state in states:
+            if self.markers is not None:
+                self.marker_tracker.follow(self._surface(state))
+            yield state
+
+    def _dotted(self, surface: GelSurface, markers: MarkerFrame) -> GelSurface:
+        """The surface with dots printed where the markers are, if there is an image to show them."""
+        if not {"rgb", "layers"} & set(self._optical_outputs):
+            return surface
+        from raytac.markers.dots import dot_ink
+
+        return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
         """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where it is not.

@@ -144,6 +144,17 @@ class MarkerTracker:
         self._contacts.reset(which)
         self._place(which)
 
+    def at_rest(self) -> MarkerFrame:
+        """Markers of one untouched pad (B = 1), placed as in environment 0; changes no history and draws nothing."""
+        rest, pixel = self.pattern.rest[:1], self.pattern.pixel[:1]
+        nothing = np.zeros(pixel.shape)
+        return MarkerFrame(nothing, nothing, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
+
+    def follow(self, surface: GelSurface) -> None:
+        """Take note of a surface of the motion whose markers nobody asks for; as ``update``, for models that need the history."""
+        if self._cells is not None:
+            self._contacts.update(surface, self._cells.sample(surface))
+
     def update(self, surface: GelSurface) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
 
