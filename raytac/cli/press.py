@@ -12,6 +12,7 @@ import tyro
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import CommonOptions, parse_outputs, parse_resolution
+from raytac.markers import MARKER_MODELS
 from raytac.report.press import run_press
 from raytac.sensor import INTEGRATORS, OPTICS, PADS, PHYSICS, TactileSensor, sensor_outputs
 from raytac.specs import load_press
@@ -23,8 +24,9 @@ __all__ = ["PressArgs"]
 class PressArgs(CommonOptions):
     """Press an object into the gel and write image, layers, height and a preview to a folder.
 
-    Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, traction.npy, preview.png and
-    metrics.json. An error or Ctrl-C leaves the folder as it was; a press that is done replaces an earlier one there as a whole.
+    Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, traction.npy, markers.npz,
+    preview.png and metrics.json. An error or Ctrl-C leaves the folder as it was; a press that is done replaces an earlier one there as
+    a whole.
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -42,6 +44,9 @@ class PressArgs(CommonOptions):
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
     shadow: bool | None = None
     """taxim: cast shadows; where the table has them if not given."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
+    """How the sensor's markers move: fots, surface (needs physics ipc), superposition or force_field; the sensor must have markers, as
+    gelsight_mini_7x9 has. Writes markers.npz, and images show the dots. None if not given."""
     integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
     """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
     spp: int | None = None
@@ -73,6 +78,7 @@ class PressArgs(CommonOptions):
             spp=self.spp,
             device=self.device,
             seed=self.seed,
+            markers=self.markers,
             optics_options=self._optics_options(),
         )
         out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)

@@ -16,6 +16,8 @@ from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import MaxNLocator
 
 from raytac.gel.surface import PadGrid
+from raytac.markers import MarkerFrame
+from raytac.report.markers_figure import draw_arrows
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
 __all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
@@ -69,6 +71,10 @@ class PreviewData:
     """Image of the untouched pad, shape (H, W, 3), uint8."""
     normals: np.ndarray | None = None
     """Unit normals, pad frame, n_z < 0, shape (H, W, 3)."""
+    markers: MarkerFrame | None = None
+    """Markers of environment 0, in pixels of ``resolution``."""
+    resolution: tuple[int, int] | None = None
+    """(width, height) of the image [px]."""
     traction: np.ndarray | None = None
     """Force of the object on the pad per area, pad frame [Pa], shape (Ny, Nx, 3)."""
     section: tuple[float, float] | None = None
@@ -102,6 +108,8 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
         panels.append(lambda axes: _normals_panel(axes, data))
     if data.rgb is not None and data.rest_rgb is not None:
         panels.append(lambda axes: _difference_panel(axes, data))
+    if data.markers is not None:
+        panels.append(lambda axes: _marker_panel(axes, data))
     if data.traction is not None:
         panels += [lambda axes: _pressure_panel(axes, data), lambda axes: _shear_panel(axes, data)]
     with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
@@ -183,6 +191,13 @@ def _colour_bar(axes: Axes, shown: AxesImage) -> None:
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     bar.locator = MaxNLocator(nbins=4, steps=[1, 2, 5, 10])
     bar.update_ticks()
+
+
+def _marker_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.markers is not None and data.resolution is not None
+    magnified = draw_arrows(axes, data.markers, data.resolution)
+    longest = float(np.nanmax(np.linalg.norm(data.markers.displacement_px[0], axis=-1)))
+    axes.set_title(f"markers × {magnified:g}, longest {longest:.1f} px", loc="left")
 
 
 def _pressure_panel(axes: Axes, data: PreviewData) -> None:

@@ -159,7 +159,7 @@ def test_batch_is_single(grid: PadGrid) -> None:
     batch = follow(grid, *together)
     for b, env in enumerate(envs):
         single = follow(grid, *env)
-        for name in ("active", "centre", "shear", "twist"):
+        for name in ("active", "centre", "shear", "twist", "radius"):
             np.testing.assert_allclose(getattr(batch, name)[b], getattr(single, name)[0], rtol=0, atol=1e-15)
 
 
