@@ -118,7 +118,8 @@ class SoftPad:
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
         self._touches: dict[tuple[float, float, float], float] = {}
-        self._contact: SoftContact | None = None
+        self.solver: SoftContact | None = None
+        """Pad and object in the contact solver; None without an object."""
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
         self._lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
@@ -128,7 +129,7 @@ class SoftPad:
         self._forget()
         if self.parts:
             self._origin[:] = [self._first_place(b) for b in range(num_envs)]
-            self._contact = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
+            self.solver = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -188,8 +189,8 @@ class SoftPad:
     def reset(self) -> None:
         """Forget all history: the pad at rest, the object above it."""
         self._forget()
-        if self._contact is not None:
-            self._contact.reset()
+        if self.solver is not None:
+            self.solver.reset()
 
     # --- driving ---------------------------------------------------------------------------------------------------------------
 
@@ -245,18 +246,18 @@ class SoftPad:
                 begun = depth = self._depth
 
     def _step(self) -> None:
-        assert self._contact is not None
+        assert self.solver is not None
         poses = self._poses(self._depth)
         case = None
         if self.scene.moves == "case":
             case = self._case()
-        self._failed |= self._contact.drive(poses, case)
+        self._failed |= self.solver.drive(poses, case)
 
     def _settle_depth(self) -> None:
         """Drive until the coat, not the barrier's shell, is at the depth."""
-        assert self._contact is not None
+        assert self.solver is not None
         for _ in range(_REFINEMENTS):
-            clearance = self._reader.clearance(self._contact, self._poses(self._depth))
+            clearance = self._reader.clearance(self.solver, self._poses(self._depth))
             off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
             if np.abs(off).max() < _CLOSE:
                 return
@@ -264,7 +265,7 @@ class SoftPad:
             self._step()
 
     def _release(self, depth: np.ndarray, fraction: float) -> None:
-        assert self._contact is not None
+        assert self.solver is not None
         lift = np.array(
             [
                 place[2] - self._touch(place[0] + shear[0], place[1] + shear[1], twist)
@@ -273,7 +274,7 @@ class SoftPad:
         )
         if self._is_free:
             if fraction == 1.0:
-                self._contact.reset()
+                self.solver.reset()
                 self._depth = lift - CLEARANCE
             return
         self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
@@ -303,13 +304,13 @@ class SoftPad:
 
     def _lie(self) -> None:
         """Let a free object come to rest under its weight."""
-        assert self._contact is not None and self._weight > 0.0
-        self._contact.weigh(float(self._force[0]) / self._weight)
+        assert self.solver is not None and self._weight > 0.0
+        self.solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
-            self._failed |= self._contact.drive(self._poses(self._depth))
-            if (self._contact.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
+            self._failed |= self.solver.drive(self._poses(self._depth))
+            if (self.solver.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
                 return
-        self._failed |= self._contact.speed() >= _STILL
+        self._failed |= self.solver.speed() >= _STILL
 
     # --- reading ---------------------------------------------------------------------------------------------------------------
 
@@ -319,12 +320,12 @@ class SoftPad:
         return state.reading
 
     def _normal_force(self) -> np.ndarray:
-        assert self._contact is not None
-        return -self._contact.forces()[:, :, 2].sum(axis=1)
+        assert self.solver is not None
+        return -self.solver.forces()[:, :, 2].sum(axis=1)
 
     def _state(self, stage: int, kind: str, fraction: float) -> SoftState:
         batch = self.num_envs
-        if self._contact is None:
+        if self.solver is None:
             poses, zero = np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
             rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
             coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
@@ -337,7 +338,7 @@ class SoftPad:
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
             )
         failed: np.ndarray = self._failed.copy()
-        reading = self._reader.read(self._contact, self._poses(self._depth), failed)
+        reading = self._reader.read(self.solver, self._poses(self._depth), failed)
         self._last = reading
         surface, forces = reading.surface, reading.forces
         assert surface.coat is not None

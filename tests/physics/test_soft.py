@@ -84,8 +84,8 @@ def test_the_case_feels_what_the_object_does():
     """The wrench summed over the coat's contacts is that summed over the bonded vertices, within 1 % of the load."""
     pad = soft(press(indent(0.3e-3), StageSpec("shear", shear=(0.1e-3, 0.0))))
     wrench = pad.wrench(pad.peak(pad.run()))[0]
-    assert pad._contact is not None
-    held = pad._contact.world.wrench("pad")
+    assert pad.solver is not None
+    held = pad.solver.world.wrench("pad")
     load = np.linalg.norm(wrench[:3])
     assert load > 0.3 and np.linalg.norm(held.force[0] - wrench[:3]) < 0.01 * load
     assert np.linalg.norm(held.torque[0] - wrench[3:]) < 0.01 * load * SENSOR.gelpad.thickness
@@ -153,7 +153,7 @@ def test_friction_is_coulombs():
     assert state.shear_force[0, 0] == pytest.approx(0.2 * state.normal_force[0], rel=0.1)
     pad = soft(press(indent(0.5e-3), StageSpec("shear", shear=(0.5e-3, 0.0))), FRICTIONLESS)
     state = pad.peak(pad.run())
-    assert abs(state.shear_force[0, 0]) < 0.02 * state.normal_force[0]
+    assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
 
 
 def test_twist_turns_with_the_object():
@@ -161,6 +161,7 @@ def test_twist_turns_with_the_object():
     state = pad.peak(pad.run())
     assert state.twist_torque[0] > 1e-4 and np.abs(state.shear_force[0]).max() < 1e-3 * state.normal_force[0]
     coat = pad.surface(state).coat
+    assert coat is not None
     here = np.linalg.norm(coat.mesh.rest[:, :2], axis=1) < 2e-3
     x, y = coat.mesh.rest[here, :2].T
     turned = (x * coat.displacement[0, here, 1] - y * coat.displacement[0, here, 0]).sum() / (x**2 + y**2).sum()
