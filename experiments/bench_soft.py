@@ -31,7 +31,7 @@ from raytac.io.options import CommonOptions, parse_names
 from raytac.physics.soft import SoftPad
 from raytac.physics.soft_mesh import PadLevel, pad_mesh
 from raytac.sensor import PADS, TactileSensor
-from raytac.specs import load_press
+from raytac.specs import SensorSpec, load_press, load_sensor
 from raytac.specs.press import PressScene, StageSpec
 
 DEPTH, STEPS = 0.8e-3, 8
@@ -59,7 +59,7 @@ class Args(CommonOptions):
                 raise InputError("levels", value=level, rule="must be a known level", choices=PADS)
         out = self.out or Path("runs") / "bench_soft"
         with result_folder(out, ("metrics.json",)) as folder:
-            metrics = measured(self.sensor, levels, self.refined, self.device, self.seed)
+            metrics = measured(load_sensor(self.sensor), levels, self.refined, self.device, self.seed)
             metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
             write_metrics(folder / "metrics.json", metrics)
         for key, value in metrics.items():
@@ -73,13 +73,13 @@ def ball(*stages: StageSpec, dynamics: str = "kinematic") -> PressScene:
     return replace(scene, trajectory=stages, object=replace(scene.object, dynamics=dynamics))
 
 
-def measured(name: str, levels: tuple[str, ...], refined: bool, device: str, seed: int) -> dict[str, Metric]:
+def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, device: str, seed: int) -> dict[str, Metric]:
     metrics: dict[str, Metric] = {"command": "bench_soft", "seed": seed}
     heights, touched = {}, {}
     scene = ball(StageSpec("indent", depth=DEPTH))
     for level in [*levels, *(["refined"] if refined else [])]:
-        pad = pad_mesh(TactileSensor(name).spec.gelpad, REFINED) if level == "refined" else level
-        sensor = TactileSensor(name, physics="ipc", pad=pad, device=device, seed=seed)
+        pad = pad_mesh(spec.gelpad, REFINED) if level == "refined" else level
+        sensor = TactileSensor(spec, physics="ipc", pad=pad, device=device, seed=seed)
         metrics["device"] = sensor.device_used
         sensor.rest()
         seconds = []
@@ -96,6 +96,7 @@ def measured(name: str, levels: tuple[str, ...], refined: bool, device: str, see
             seconds.append(time.perf_counter() - began)
         surface = frame.surface
         heights[level], touched[level] = surface.height[0].astype(float), surface.contact[0]
+        print(f"{level}: {len(seconds)} steps in {sum(seconds):.1f} s", flush=True)
         metrics |= {
             f"soft.{level}.vertices": len(loaded.mesh.tets.vertices),
             f"soft.{level}.steps_per_s": 1.0 / float(np.median(seconds[1:])),
@@ -116,12 +117,11 @@ def measured(name: str, levels: tuple[str, ...], refined: bool, device: str, see
         metrics[f"soft.{level}.height_um"] = float(np.sqrt((off[touched[truth]] ** 2).mean()))
         metrics[f"soft.{level}.around_um"] = float(np.sqrt((off[near & ~touched[truth]] ** 2).mean()))
     metrics["height.against"] = truth
-    return metrics | forces(name) | {"law.force_n": layer_law(name)}
+    return metrics | forces(spec) | {"law.force_n": layer_law(spec)}
 
 
-def forces(name: str) -> dict[str, Metric]:
+def forces(spec: SensorSpec) -> dict[str, Metric]:
     """Relative errors of the force on the case, coarse pad."""
-    spec = TactileSensor(name).spec
     found: dict[str, Metric] = {}
     for key, force, dynamics in (("driven", 1.0, "kinematic"), ("weight", 0.3, "affine")):
         pad = SoftPad(spec, ball(StageSpec("indent", force=force), dynamics=dynamics), pitch=0.2e-3)
@@ -131,10 +131,10 @@ def forces(name: str) -> dict[str, Metric]:
     return found
 
 
-def layer_law(name: str) -> float:
+def layer_law(spec: SensorSpec) -> float:
     from raytac.physics.rigid import RigidPad
 
-    pad = RigidPad(TactileSensor(name).spec, ball(StageSpec("indent", depth=DEPTH)), pitch=0.05e-3)
+    pad = RigidPad(spec, ball(StageSpec("indent", depth=DEPTH)), pitch=0.05e-3)
     return float(pad.peak(pad.run()).normal_force[0])
 
 
