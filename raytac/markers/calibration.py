@@ -47,9 +47,9 @@ def probe_sensor(sensor: SensorSpec) -> SensorSpec:
 class ProbeData:
     """Frames of many presses under the probes: N frames under load, P probes.
 
-    ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth``, ``contact``: samples
-    (N, ny, nx); ``contacts``: (active, centre, shear, twist, radius) as in ``Contacts``, (N, K, …); ``force``: (penetration (N, P),
-    wall (N, P, 2), way (N, P, 2)) that the force field reads.
+    ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth`` [m], (N, ny, nx), and
+    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: (active, centre, shear, twist, radius) as in ``Contacts``, (N, K, …);
+    ``force``: (penetration (N, P), wall (N, P, 2), way (N, P, 2)) that the force field reads.
     """
 
     cells: ContactCells
@@ -57,7 +57,7 @@ class ProbeData:
     truth: np.ndarray
     loads: np.ndarray
     depth: np.ndarray
-    contact: np.ndarray
+    boxes: np.ndarray
     contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     force: tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -84,9 +84,7 @@ class ProbeData:
                 penetration = np.where(touched, np.maximum(rest[..., 2] - height, 0), 0)
                 wall = slope / np.sqrt(1 + (slope**2).sum(axis=-1, keepdims=True))
                 way = object_way(contacts, rest[..., :2])
-                rows.append(
-                    (truth[0], frame.load, samples.depth[0], samples.contact[0], contacts, penetration[0], wall[0], way[0])
-                )
+                rows.append((truth[0], frame.load, samples.depth[0], samples.boxes[0], contacts, penetration[0], wall[0], way[0]))
         most = max(row[4].active.shape[1] for row in rows)
 
         def padded(name: str) -> np.ndarray:
@@ -99,7 +97,7 @@ class ProbeData:
             truth=np.stack([row[0] for row in rows]),
             loads=np.array([row[1] for row in rows]),
             depth=np.stack([row[2] for row in rows]),
-            contact=np.stack([row[3] for row in rows]),
+            boxes=np.stack([row[3] for row in rows]),
             contacts=(padded("active"), padded("centre"), padded("shear"), padded("twist"), padded("radius")),
             force=(np.stack([r[5] for r in rows]), np.stack([r[6] for r in rows]), np.stack([r[7] for r in rows])),
         )
@@ -142,7 +140,7 @@ def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto"
     def error(constants: FotsConstants, rows: np.ndarray) -> float:
         markers = np.broadcast_to(data.markers, (len(rows), *data.markers.shape))
         contacts = tuple(part[rows] for part in data.contacts)
-        moved = kernel.displacement(markers, data.depth[rows], data.contact[rows], contacts, constants)  # type: ignore[arg-type]
+        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], contacts, constants)  # type: ignore[arg-type]
         return float(np.linalg.norm(moved - data.truth[rows], axis=-1).mean())
 
     def rows_of(load: str) -> np.ndarray:

@@ -57,4 +57,4 @@ class FotsMarkers:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert samples is not None and contacts is not None
         motion = contacts.active, contacts.centre, contacts.shear, contacts.twist, contacts.radius
-        return self._kernel.displacement(rest[..., :2], samples.depth, samples.contact, motion, self.constants)
+        return self._kernel.displacement(rest[..., :2], samples.depth, samples.boxes, motion, self.constants)

@@ -14,9 +14,9 @@ def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...
     """Indices (env, row, column) of the cells' first nodes and the place in the cell along x and y, each (B, M); clipped to the pad."""
     grid = surface.grid
     dx, dy = grid.pitch
-    fx = np.clip((xy[..., 0] - grid.x[0]) / dx, 0, len(grid.x) - 1.001)
-    fy = np.clip((xy[..., 1] - grid.y[0]) / dy, 0, len(grid.y) - 1.001)
-    fx, fy = np.nan_to_num(fx), np.nan_to_num(fy)  # where an environment failed, any node will do
+    # fmin and fmax pass over NaN: where an environment failed, any node will do.
+    fx = np.fmax(np.fmin((xy[..., 0] - grid.x[0]) / dx, len(grid.x) - 1.001), 0.0)
+    fy = np.fmax(np.fmin((xy[..., 1] - grid.y[0]) / dy, len(grid.y) - 1.001), 0.0)
     column, row = fx.astype(int), fy.astype(int)
     return (np.arange(len(xy))[:, None], row, column), fx - column, fy - row
 
@@ -24,10 +24,12 @@ def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...
 def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
     """z of the surface at points (B, M, 2) [m], bilinear, shape (B, M)."""
     (env, row, column), wx, wy = _corners(surface, xy)
-    height = surface.height
-    top = (1 - wx) * height[env, row, column] + wx * height[env, row, column + 1]
-    bottom = (1 - wx) * height[env, row + 1, column] + wx * height[env, row + 1, column + 1]
-    return (1 - wy) * top + wy * bottom
+    # One flat index and four takes: half the time of four look-ups by three indices.
+    _, ny, nx = surface.height.shape
+    node, height = (env * ny + row) * nx + column, np.ascontiguousarray(surface.height).reshape(-1)
+    a, b, c, d = (height.take(node + offset) for offset in (0, 1, nx, nx + 1))
+    top, bottom = a + wx * (b - a), c + wx * (d - c)
+    return top + wy * (bottom - top)
 
 
 def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

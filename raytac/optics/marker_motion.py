@@ -69,7 +69,7 @@ class FotsKernel:
         self,
         markers: np.ndarray,
         depth: np.ndarray,
-        contact: np.ndarray,
+        boxes: np.ndarray,
         contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         constants: FotsConstants,
     ) -> np.ndarray:
@@ -78,7 +78,7 @@ class FotsKernel:
         Args:
             markers: x, y at rest [m], (B, M, 2).
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
-            contact: (B, ny, nx) bool; bounds the sums.
+            boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
             contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad], radius (B, K) [m]).
             constants: of the pad.
         """
@@ -92,7 +92,7 @@ class FotsKernel:
         inputs = (
             self._on_device(markers),
             mi.Float(np.ascontiguousarray(depth, dtype=np.float32).ravel()),
-            mi.UInt32(_boxes(contact).ravel()),
+            mi.UInt32(np.ascontiguousarray(boxes, dtype=np.uint32).ravel()),
             mi.Float(table.ravel()),
             self._constants(constants),
         )
@@ -182,14 +182,3 @@ def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple
     start = (mi.UInt32(0), mi.Float(0), mi.Vector2f(0), mi.Float(0), mi.Vector2f(0))
     _, es, shear, et, twist = dr.while_loop(start, more, add, label="drag")
     return shear / dr.maximum(1, es) + twist / dr.maximum(1, et)
-
-
-def _boxes(contact: np.ndarray) -> np.ndarray:
-    """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
-    columns, rows = np.any(contact, axis=1), np.any(contact, axis=2)
-    box = np.zeros((len(contact), 4), dtype=np.uint32)
-    for first, along in ((0, columns), (2, rows)):
-        box[:, first] = along.argmax(axis=1)
-        box[:, first + 1] = along.shape[1] - along[:, ::-1].argmax(axis=1)
-    box[~np.any(rows, axis=1)] = 0
-    return box
