@@ -1,6 +1,6 @@
 """FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
 
-Zhao, Qian, Duan and Luo, FOTS, RA-L 2024, section III-B, in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
+Zhao, Qian, Duan and Luo, FOTS, RA-L 2024 (arXiv 2404.19217), in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
 contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
 
     dilate   Δd_d = g Σ_i a Δh_i (M' − C_i) exp(−λ_d ‖M' − C_i‖²)    M' = M + Δd_s + Δd_t
