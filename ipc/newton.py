@@ -25,7 +25,8 @@ from ipc import dynamics, elasticity
 from ipc.collision import Collision
 from ipc.contact import Contacts
 from ipc.layout import Layout
-from ipc.linear import BlockJacobi, Pcg, Preconditioner, SystemView, row_column, row_sum
+from ipc.linear import Pcg, SystemView, row_column, row_sum
+from ipc.preconditioner import make_preconditioner
 from ipc.settings import Settings
 
 __all__ = ["Newton", "StepCounts"]
@@ -255,7 +256,7 @@ class Newton:
         self.system.blocks = wp.zeros((batch, len(layout.col)), dtype=wp.mat33d, device=device)
         self.system.R = self.R
         self.pcg = Pcg(batch, self.nodes, device)
-        self.preconditioner: Preconditioner = BlockJacobi(batch, self.nodes, device)
+        self.preconditioner = make_preconditioner(layout, settings, batch, device)
         self.inertia_scale, self.alpha, self.slope, self.change, self.noise = (numbers() for _ in range(5))
         self.min_det, self.size, self.barrier_energy = (numbers() for _ in range(3))
         self.active, self.project, self.bad, self.searching, self.trials, self.mask = (flags() for _ in range(6))
