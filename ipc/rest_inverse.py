@@ -6,8 +6,8 @@ contact rows add Jᵀ S J at m contact nodes (J picks their 3m unknowns, S = Σ 
     M⁻¹ = (K_0 + Jᵀ S J)⁻¹ = K_0⁻¹ − K_0⁻¹ Jᵀ W J K_0⁻¹,      W = (S⁻¹ + J K_0⁻¹ Jᵀ)⁻¹,
 
 is exact as long as the body is at rest; deformation and what W leaves out are left to PCG. S is not regular (friction may be missing),
-so a share REGULAR of the elastic stiffness of each contact node is added to it. Every sum K_0 + Jᵀ S J of part of the rows is positive
-definite, so more contact nodes than there is room for only cost iterations: the stiffest are taken. Nodes of other bodies have
+so a share REGULAR of the elastic stiffness of each contact node is added to it. K_0 + Jᵀ S J is positive definite whichever nodes J
+picks, so more contact nodes than there is room for only cost iterations: the stiffest are taken. Nodes of other bodies have
 block-Jacobi.
 
 K_0⁻¹ is dense and in single precision; across a batch its application is one product of matrices. On CUDA everything is a launch of
@@ -334,9 +334,7 @@ def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) ->
 
 
 @wp.kernel
-def contact_forces(
-    rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
-):
+def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
     """W J K_0⁻¹ r, one block of threads an environment."""
     env, lane = wp.tid()
     if running[env] == 0:
