@@ -15,14 +15,21 @@ from numpy.typing import NDArray
 from ipc.layout import Layout
 from ipc.settings import Settings
 
-__all__ = ["bonded_bodies", "rest_blocks", "rest_inverse"]
+__all__ = ["bonded_bodies", "dense_block", "free_nodes", "rest_blocks"]
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
 
 
 def bonded_bodies(layout: Layout) -> list[int]:
     """Soft bodies with bonded vertices: in their frame the rest state stays what it is, wherever the frame goes."""
     return [b for b in range(len(layout.names)) if layout.framed[b] and layout.node_start[b] < layout.node_start[b + 1]]
+
+
+def free_nodes(layout: Layout, body: int) -> Ints:
+    """The nodes of a body that are unknown."""
+    span = np.arange(layout.node_start[body], layout.node_start[body + 1])
+    return span[layout.node_free[span] != 0]
 
 
 def rest_blocks(layout: Layout, settings: Settings) -> Floats:
@@ -51,20 +58,13 @@ def rest_blocks(layout: Layout, settings: Settings) -> Floats:
     return blocks + inertia[:, None, None] * eye
 
 
-def rest_inverse(layout: Layout, blocks: Floats, nodes: NDArray[np.integer]) -> NDArray[np.float32]:
-    """K_0⁻¹ of some nodes [m/N], the others held, dense and symmetric, shape (3n, 3n).
-
-    Raises:
-        numpy.linalg.LinAlgError: if the inverse rounded to single precision is not positive definite.
-    """
-    place = np.full(len(layout.node_rest), -1)
-    place[nodes] = np.arange(len(nodes))
-    rows = place[np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start))]
-    cols = place[layout.col]
-    inside = (rows >= 0) & (cols >= 0)
-    dense = np.zeros((len(nodes), 3, len(nodes), 3))
-    dense[rows[inside], :, cols[inside], :] = blocks[inside]
-    inverse = np.linalg.inv(dense.reshape(3 * len(nodes), 3 * len(nodes)))
-    single = (0.5 * (inverse + inverse.T)).astype(np.float32)
-    np.linalg.cholesky(single.astype(np.float64))
-    return single
+def dense_block(layout: Layout, blocks: Floats, rows: Ints, cols: Ints) -> Floats:
+    """The part of a matrix between two lists of nodes, shape (3 rows, 3 cols)."""
+    count = len(layout.node_rest)
+    place, across = np.full(count, -1), np.full(count, -1)
+    place[rows], across[cols] = np.arange(len(rows)), np.arange(len(cols))
+    i, j = place[np.repeat(np.arange(count), np.diff(layout.row_start))], across[layout.col]
+    inside = (i >= 0) & (j >= 0)
+    dense = np.zeros((len(rows), 3, len(cols), 3))
+    dense[i[inside], :, j[inside], :] = blocks[inside]
+    return dense.reshape(3 * len(rows), 3 * len(cols))

@@ -12,12 +12,8 @@ from ipc.layout import Layout, build_layout, rotation_matrix
 from ipc.linear import BlockJacobi, SystemView
 from ipc.rest_inverse import RestInverse
 from ipc.rest_stiffness import rest_blocks
+from ipc.substructure import choose_partition, entries, partition
 from tests.ipc.conftest import bonded_pad, small_pad
-
-CPU = pytest.param("cpu")
-CUDA = pytest.param(
-    "cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")], id="cuda"
-)
 
 
 class Problem:
@@ -109,6 +105,13 @@ def problem(rng: np.random.Generator) -> Problem:
     return Problem(layout, 3 * int(layout.node_free.sum()), 8, rng, "cpu")
 
 
+@pytest.fixture(scope="module")
+def thick() -> Problem:
+    """A pad with 24 nodes inside."""
+    layout = build_layout([bonded_pad(small_pad((5, 4, 3)))], 0.5, {}, [])
+    return Problem(layout, 3 * int(layout.node_free.sum()), 8, np.random.default_rng(7), "cpu")
+
+
 class Recorder(BlockJacobi):
     """Keeps the first matrix it is given."""
 
@@ -145,6 +148,44 @@ def test_exact_at_rest(problem: Problem) -> None:
     assert values.min() > 1 - 1e-3 and values.max() < 1 + 1e-3, f"eigenvalues {values.min():.5f} to {values.max():.5f}"
     alone = RestInverse(problem.layout, problem.settings, problem.batch, problem.device)
     assert spectrum(problem.inverse(alone), problem.H).max() > 10, "the contacts were to matter"
+
+
+@pytest.mark.parametrize("patches", [0, 1, 2, 4])
+def test_condensation_changes_nothing(thick: Problem, patches: int) -> None:
+    preconditioner = thick.updated(patches=patches)
+    assert preconditioner.patched == (patches > 0)
+    inverse = thick.inverse(preconditioner)
+    np.testing.assert_allclose(inverse, inverse.T, rtol=0, atol=1e-6 * np.abs(inverse).max())
+    values = spectrum(inverse, thick.H)
+    assert values.min() > 1 - 1e-3 and values.max() < 1 + 1e-3, f"eigenvalues {values.min():.5f} to {values.max():.5f}"
+
+
+def test_patches_do_not_see_each_other(thick: Problem) -> None:
+    layout = thick.layout
+    nodes = np.flatnonzero(layout.node_free)
+    inside = np.setdiff1d(nodes, layout.vert_nodes[layout.vert_count == 1, 0])
+    rows = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start))
+    before = 0
+    for parts in (1, 2, 4):
+        label = partition(layout, inside, parts)
+        assert set(np.unique(label[label >= 0])) <= set(range(parts)) and (label >= 0).any()
+        assert (label[np.setdiff1d(np.arange(len(label)), inside)] == -1).all()
+        one, other = label[rows], label[layout.col]
+        assert (one[(one >= 0) & (other >= 0)] == other[(one >= 0) & (other >= 0)]).all()
+        interface = int((label[nodes] < 0).sum())
+        assert interface > before, "every cut takes nodes from the patches"
+        before = interface
+
+
+def test_partition_with_the_fewest_entries() -> None:
+    """A small pad stays whole; a larger one is cut, and holds less than half of what the whole inverse would."""
+    small = build_layout([bonded_pad(small_pad())], 0.5, {}, [])
+    assert (choose_partition(small, 0)[1] == -1).all()
+    large = build_layout([bonded_pad(small_pad((20, 20, 4)))], 0.5, {}, [])
+    nodes, label = choose_partition(large, 0)
+    assert label.max() >= 3
+    assert 2 * entries(large, nodes, label) < (3 * len(nodes)) ** 2
+    assert entries(large, nodes, np.full_like(label, -1)) == (3 * len(nodes)) ** 2
 
 
 def test_more_contacts_than_room(problem: Problem) -> None:
@@ -244,16 +285,20 @@ def test_bad_settings() -> None:
         ipc.World([free], ipc.Settings(preconditioner="rest_inverse"), device="cpu")
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
+@pytest.mark.parametrize("patches", [0, 4])
 @pytest.mark.parametrize("batch", [1, 3, 40])
-@pytest.mark.parametrize("device", [CUDA])
-def test_cuda_agrees_and_can_be_captured(device: str, batch: int, rng: np.random.Generator) -> None:
+def test_cuda_agrees_and_can_be_captured(batch: int, patches: int, rng: np.random.Generator) -> None:
     """Vectors, a few of them, and tiles; once launch by launch and once as a graph."""
+    device = "cuda"
+    layout = build_layout([bonded_pad(small_pad((5, 4, 3)))], 0.5, {}, []) if patches else two_pads()
     state = rng.bit_generator.state
-    here = Problem(two_pads(), batch, 8, rng, "cpu")
+    here = Problem(layout, batch, 8, rng, "cpu")
     rng.bit_generator.state = state
-    there = Problem(two_pads(), batch, 8, rng, device)
+    there = Problem(layout, batch, 8, rng, device)
     r = rng.normal(size=(batch, len(here.H)))
-    expected, preconditioner = here.apply(here.updated(), r), there.updated()
+    expected, preconditioner = here.apply(here.updated(patches=0), r), there.updated(patches=patches)
     np.testing.assert_allclose(there.apply(preconditioner, r), expected, rtol=0, atol=1e-4 * np.abs(expected).max())
     full = np.zeros((batch, len(here.layout.node_rest), 3))
     full[:, here.free] = r.reshape(batch, -1, 3)
