@@ -1,106 +1,277 @@
-"""How long does a press step take? One pad, one sphere, by number of vertices and of environments.
+"""How long does a step take? One pad and a sphere, by number of vertices and environments; or two pads that put a peg into a hole.
 
     python experiments/bench_ipc.py --sizes 300,1400,5300 --out runs/bench_ipc           # CPU or CUDA, whichever there is
     python experiments/bench_ipc.py --device cuda --sizes 300,1400,5300,18000 --envs 1,128,1024
+    python experiments/bench_ipc.py --device cuda --pads peg --envs 256,4096 --out runs/bench_ipc_peg
 
-A bonded pad of 20.75 × 25.25 × 4 mm (E = 0.1 MPa, ν = 0.45) and a sphere of 4 mm radius that is driven 1 mm in 20 steps of 10 ms and then
-held for 5; d̂ = 0.1 mm, μ = 0.5, velocity tolerance 1e-4 m/s. The first step (compilation, first lists) is told apart. On a
-machine that others use too, the processor time says more than the clock.
+Press: a bonded pad of 20.75 × 25.25 × 4 mm (E = 0.1 MPa, ν = 0.45) and a sphere of 4 mm radius that is driven down 1 mm in 20 steps of
+10 ms and then held for 5; d̂ = 0.1 mm, μ = 0.5, velocity tolerance 1e-4 m/s. Peg: see ``bench_ipc_scenes.peg_world``.
+
+The first step (first lists, and what was not compiled yet) is told apart. Memory: on CUDA, bytes in use in Warp's memory pool, on the
+CPU, growth of the resident set, both from before the world is made to after the last step. On a machine that others use too, the
+processor time says more than the clock.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
 import warp as wp
+from bench_ipc_scenes import (
+    CELLS,
+    D_HAT,
+    DT,
+    FRICTION,
+    GAP,
+    HOLD,
+    PEG_CLOSE,
+    PEG_LOWER,
+    PRESS,
+    RADIUS,
+    ball_height,
+    peg_drive,
+    peg_world,
+    press_world,
+)
 
 import ipc
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io.options import CommonOptions, parse_names
 
-CELLS = {300: (8, 10, 2), 1400: (16, 20, 3), 5300: (26, 32, 5), 18000: (40, 48, 8)}
-RADIUS, GAP, DEPTH = 4e-3, 1.1e-4, 1e-3
-PRESS, HOLD = 20, 5
+BATCHED = 1400
+"""The most vertices that are measured with more than one environment."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args(CommonOptions):
-    """Time the solver's press steps."""
+    """Time the solver's steps."""
 
+    pads: Literal["press", "peg"] = "press"
+    """One pad and a sphere, or two pads, a peg and a hole."""
     sizes: str = "300,1400,5300"
-    """About how many vertices: any of 300, 1400, 5300, 18000, joined by commas."""
+    """About how many vertices the pad of the press has: any of 300, 1400, 5300, 18000, joined by commas."""
     envs: str = "1"
-    """Numbers of environments, joined by commas; more than one environment is measured up to 1400 vertices."""
-    friction: float = 0.5
-    """μ."""
+    """Numbers of environments, joined by commas; the press measures more than one environment up to 1400 vertices."""
+    friction: float = FRICTION
+    """μ of the press."""
+    spread: float = 0.0
+    """Share by which environments of the press differ in depth, drawn at random; 0: all do the same. In [0, 1)."""
+    limit_s: float = 120.0
+    """A measurement stops after the step in which this time is up [s]; its steps so far count."""
 
 
-def measure(size: int, envs: int, args: Args) -> dict[str, Metric]:
-    """One press: median step, throughput, iterations and stages."""
-    mesh = ipc.domed_pad((20.75e-3, 25.25e-3), 4e-3, (np.inf, np.inf), CELLS[size])
-    base = ipc.vertices_in_box(mesh, (-1, -1, -4e-3), (1, 1, -4e-3))
-    pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45, 1000.0), bonded=base)
-    ball = ipc.KinematicBody("ball", ipc.icosphere(RADIUS, 3), ipc.Pose((0, 0, RADIUS + GAP)))
-    settings = ipc.Settings(dt=0.01, d_hat=1e-4, friction=args.friction)
-    world = ipc.World([pad, ball], settings, num_envs=envs, device=args.device)
-    times, busy, newton, linear, converged = [], [], 0, 0, True
-    for k in range(PRESS + HOLD):
-        world.set_target("ball", (0, 0, RADIUS + GAP - DEPTH * min(k + 1, PRESS) / PRESS))
+@dataclass(frozen=True)
+class Run:
+    """A world that was stepped through its scene, B environments, S steps.
+
+    Attributes:
+        world: as the last step left it.
+        first_s: time of making the world and of the first step [s].
+        seconds, busy: clock and processor time of steps 1 to S − 1 [s].
+        reports: one a step.
+        phases: names of the parts of the scene, one a step.
+        stages: seconds a step in each stage, the first step left out.
+        memory: bytes an environment.
+    """
+
+    world: ipc.World
+    first_s: tuple[float, float]
+    seconds: np.ndarray
+    busy: np.ndarray
+    reports: tuple[ipc.StepReport, ...]
+    phases: tuple[str, ...]
+    stages: dict[str, float]
+    memory: float
+
+
+def memory_in_use(device: str) -> int:
+    """Bytes in use: Warp's memory pool on CUDA (the card's, without a pool), the process's resident set on the CPU."""
+    chosen = wp.get_device({"auto": "cuda" if wp.is_cuda_available() else "cpu"}.get(device, device))
+    if not chosen.is_cuda:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return wp.get_mempool_used_mem_current(chosen) if wp.is_mempool_enabled(chosen) else chosen.total_memory - chosen.free_memory
+
+
+def compile_kernels(device: str) -> float:
+    """Seconds until a first small press has taken two steps: mostly compiling or loading kernels."""
+    begin = time.perf_counter()
+    world = press_world((2, 2, 1), ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION), 1, device)
+    for step in range(2):
+        world.set_target("ball", (0, 0, ball_height(step)))
+        world.step()
+    return time.perf_counter() - begin
+
+
+def run(world_of: Iterator[tuple[ipc.World, str]], num_envs: int, device: str, limit: float) -> Run:
+    """Step through a scene: an iterator that first makes its world, then sets the targets of each step and names its phase."""
+    before, begin = memory_in_use(device), time.perf_counter()
+    seconds, busy, reports, phases, timers = [], [], [], [], {}
+    made = 0.0
+    for world, phase in world_of:
         wp.synchronize()
+        if not seconds:
+            made = time.perf_counter() - begin
         start, cpu = time.perf_counter(), time.process_time()
-        report = world.step()
+        reports.append(world.step())
         wp.synchronize()
-        times.append(time.perf_counter() - start)
+        seconds.append(time.perf_counter() - start)
         busy.append(time.process_time() - cpu)
-        newton, linear = newton + int(report.newton.max()), linear + int(report.linear.max())
-        converged &= bool(report.converged.all())
-        if k == 0:
-            before = world.timers
-    pressed = np.array(times[1:PRESS])
-    key = f"{world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
-    stages = {f"{key}.stage_ms.{n}": 1e3 * (t - before.get(n, 0)) / (PRESS + HOLD - 1) for n, t in world.timers.items()}
-    press, hold = 1e3 * float(np.median(pressed)), 1e3 * float(np.median(times[PRESS:]))
-    rate, mean_newton, mean_pcg = float(envs / np.mean(pressed)), newton / len(times), linear / len(times)
-    print(
-        f"{key:14} {len(mesh.vertices):6d} vertices  press {press:8.2f} ms  hold {hold:8.2f} ms  first {times[0]:6.2f} s  "
-        f"{rate:9.1f} env-steps/s  processor {1e3 * np.median(busy[1:PRESS]):8.2f} ms  newton {mean_newton:.2f}  pcg {mean_pcg:.1f}"
+        phases.append(phase)
+        timers = timers or world.timers
+        if time.perf_counter() - begin > limit and len(seconds) > 1:
+            print(f"  stopped after {len(seconds)} steps: {limit:g} s are up")
+            break
+    count = max(1, len(seconds) - 1)
+    stages = {name: (total - timers.get(name, 0.0)) / count for name, total in world.timers.items()}
+    memory = (memory_in_use(device) - before) / num_envs
+    return Run(
+        world,
+        (made, seconds[0]),
+        np.array(seconds[1:]),
+        np.array(busy[1:]),
+        tuple(reports),
+        tuple(phases),
+        stages,
+        memory,
     )
+
+
+def press_scene(size: int, envs: int, args: Args) -> Iterator[tuple[ipc.World, str]]:
+    """Down for ``PRESS`` steps, then at rest."""
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction)
+    world = press_world(CELLS[size], settings, envs, args.device)
+    share = 1 - args.spread * np.random.default_rng(args.seed).random(envs)
+    for step in range(PRESS + HOLD):
+        target = np.zeros((envs, 3))
+        target[:, 2] = RADIUS + GAP + share * (ball_height(step) - RADIUS - GAP)
+        world.set_target("ball", target)
+        yield world, "press" if step < PRESS else "hold"
+
+
+def peg_scene(envs: int, args: Args) -> Iterator[tuple[ipc.World, str]]:
+    """Close the grip, then lower the peg into the hole."""
+    world = peg_world(envs, args.device)
+    for phase in peg_drive(world):
+        yield world, phase
+
+
+def common_metrics(key: str, run: Run, timed: tuple[str, ...], envs: int) -> dict[str, Metric]:
+    """What both scenes tell: times over the phases ``timed``, without the first step."""
+    chosen = np.isin(run.phases[1:], timed)
+    newton = np.array([report.newton.max() for report in run.reports])
+    linear = np.array([report.linear.max() for report in run.reports])
+    seconds = run.seconds[chosen]
     return {
-        f"{key}.vertices": len(mesh.vertices),
-        f"{key}.ms_per_step": press,
-        f"{key}.processor_ms_per_step": 1e3 * float(np.median(busy[1:PRESS])),
-        f"{key}.ms_per_hold_step": hold,
-        f"{key}.first_step_s": times[0],
-        f"{key}.env_steps_per_s": rate,
-        f"{key}.newton_per_step": mean_newton,
-        f"{key}.pcg_per_step": mean_pcg,
-        f"{key}.converged": int(converged),
-        f"{key}.force_n": float(world.wrench("ball").force[0, 2]),
-        **stages,
+        f"{key}.ms_per_step": 1e3 * float(np.median(seconds)),
+        f"{key}.processor_ms_per_step": 1e3 * float(np.median(run.busy[chosen])),
+        f"{key}.env_steps_per_s": float(envs / seconds.mean()),
+        f"{key}.steps": len(run.reports),
+        f"{key}.world_s": run.first_s[0],
+        f"{key}.first_step_s": run.first_s[1],
+        f"{key}.memory_mb_per_env": run.memory / 2**20,
+        f"{key}.newton_per_step": float(newton.mean()),
+        f"{key}.newton_most": int(newton.max()),
+        f"{key}.pcg_per_step": float(linear.mean()),
+        f"{key}.converged": int(all(report.converged.all() for report in run.reports)),
+        f"{key}.not_converged_env_steps": int(sum((~report.converged).sum() for report in run.reports)),
+        f"{key}.min_gap_um": 1e6 * float(min(report.min_gap.min() for report in run.reports)),
+        **{f"{key}.stage_ms.{name}": 1e3 * seconds for name, seconds in run.stages.items()},
     }
+
+
+def say(key: str, metrics: dict[str, Metric]) -> None:
+    """One line, the stages on a second."""
+    get = {name.removeprefix(f"{key}."): value for name, value in metrics.items()}
+    print(
+        f"{key:18} {get['vertices']:6d} vertices  {get['ms_per_step']:9.2f} ms  {get['env_steps_per_s']:9.1f} env-steps/s  "
+        f"processor {get['processor_ms_per_step']:9.2f} ms  first {get['first_step_s']:6.2f} s  newton {get['newton_per_step']:.2f}  "
+        f"pcg {get['pcg_per_step']:.1f}  {get['memory_mb_per_env']:.2f} MB an environment  converged {get['converged']}"
+    )
+    stages = {name.removeprefix("stage_ms."): value for name, value in get.items() if name.startswith("stage_ms.")}
+    print(
+        "   stages [ms]: "
+        + "  ".join(f"{name} {value:.2f}" for name, value in sorted(stages.items(), key=lambda s: -float(s[1])))
+    )
+
+
+def measure_press(size: int, envs: int, args: Args) -> dict[str, Metric]:
+    """One press."""
+    done = run(press_scene(size, envs, args), envs, args.device, args.limit_s)
+    key = f"{done.world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
+    hold = done.seconds[np.isin(done.phases[1:], ("hold",))]
+    metrics = common_metrics(key, done, ("press",), envs) | {
+        f"{key}.vertices": len(done.world.positions("pad")[0]),
+        f"{key}.force_n": float(done.world.wrench("ball").force[:, 2].max()),
+    }
+    if len(hold):
+        metrics[f"{key}.ms_per_hold_step"] = 1e3 * float(np.median(hold))
+    say(key, metrics)
+    return metrics
+
+
+def measure_peg(envs: int, args: Args) -> dict[str, Metric]:
+    """One insertion; how well the grip held tells whether the time was spent on physics."""
+    done = run(peg_scene(envs, args), envs, args.device, args.limit_s)
+    world = done.world
+    vertices = 2 * len(world.positions("left")[0])
+    key = f"{world.device.alias.split(':')[0]}.peg{vertices // 2}" + (f"x{envs}" if envs > 1 else "")
+    A, p = world.affine_pose("peg")
+    slip = p[:, 2] - world.frame("left")[1][:, 2]
+    metrics = common_metrics(key, done, ("close", "lower"), envs) | {
+        f"{key}.vertices": vertices,
+        f"{key}.grip_n": float(world.wrench("right").force[:, 0].max()),
+        f"{key}.hole_force_n": float(np.linalg.norm(world.wrench("hole").force, axis=1).max()),
+        f"{key}.slip_um": 1e6 * float(np.abs(slip).max()),
+        f"{key}.tilt_deg": float(np.degrees(np.arccos(np.clip(A[:, 2, 2], -1, 1))).max()),
+        f"{key}.lowered_mm": -1e3 * float(p[:, 2].max()),
+    }
+    lower = done.seconds[np.isin(done.phases[1:], ("lower",))]
+    if len(lower):
+        metrics[f"{key}.ms_per_lower_step"] = 1e3 * float(np.median(lower))
+    say(key, metrics)
+    return metrics
+
+
+def parse_numbers(text: str, option: str, choices: tuple[int, ...] | None = None) -> tuple[int, ...]:
+    """``"1,128"`` to positive whole numbers.
+
+    Raises:
+        InputError: something else, or a number that is not in ``choices`` (None is any).
+    """
+    names = parse_names(text, option, None if choices is None else tuple(map(str, choices)))
+    for name in names:
+        if not name.isdecimal() or int(name) < 1:
+            raise InputError(option, value=name, rule="must be whole numbers from 1, joined by commas")
+    return tuple(map(int, names))
 
 
 def main(args: Args) -> int:
     begin = time.perf_counter()
-    sizes, envs = [int(s) for s in args.sizes.split(",")], [int(e) for e in args.envs.split(",")]
-    if not set(sizes) <= set(CELLS) or min(envs) < 1:
-        print(
-            f"--sizes {args.sizes} --envs {args.envs}: sizes are {', '.join(map(str, CELLS))}; environments at least 1",
-            file=sys.stderr,
-        )
-        return 2
-    metrics: dict[str, Metric] = {}
-    for size in sizes:
+    sizes, envs = parse_numbers(args.sizes, "sizes", tuple(CELLS)), parse_numbers(args.envs, "envs")
+    if not 0 <= args.spread < 1:
+        raise InputError("spread", value=args.spread, rule="must lie in [0, 1)")
+    if not args.limit_s > 0:
+        raise InputError("limit-s", value=args.limit_s, rule="must be positive")
+    metrics: dict[str, Metric] = {"compile_s": compile_kernels(args.device)}
+    if args.pads == "peg":
+        print(f"peg: {PEG_CLOSE} steps to close, {PEG_LOWER} to lower")
         for count in envs:
-            if count == 1 or size <= 1400:
-                metrics |= measure(size, count, args)
+            metrics |= measure_peg(count, args)
+    else:
+        for size in sizes:
+            for count in envs:
+                if count == 1 or size <= BATCHED:
+                    metrics |= measure_press(size, count, args)
     common = {"experiment": "bench_ipc", "device": args.device, "seed": args.seed, **versions((*VERSIONED, "warp-lang"))}
     with result_folder(args.out or Path("runs/bench_ipc"), ("metrics.json",)) as folder:
         write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})

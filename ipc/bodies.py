@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,6 +46,8 @@ class SoftBody:
         pose: ``world_from_body`` at the start. With bonded vertices the frame is driven (see ``World.set_target``); without, it only
             places the body.
         self_contact: whether the body's surface may touch itself.
+        grips: further sets of vertices, each bonded exactly to a moving frame of its own, which is driven under the name
+            ``"<body>.<grip>"`` and begins at ``pose``; they need ``bonded`` vertices beside them, whose frame the body is solved in.
     """
 
     name: str
@@ -53,12 +56,24 @@ class SoftBody:
     bonded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     pose: Pose = Pose()
     self_contact: bool = False
+    grips: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        bonded = np.unique(np.asarray(self.bonded, dtype=np.int64))
-        if len(bonded) and (bonded[0] < 0 or bonded[-1] >= len(self.mesh.vertices)):
-            raise IpcError(f"{self.name}: bonded names vertices {bonded[0]} to {bonded[-1]}: there are {len(self.mesh.vertices)}")
+        bonded = self._vertices("bonded", self.bonded)
+        grips = {key: self._vertices(key, ids) for key, ids in self.grips.items()}
+        if grips and not len(bonded):
+            raise IpcError(f"{self.name}: grips {', '.join(grips)} need bonded vertices beside them")
+        held = np.concatenate([bonded, *grips.values()])
+        if len(np.unique(held)) < len(held):
+            raise IpcError(f"{self.name}: a vertex is held twice, by bonded or grips {', '.join(grips)}")
         object.__setattr__(self, "bonded", bonded)
+        object.__setattr__(self, "grips", grips)
+
+    def _vertices(self, what: str, ids: ArrayLike) -> NDArray[np.int64]:
+        found = np.unique(np.asarray(ids, dtype=np.int64))
+        if len(found) and (found[0] < 0 or found[-1] >= len(self.mesh.vertices)):
+            raise IpcError(f"{self.name}: {what} names vertices {found[0]} to {found[-1]}: there are {len(self.mesh.vertices)}")
+        return found
 
 
 @dataclass(frozen=True)
@@ -70,12 +85,19 @@ class AffineBody:
         surface: closed surface in the body's frame; mass and inertia come from its volume.
         material: stiffness and density.
         pose: ``world_from_body`` at the start.
+        drive: strength s of a drive towards the pose given by ``World.set_target`` (its start at first): the step adds
+            ½ s/h² ‖x − x_aim‖²_M, so that a free body covers s/(1 + s) of the way in one step and contact may hold it back. 0: free.
     """
 
     name: str
     surface: TriMesh
     material: Stiff = field(default_factory=Stiff)
     pose: Pose = Pose()
+    drive: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.drive < np.inf:
+            raise IpcError(f"{self.name}: drive = {self.drive}: it must be finite and not negative")
 
 
 @dataclass(frozen=True)

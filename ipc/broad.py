@@ -18,7 +18,19 @@ import warp as wp
 
 from ipc.contact import Candidates, Surface
 
-__all__ = ["body_boxes", "clear_body_boxes", "find_ee", "find_pt", "leaves_box", "reset_lists", "select_prims", "vertex_boxes"]
+__all__ = [
+    "body_boxes",
+    "check_candidates",
+    "clear_body_boxes",
+    "find_ee",
+    "find_pt",
+    "leaves_box",
+    "put_back",
+    "rank_candidates",
+    "reset_lists",
+    "select_prims",
+    "vertex_boxes",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,8 +44,9 @@ def leaves_box(
     active: wp.array(dtype=wp.int32),
     # outputs
     stale: wp.array(dtype=wp.int32),
+    any_stale: wp.array(dtype=wp.int32),
 ):
-    """Marks environments in which x or x + dx lies outside its vertex's box."""
+    """Marks environments in which x or x + dx lies outside its vertex's box, and whether there is one."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -42,6 +55,15 @@ def leaves_box(
     a, b = wp.min(p, q), wp.max(p, q)
     if not (a[0] >= lo[0] and a[1] >= lo[1] and a[2] >= lo[2] and b[0] <= hi[0] and b[1] <= hi[1] and b[2] <= hi[2]):
         stale[env] = 1
+        any_stale[0] = 1
+
+
+@wp.kernel
+def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if a list did not fit."""
+    env = wp.tid()
+    if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
+        overflow[0] = 1
 
 
 @wp.kernel
@@ -230,3 +252,40 @@ def find_ee(
                     slot = wp.atomic_add(candidates.ee_count, env, 1)
                     if slot < candidates.ee.shape[1]:
                         candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+
+
+@wp.func
+def comes_before(a: wp.vec3i, b: wp.vec3i) -> wp.bool:
+    return a[0] < b[0] or (a[0] == b[0] and a[1] < b[1])
+
+
+@wp.kernel
+def rank_candidates(
+    items: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    ordered: wp.array2d(dtype=wp.vec3i),
+):
+    """Puts every pair where its rank says; pairs are unique, so their order no longer depends on who found them first."""
+    env, i = wp.tid()
+    if stale[env] == 0 or i >= count[env]:
+        return
+    rank = wp.int32(0)
+    for k in range(wp.min(count[env], items.shape[1])):
+        if comes_before(items[env, k], items[env, i]):
+            rank += 1
+    ordered[env, rank] = items[env, i]
+
+
+@wp.kernel
+def put_back(
+    ordered: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    items: wp.array2d(dtype=wp.vec3i),
+):
+    env, i = wp.tid()
+    if stale[env] != 0 and i < count[env]:
+        items[env, i] = ordered[env, i]

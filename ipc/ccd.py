@@ -84,8 +84,8 @@ def ccd_pt(
     dx: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
-    slack: wp.float64,
-    floor: wp.float64,
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -108,8 +108,8 @@ def ccd_pt(
         dx[env, f0],
         dx[env, f1],
         dx[env, f2],
-        slack,
-        floor,
+        slack[env],
+        floor[env],
         bound,
     )
     if t < bound:
@@ -122,8 +122,8 @@ def ccd_ee(
     dx: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
-    slack: wp.float64,
-    floor: wp.float64,
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -146,8 +146,8 @@ def ccd_ee(
         dx[env, a1],
         dx[env, b0],
         dx[env, b1],
-        slack,
-        floor,
+        slack[env],
+        floor[env],
         bound,
     )
     if t < bound:
@@ -163,8 +163,8 @@ def ccd_plane(
     t0: wp.array2d(dtype=wp.vec3d),
     R1: wp.array2d(dtype=wp.mat33d),
     t1: wp.array2d(dtype=wp.vec3d),
-    slack: wp.float64,
-    floor: wp.float64,
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -177,6 +177,6 @@ def ccd_plane(
     A, B = R0[env, body], R1[env, body]
     d0 = wp.dot(wp.vec3d(A[0, 2], A[1, 2], A[2, 2]), x[env, v] - t0[env, body])
     d1 = wp.dot(wp.vec3d(B[0, 2], B[1, 2], B[2, 2]), x[env, v] + dx[env, v] - t1[env, body])
-    gap = wp.max(slack * d0, wp.min(floor, wp.float64(0.999) * d0))
+    gap = wp.max(slack[env] * d0, wp.min(floor[env], wp.float64(0.999) * d0))
     if d1 < gap:
         wp.atomic_min(alpha, env, (d0 - gap) / (d0 - d1))

@@ -1,4 +1,8 @@
-"""Everything that surfaces do to each other: candidate lists, contact forces and rows, friction, and how far a step may go."""
+"""Everything that surfaces do to each other: candidate lists, contact forces and rows, friction, and how far a step may go.
+
+Nothing here waits for the device: launches cover the buffers, counts are read by the kernels, and what did not fit raises the flag
+``overflow``, whereupon the caller discards what it was doing, calls ``grow`` and does it again.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import warp as wp
 
 from ipc import broad, ccd, contact, friction
 from ipc.layout import Layout
+from ipc.reduce import SUM, Reducer
 
 __all__ = ["Collision"]
 
@@ -23,11 +28,15 @@ class Collision:
         batch: number of environments.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
+        deterministic: sort the lists, and add up in their order.
         device: Warp device.
     """
 
-    def __init__(self, layout: Layout, batch: int, d_hat: float, margin: float, device: wp.Device) -> None:
+    def __init__(self, layout: Layout, batch: int, d_hat: float, margin: float, deterministic: bool, device: wp.Device) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
+        # Pairs of an environment are shared by so many threads. One alone adds forces up in the order of the lists.
+        self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
+        self._sort = deterministic and device.is_cuda
         verts, bodies = int(layout.vert_start[-1]), len(layout.names)
         plane_vert, plane_body, plane_pair = [], [], []
         meshes = []
@@ -103,43 +112,57 @@ class Collision:
         self._size_candidates(256, 256)
         self.contacts = contact.Contacts()
         self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+        self.lagged, self._old = friction.Lagged(), friction.Lagged()
+        self.lagged.count, self._old.count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self._size_contacts(128, 256)
-        self.lagged = friction.Lagged()
-        self.lagged.count = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._size_lagged(self.lagged, 1)
-        self._old = friction.Lagged()
-        self._old.count = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._size_lagged(self._old, 1)
-        self._lag_most = self._old_most = 0
-        self.pt_most = self.ee_most = self.contact_most = self.row_most = 0
-        self.rebuilds = 0
-        self._force_scratch = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
-        self._size_scratch = wp.zeros(batch, dtype=wp.float64, device=device)
+        self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
+        self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
+        self._change = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
+        self._change_size = wp.zeros((batch, verts), dtype=wp.float64, device=device)
+        self._force = wp.zeros(batch, dtype=wp.float64, device=device)
+        self._reduce = Reducer(batch, max(1, verts), device)
+        self._reduce.prepare(verts)
         self._low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first look builds a list
 
     # --- buffers ---------------------------------------------------------------------------------------------------------------
 
     def _size_candidates(self, pt: int, ee: int) -> None:
         self.candidates.pt, self.candidates.ee = (wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee))
-        self._pt_room, self._ee_room = pt, ee
+        self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
-        new = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "force": wp.float64, "gap": wp.float64, "pair": wp.int32}
-        for name, dtype in new.items():
+        for name, dtype in {
+            **{"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d},
+            **{"force": wp.float64, "gap": wp.float64, "pair": wp.int32},
+        }.items():
             setattr(self.contacts, name, wp.zeros((self.batch, pairs), dtype=dtype, device=self.device))
         self.contacts.row_verts = wp.zeros((self.batch, rows), dtype=wp.vec4i, device=self.device)
         self.contacts.row = wp.zeros((self.batch, rows), dtype=contact.mat34d, device=self.device)
-        self._pair_room, self._row_room = pairs, rows
+        fields = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "limit": wp.float64, "pair": wp.int32}
+        room = pairs if self.friction else 1
+        for lagged in (self.lagged, self._old):
+            for name, dtype in fields.items():
+                new = wp.zeros((self.batch, room), dtype=dtype, device=self.device)
+                before = getattr(lagged, name)
+                if before is not None:
+                    values = new.numpy()
+                    values[:, : min(room, before.shape[1])] = before.numpy()[:, :room]
+                    new.assign(values)
+                setattr(lagged, name, new)
 
-    def _size_lagged(self, lagged: Any, pairs: int) -> None:
-        for name, dtype in {
-            "verts": wp.vec4i,
-            "coef": wp.vec4d,
-            "normal": wp.vec3d,
-            "limit": wp.float64,
-            "pair": wp.int32,
-        }.items():
-            setattr(lagged, name, wp.zeros((self.batch, pairs), dtype=dtype, device=self.device))
+    def grow(self) -> None:
+        """Make room for what did not fit, and for half as much again; the lists are made anew at the next look."""
+        counts = (self.candidates.pt_count, self.candidates.ee_count, self.contacts.count, self.contacts.row_count)
+        rooms = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
+        most = [int(c.numpy().max()) for c in counts]
+        room = [r.shape[1] for r in rooms]
+        pt, ee, pairs, rows = (max(r, int(_GROW * m)) if m > r else r for r, m in zip(room, most, strict=True))
+        if (pt, ee) != (room[0], room[1]):
+            self._size_candidates(pt, ee)
+            self.forget(np.ones(self.batch, bool))
+        if (pairs, rows) != (room[2], room[3]):
+            self._size_contacts(pairs, rows)
+        self.overflow.zero_()
 
     # --- broad phase -----------------------------------------------------------------------------------------------------------
 
@@ -150,69 +173,58 @@ class Collision:
         self._low.assign(low)
 
     def refresh(self, x: wp.array, dx: wp.array, active: wp.array) -> None:
-        """Make the candidate lists hold for every position on the way from x to x + dx (B, V)."""
+        """Make the candidate lists hold for every position on the way from x to x + dx (B, V), or set ``overflow``."""
         if not self._searches:
             return
         self._stale.zero_()
-        wp.launch(
-            broad.leaves_box,
-            dim=x.shape,
-            inputs=[x, dx, self._low, self._high, active],
-            outputs=[self._stale],
-            device=self.device,
-        )
-        if not self._stale.numpy().any():
-            return
-        self.rebuilds += 1
-        dim = (self.batch, self._body_low.shape[1])
-        wp.launch(
-            broad.vertex_boxes,
-            dim=x.shape,
-            inputs=[x, dx, self.margin, self._stale],
-            outputs=[self._low, self._high],
-            device=self.device,
-        )
-        wp.launch(broad.clear_body_boxes, dim=dim, inputs=[self._stale, self._body_low, self._body_high], device=self.device)
-        wp.launch(
-            broad.body_boxes,
-            dim=x.shape,
-            inputs=[self._low, self._high, self.vert_body, self._stale],
-            outputs=[self._body_low, self._body_high],
-            device=self.device,
-        )
-        while True:
-            wp.launch(
-                broad.reset_lists, dim=self.batch, inputs=[self._stale, self._list_count, self.candidates], device=self.device
-            )
-            wp.launch(
-                broad.select_prims,
-                dim=(self.batch, self._prims),
-                inputs=[
-                    *(self._low, self._high, self._body_low, self._body_high, self.surface),
-                    *(self._prim_kind, self._prim_index, self._prim_other, self._prim_list, self._list_start, self._stale),
-                ],
-                outputs=[self._list_count, self._members],
-                device=self.device,
-            )
-            for kind, first, second, pair, size in self._searches:
-                wp.launch(
-                    broad.find_pt if kind == "pt" else broad.find_ee,
-                    dim=(self.batch, size),
-                    inputs=[
-                        *(self._low, self._high, self.surface, self._members, self._list_start, self._list_count),
-                        *(first, second, pair, self._stale),
-                    ],
-                    outputs=[self.candidates],
-                    device=self.device,
-                )
-            self.pt_most, self.ee_most = int(self.candidates.pt_count.numpy().max()), int(self.candidates.ee_count.numpy().max())
-            if self.pt_most <= self._pt_room and self.ee_most <= self._ee_room:
-                return
-            # Lists of environments that were not stale are lost with the old buffers, so all are made again.
-            self._size_candidates(max(self._pt_room, int(_GROW * self.pt_most)), max(self._ee_room, int(_GROW * self.ee_most)))
-            self._stale.fill_(1)
+        self._any_stale.zero_()
+        inputs, outputs = [x, dx, self._low, self._high, active], [self._stale, self._any_stale]
+        wp.launch(broad.leaves_box, dim=x.shape, inputs=inputs, outputs=outputs, device=self.device)
+        wp.capture_if(self._any_stale, on_true=self._rebuild, x=x, dx=dx)
+
+    def _rebuild(self, x: wp.array, dx: wp.array) -> None:
+        """New boxes and lists for the stale environments."""
+        device, stale = self.device, self._stale
+        bodies = (self.batch, self._body_low.shape[1])
+        inputs, outputs = [x, dx, self.margin, stale], [self._low, self._high]
+        wp.launch(broad.vertex_boxes, dim=x.shape, inputs=inputs, outputs=outputs, device=device)
+        wp.launch(broad.clear_body_boxes, dim=bodies, inputs=[stale, self._body_low, self._body_high], device=device)
+        inputs, outputs = [self._low, self._high, self.vert_body, stale], [self._body_low, self._body_high]
+        wp.launch(broad.body_boxes, dim=x.shape, inputs=inputs, outputs=outputs, device=device)
+        wp.launch(broad.reset_lists, dim=self.batch, inputs=[stale, self._list_count, self.candidates], device=device)
+        inputs = [
+            *(self._low, self._high, self._body_low, self._body_high, self.surface),
+            *(self._prim_kind, self._prim_index, self._prim_other, self._prim_list, self._list_start, stale),
+        ]
+        outputs = [self._list_count, self._members]
+        wp.launch(broad.select_prims, dim=(self.batch, self._prims), inputs=inputs, outputs=outputs, device=device)
+        for kind, first, second, pair, size in self._searches:
+            kernel = broad.find_pt if kind == "pt" else broad.find_ee
+            inputs = [
+                *(self._low, self._high, self.surface, self._members, self._list_start, self._list_count),
+                *(first, second, pair, stale),
+            ]
+            wp.launch(kernel, dim=(self.batch, size), inputs=inputs, outputs=[self.candidates], device=device)
+        if self._sort:
+            for items, count in ((self.candidates.pt, self.candidates.pt_count), (self.candidates.ee, self.candidates.ee_count)):
+                ordered = self._ordered[items.shape[1]]
+                inputs, outputs = [items, count, stale], [ordered]
+                wp.launch(broad.rank_candidates, dim=items.shape, inputs=inputs, outputs=outputs, device=device)
+                wp.launch(broad.put_back, dim=items.shape, inputs=[ordered, count, stale], outputs=[items], device=device)
+        wp.launch(broad.check_candidates, dim=self.batch, inputs=[self.candidates], outputs=[self.overflow], device=device)
 
     # --- contact ---------------------------------------------------------------------------------------------------------------
+
+    def _each(self, kernel: Any, inputs: list, outputs: list) -> None:
+        """Launch a kernel whose threads go over the lists of an environment together."""
+        inputs = [*inputs, self.lanes]
+        wp.launch(kernel, dim=(self.batch, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
+
+    def _narrow(self, kernels: tuple[Any, Any], inputs: list, outputs: list) -> None:
+        """Launch the point-triangle and the edge-edge kernel over the candidates."""
+        if self._searches:
+            for kernel in kernels:
+                self._each(kernel, inputs, outputs)
 
     def assemble(
         self,
@@ -226,32 +238,23 @@ class Collision:
         gradient: wp.array,
         energy: wp.array,
     ) -> None:
-        """Contacts, rows, ``gradient`` (B, V) [N] and barrier ``energy`` (B,) [J] at x; lagged friction against ``start``."""
-        while True:
-            gradient.zero_()
-            energy.zero_()
-            self.contacts.count.zero_()
-            self.contacts.row_count.zero_()
-            outputs = [gradient, energy, self.contacts]
-            for kernel, most in ((contact.contact_pt, self.pt_most), (contact.contact_ee, self.ee_most)):
-                if most:
-                    inputs = [x, self.surface, self.candidates, kappa, active]
-                    wp.launch(kernel, dim=(self.batch, most), inputs=inputs, outputs=outputs, device=self.device)
-            if self.planes:
-                inputs = [x, self.surface, R, t, kappa, active]
-                wp.launch(
-                    contact.contact_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=outputs, device=self.device
-                )
-            if self._lag_most:
-                inputs = [x, start, self.lagged, friction_eps, active]
-                dim = (self.batch, self._lag_most)
-                wp.launch(friction.friction_rows, dim=dim, inputs=inputs, outputs=[gradient, self.contacts], device=self.device)
-            self.contact_most, self.row_most = int(self.contacts.count.numpy().max()), int(self.contacts.row_count.numpy().max())
-            if self.contact_most <= self._pair_room and self.row_most <= self._row_room:
-                return
-            self._size_contacts(
-                max(self._pair_room, int(_GROW * self.contact_most)), max(self._row_room, int(_GROW * self.row_most))
-            )
+        """Contacts, rows, ``gradient`` (B, V) [N] and barrier ``energy`` (B,) [J] at x; lagged friction against ``start``.
+
+        What does not fit sets ``overflow``.
+        """
+        device = self.device
+        wp.launch(contact.clear, dim=x.shape, inputs=[active], outputs=[gradient, energy, self.contacts], device=device)
+        outputs = [gradient, energy, self.contacts]
+        kernels = (contact.contact_pt, contact.contact_ee)
+        self._narrow(kernels, [x, self.surface, self.candidates, kappa, active], outputs)
+        if self.planes:
+            inputs = [x, self.surface, R, t, kappa, active]
+            self._each(contact.contact_plane, inputs, outputs)
+        if self.friction:
+            inputs = [x, start, self.lagged, friction_eps, active]
+            outputs = [gradient, self.contacts]
+            self._each(friction.friction_rows, inputs, outputs)
+        wp.launch(contact.check_contacts, dim=self.batch, inputs=[self.contacts], outputs=[self.overflow], device=device)
 
     def energy_change(
         self,
@@ -266,17 +269,12 @@ class Collision:
         change: wp.array,
     ) -> None:
         """Add the change of barrier and friction energy from x0 to x1 to ``change`` (B,) [J]."""
-        for kernel, most in ((contact.energy_pt, self.pt_most), (contact.energy_ee, self.ee_most)):
-            if most:
-                inputs = [x0, x1, self.surface, self.candidates, kappa, active]
-                wp.launch(kernel, dim=(self.batch, most), inputs=inputs, outputs=[change], device=self.device)
+        kernels = (contact.energy_pt, contact.energy_ee)
+        self._narrow(kernels, [x0, x1, self.surface, self.candidates, kappa, active], [change])
         if self.planes:
-            inputs = [x0, x1, self.surface, R, t, kappa, active]
-            wp.launch(contact.energy_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[change], device=self.device)
-        if self._lag_most:
-            inputs = [x0, x1, start, self.lagged, friction_eps, active]
-            dim = (self.batch, self._lag_most)
-            wp.launch(friction.friction_change, dim=dim, inputs=inputs, outputs=[change], device=self.device)
+            self._each(contact.energy_plane, [x0, x1, self.surface, R, t, kappa, active], [change])
+        if self.friction:
+            self._each(friction.friction_change, [x0, x1, start, self.lagged, friction_eps, active], [change])
 
     def limit_step(
         self,
@@ -284,57 +282,45 @@ class Collision:
         dx: wp.array,
         frames0: tuple[wp.array, wp.array],
         frames1: tuple[wp.array, wp.array],
-        slack: float,
-        floor: float,
+        slack: wp.array,
+        floor: wp.array,
         active: wp.array,
         alpha: wp.array,
     ) -> None:
-        """Lower ``alpha`` (B,) to the share of dx at which some distance falls to ``slack`` of what it is, or to ``floor`` [m]."""
-        for kernel, most in ((ccd.ccd_pt, self.pt_most), (ccd.ccd_ee, self.ee_most)):
-            if most:
+        """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m]."""
+        if self._searches:
+            for kernel, items in ((ccd.ccd_pt, self.candidates.pt), (ccd.ccd_ee, self.candidates.ee)):
                 inputs = [x, dx, self.surface, self.candidates, slack, floor, active]
-                wp.launch(kernel, dim=(self.batch, most), inputs=inputs, outputs=[alpha], device=self.device)
+                wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
         if self.planes:
             inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, active]
             wp.launch(ccd.ccd_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[alpha], device=self.device)
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
-    def lag(self, active: wp.array) -> np.ndarray:
+    def lag(self, active: wp.array, changed: wp.array) -> None:
         """Freeze the contacts of the active environments for friction.
 
-        Returns:
-            By how much the friction limits μ λ n changed, as a share of their sum; shape (B,), zero without friction.
+        ``changed`` (B,) becomes by how much the friction limits μ λ n changed, as a share of their sum.
         """
-        if not self.friction:
-            return np.zeros(self.batch)
-        self.lagged, self._old, self._old_most = self._old, self.lagged, self._lag_most
-        self._lag_most = max(self.contact_most, 0 if bool(active.numpy().all()) else self._old_most)
-        if self.lagged.limit.shape[1] < self._lag_most:
-            self._size_lagged(self.lagged, int(_GROW * self._lag_most))
-        if self._lag_most == 0:
-            self.lagged.count.zero_()
-        else:
-            wp.launch(
-                friction.lag_contacts,
-                dim=(self.batch, self._lag_most),
-                inputs=[self.contacts, self.pair_mu, self._old, active],
-                outputs=[self.lagged],
-                device=self.device,
-            )
-        self._force_scratch.zero_()
-        self._size_scratch.zero_()
-        for lagged, most, sign in ((self.lagged, self._lag_most, 1.0), (self._old, self._old_most, -1.0)):
-            if most:
-                wp.launch(
-                    friction.lag_difference,
-                    dim=(self.batch, most),
-                    inputs=[lagged, sign, active],
-                    outputs=[self._force_scratch, self._size_scratch],
-                    device=self.device,
-                )
-        changed = np.linalg.norm(self._force_scratch.numpy(), axis=-1).sum(axis=1)
-        return changed / np.maximum(self._size_scratch.numpy(), 1e-300)
+        device, dim = self.device, self.lagged.limit.shape
+        wp.launch(friction.keep_lagged, dim=dim, inputs=[self.lagged, active], outputs=[self._old], device=device)
+        inputs = [self.contacts, self.pair_mu, active]
+        wp.launch(friction.lag_contacts, dim=dim, inputs=inputs, outputs=[self.lagged], device=device)
+        wp.launch(
+            friction.clear_change,
+            dim=self._change.shape,
+            inputs=[active],
+            outputs=[self._change, self._force, changed],
+            device=device,
+        )
+        for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
+            inputs, outputs = [lagged, sign, active], [self._change, self._force]
+            self._each(friction.lag_difference, inputs, outputs)
+        inputs, outputs = [self._change, active], [self._change_size]
+        wp.launch(friction.size_of_change, dim=self._change.shape, inputs=inputs, outputs=outputs, device=device)
+        self._reduce(self._change_size, active, SUM, changed)
+        wp.launch(friction.share_of_change, dim=self.batch, inputs=[self._force, active], outputs=[changed], device=device)
 
     def drop_lag(self, envs: np.ndarray) -> None:
         """Forget the lagged pairs of the environments of the mask (B,)."""

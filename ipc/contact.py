@@ -24,6 +24,8 @@ __all__ = [
     "Candidates",
     "Contacts",
     "Surface",
+    "check_contacts",
+    "clear",
     "contact_ee",
     "contact_plane",
     "contact_pt",
@@ -105,11 +107,16 @@ def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
 
 
 @wp.func
-def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
+def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d):
     slot = wp.atomic_add(out.row_count, env, 1)
     if slot < out.row.shape[1]:
         out.row_verts[env, slot] = verts
-        out.row[env, slot] = wp.matrix_from_cols(q0, q1, q2, q3)
+        out.row[env, slot] = row
+
+
+@wp.func
+def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
+    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3))
 
 
 @wp.func
@@ -155,21 +162,45 @@ def push_simple(
 
 
 @wp.kernel
-def contact_pt(
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
+def clear(
     active: wp.array(dtype=wp.int32),
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
-    """Point-triangle pairs."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.pt_count[env]:
+    """No forces, contacts or rows in the active environments."""
+    env, v = wp.tid()
+    if active[env] == 0:
         return
+    gradient[env, v] = wp.vec3d()
+    if v == 0:
+        energy[env] = wp.float64(0.0)
+        out.count[env] = 0
+        out.row_count[env] = 0
+
+
+@wp.kernel
+def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if contacts or rows did not fit."""
+    env = wp.tid()
+    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
+        overflow[0] = 1
+
+
+@wp.func
+def add_pt(
+    env: wp.int32,
+    i: wp.int32,
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Point-triangle pairs."""
     item = candidates.pt[env, i]
     v, f = item[0], item[1]
     f0, f1, f2 = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
@@ -184,21 +215,41 @@ def contact_pt(
 
 
 @wp.kernel
-def contact_ee(
+def contact_pt(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
-    """Edge-edge pairs, mollified where they are nearly parallel."""
+    """Point-triangle pairs."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.ee_count[env]:
+    if active[env] == 0:
         return
+    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+    while i < n:
+        add_pt(env, i, x, surface, candidates, kappa, gradient, energy, out)
+        i += lanes
+
+
+@wp.func
+def add_ee(
+    env: wp.int32,
+    i: wp.int32,
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Edge-edge pairs, mollified where they are nearly parallel."""
     item = candidates.ee[env, i]
     ea, eb = item[0], item[1]
     verts = wp.vec4i(surface.edges[ea, 0], surface.edges[ea, 1], surface.edges[eb, 0], surface.edges[eb, 1])
@@ -233,14 +284,23 @@ def contact_ee(
     wp.atomic_add(gradient, env, verts[3], (slope * coef[3]) * n + (f * m1) * gb)
     wp.atomic_add(energy, env, m * f)
     push_contact(out, env, verts, coef, n, d, -slope, item[2])
-    # 2×2 Hessian in (d/d̂, c/eps), so that clamping its eigenvalues does not depend on units.
-    dh = surface.d_hat
-    h00, h01, h11 = m * f_dd * dh * dh, f_d * m1 * dh * eps, f * m2 * eps * eps
-    mean, half = (h00 + h11) / two, (h00 - h11) / two
-    radius = wp.sqrt(half * half + h01 * h01)
-    ex, ey = half + radius, h01  # eigenvector of mean + radius
+    # As a function of d and c alone, m f has the Hessian [h00 h01; h01 h11] over their gradients. It is clamped as the matrix that it is
+    # in the space of the four vertices, over the orthonormal e1, e2 that span the gradients: ∇d = g e1, ∇c = s e1 + rest e2.
+    h00, h01, h11 = m * f_dd, f_d * m1, f * m2
+    g = wp.length(coef)
+    e1 = wp.matrix_from_cols((coef[0] / g) * n, (coef[1] / g) * n, (coef[2] / g) * n, (coef[3] / g) * n)
+    e2 = wp.matrix_from_cols(-ga, ga, -gb, gb)
+    s = wp.ddot(e1, e2)
+    e2 = e2 - s * e1
+    rest = wp.sqrt(wp.ddot(e2, e2))
+    if rest > zero:
+        e2 = e2 / rest
+    k00, k01, k11 = g * g * h00 + two * g * s * h01 + s * s * h11, rest * (g * h01 + s * h11), rest * rest * h11
+    mean, half = (k00 + k11) / two, (k00 - k11) / two
+    radius = wp.sqrt(half * half + k01 * k01)
+    ex, ey = half + radius, k01  # eigenvector of mean + radius
     if half < zero:
-        ex, ey = h01, radius - half
+        ex, ey = k01, radius - half
     size = wp.sqrt(ex * ex + ey * ey)
     if size > zero:
         ex, ey = ex / size, ey / size
@@ -253,17 +313,7 @@ def contact_ee(
             value = mean - radius
             px, py = -ey, ex
         if value > zero:
-            r = wp.sqrt(value)
-            qd, qc = r * px / dh, r * py / eps
-            push_row(
-                out,
-                env,
-                verts,
-                (qd * coef[0]) * n - qc * ga,
-                (qd * coef[1]) * n + qc * ga,
-                (qd * coef[2]) * n - qc * gb,
-                (qd * coef[3]) * n + qc * gb,
-            )
+            push_matrix(out, env, verts, wp.sqrt(value) * (px * e1 + py * e2))
     r = wp.sqrt(two * f * m1)
     for k in range(3):
         axis = wp.vec3d(zero, zero, zero)
@@ -273,22 +323,42 @@ def contact_ee(
 
 
 @wp.kernel
-def contact_plane(
+def contact_ee(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
+    candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     energy: wp.array(dtype=wp.float64),
     out: Contacts,
 ):
-    """Points above half-spaces."""
+    """Edge-edge pairs, mollified where they are nearly parallel."""
     env, i = wp.tid()
     if active[env] == 0:
         return
+    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    while i < n:
+        add_ee(env, i, x, surface, candidates, kappa, gradient, energy, out)
+        i += lanes
+
+
+@wp.func
+def add_plane(
+    env: wp.int32,
+    i: wp.int32,
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Points above half-spaces."""
     v, body = surface.plane_vert[i], surface.plane_body[i]
     R = frame_R[env, body]
     n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
@@ -312,6 +382,30 @@ def contact_plane(
         )
 
 
+@wp.kernel
+def contact_plane(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Points above half-spaces."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    n = surface.plane_vert.shape[0]
+    while i < n:
+        add_plane(env, i, x, surface, frame_R, frame_t, kappa, gradient, energy, out)
+        i += lanes
+
+
 @wp.func
 def pt_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, v: wp.int32, f: wp.int32) -> wp.float64:
     p = x[env, v]
@@ -331,6 +425,24 @@ def ee_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ea
     return edge_weight(surface, ea, eb) * b * mollifier(cross_squared(a0, a1, b0, b1), mollifier_threshold(surface, ea, eb))
 
 
+@wp.func
+def add_energy_pt(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the point-triangle energy from x0 to x1 [J]."""
+    item = candidates.pt[env, i]
+    e = pt_energy(x1, surface, env, item[0], item[1]) - pt_energy(x0, surface, env, item[0], item[1])
+    if e != wp.float64(0.0):
+        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+
+
 @wp.kernel
 def energy_pt(
     x0: wp.array2d(dtype=wp.vec3d),
@@ -339,15 +451,34 @@ def energy_pt(
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the point-triangle energy from x0 to x1 [J]."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.pt_count[env]:
+    if active[env] == 0:
         return
-    item = candidates.pt[env, i]
-    e = pt_energy(x1, surface, env, item[0], item[1]) - pt_energy(x0, surface, env, item[0], item[1])
+    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+    while i < n:
+        add_energy_pt(env, i, x0, x1, surface, candidates, kappa, change)
+        i += lanes
+
+
+@wp.func
+def add_energy_ee(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the edge-edge energy from x0 to x1 [J]."""
+    item = candidates.ee[env, i]
+    e = ee_energy(x1, surface, env, item[0], item[1]) - ee_energy(x0, surface, env, item[0], item[1])
     if e != wp.float64(0.0):
         wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
 
@@ -360,16 +491,41 @@ def energy_ee(
     candidates: Candidates,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the edge-edge energy from x0 to x1 [J]."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.ee_count[env]:
+    if active[env] == 0:
         return
-    item = candidates.ee[env, i]
-    e = ee_energy(x1, surface, env, item[0], item[1]) - ee_energy(x0, surface, env, item[0], item[1])
-    if e != wp.float64(0.0):
+    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    while i < n:
+        add_energy_ee(env, i, x0, x1, surface, candidates, kappa, change)
+        i += lanes
+
+
+@wp.func
+def add_energy_plane(
+    env: wp.int32,
+    i: wp.int32,
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the point-plane energy from x0 to x1 [J]."""
+    v, body = surface.plane_vert[i], surface.plane_body[i]
+    R = frame_R[env, body]
+    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+    d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
+    d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
+    if d0 < surface.d_hat or d1 < surface.d_hat:
+        Dh = surface.d_hat * surface.d_hat
+        e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
         wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
 
 
@@ -382,6 +538,7 @@ def energy_plane(
     frame_t: wp.array2d(dtype=wp.vec3d),
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
@@ -389,12 +546,7 @@ def energy_plane(
     env, i = wp.tid()
     if active[env] == 0:
         return
-    v, body = surface.plane_vert[i], surface.plane_body[i]
-    R = frame_R[env, body]
-    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-    d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
-    d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
-    if d0 < surface.d_hat or d1 < surface.d_hat:
-        Dh = surface.d_hat * surface.d_hat
-        e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
-        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+    n = surface.plane_vert.shape[0]
+    while i < n:
+        add_energy_plane(env, i, x0, x1, surface, frame_R, frame_t, kappa, change)
+        i += lanes

@@ -12,18 +12,28 @@ bonded vertex is a constant.
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 __all__ = [
     "advance_nodes",
+    "aim_bodies",
+    "compare_frames",
+    "difference",
     "frames_at",
     "inertia_change",
     "inertia_target",
     "kinetic_energy",
+    "lengths",
+    "lift_grips",
     "new_velocity",
     "node_gradient",
     "node_world",
+    "place_grips",
     "predict",
+    "slope_of",
+    "take",
     "vertex_motion",
     "vertex_positions",
 ]
@@ -289,3 +299,111 @@ def advance_nodes(
     """y1 = y + alpha p."""
     env, i = wp.tid()
     y1[env, i] = y[env, i] + alpha[env] * p[env, i]
+
+
+@wp.kernel
+def compare_frames(
+    frame_q: wp.array2d(dtype=wp.quatd),
+    frame_p: wp.array2d(dtype=wp.vec3d),
+    goal_q: wp.array2d(dtype=wp.quatd),
+    goal_p: wp.array2d(dtype=wp.vec3d),
+    moves: wp.array(dtype=wp.int32),
+    # outputs
+    share: wp.array(dtype=wp.float64),
+):
+    """share = 0 where a frame has a way to go, else 1."""
+    env = wp.tid()
+    share[env] = wp.float64(1.0)
+    for b in range(frame_q.shape[1]):
+        if moves[b] != 0:
+            p, q = frame_p[env, b], goal_p[env, b]
+            r, s = frame_q[env, b], goal_q[env, b]
+            if p[0] != q[0] or p[1] != q[1] or p[2] != q[2] or r[0] != s[0] or r[1] != s[1] or r[2] != s[2] or r[3] != s[3]:
+                share[env] = wp.float64(0.0)
+
+
+@wp.kernel
+def aim_bodies(
+    goal_q: wp.array2d(dtype=wp.quatd),
+    goal_p: wp.array2d(dtype=wp.vec3d),
+    node_drive: wp.array(dtype=wp.float64),
+    node_aim: wp.array(dtype=wp.int32),
+    aim_local: wp.array(dtype=wp.vec3d),
+    # outputs
+    target: wp.array2d(dtype=wp.vec3d),
+):
+    """x̃ ← (x̃ + s x_aim)/(1 + s): inertia towards x̃ and a drive of strength s towards x_aim are one quadratic of 1 + s times the mass."""
+    env, i = wp.tid()
+    frame = node_aim[i]
+    if frame >= 0:
+        aim = wp.quat_rotate(goal_q[env, frame], aim_local[i]) + goal_p[env, frame]
+        target[env, i] = (target[env, i] + node_drive[i] * aim) / (wp.float64(1.0) + node_drive[i])
+
+
+@wp.kernel
+def place_grips(
+    grip_node: wp.array(dtype=wp.int32),
+    grip_frame: wp.array(dtype=wp.int32),
+    grip_local: wp.array(dtype=wp.vec3d),
+    node_body: wp.array(dtype=wp.int32),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    y: wp.array2d(dtype=wp.vec3d),
+):
+    """Gripped nodes go with their grip's frame; y holds them in their body's frame, as all nodes."""
+    env, g = wp.tid()
+    node, frame = grip_node[g], grip_frame[g]
+    body = node_body[node]
+    world = R[env, frame] * grip_local[g] + t[env, frame]
+    y[env, node] = wp.transpose(R[env, body]) * (world - t[env, body])
+
+
+@wp.kernel
+def lift_grips(
+    grip_node: wp.array(dtype=wp.int32),
+    y: wp.array2d(dtype=wp.vec3d),
+    y1: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    lift: wp.array2d(dtype=wp.vec3d),
+):
+    """lift = y1 − y of the gripped nodes."""
+    env, g = wp.tid()
+    lift[env, grip_node[g]] = y1[env, grip_node[g]] - y[env, grip_node[g]]
+
+
+@wp.kernel
+def lengths(p: wp.array2d(dtype=wp.vec3d), residual: wp.array2d(dtype=wp.vec3d), size: wp.array2d(dtype=wp.float64)):
+    """‖p‖ node by node [m]; 1e300 where p or the residual is not finite."""
+    env, i = wp.tid()
+    length = wp.length(p[env, i])
+    if not (length < wp.float64(1.0e100)) or not (wp.length(residual[env, i]) < wp.float64(1.0e100)):
+        length = wp.float64(1.0e300)
+    size[env, i] = length
+
+
+@wp.kernel
+def slope_of(p: wp.array2d(dtype=wp.vec3d), gradient: wp.array2d(dtype=wp.vec3d), slope: wp.array2d(dtype=wp.float64)):
+    """g·p node by node [J]; p is zero on bonded nodes."""
+    env, i = wp.tid()
+    slope[env, i] = wp.dot(p[env, i], gradient[env, i])
+
+
+@wp.kernel
+def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2d(dtype=Any)):
+    """y = y1 where the mask is set."""
+    env, i = wp.tid()
+    if mask[env] != 0:
+        y[env, i] = y1[env, i]
+
+
+# Said here, so that the module is compiled once and not again at each new type.
+for _type in (wp.vec3d, wp.mat33d):
+    wp.overload(take, [wp.array2d(dtype=_type), wp.array(dtype=wp.int32), wp.array2d(dtype=_type)])
+
+
+@wp.kernel
+def difference(a: wp.array2d(dtype=wp.vec3d), b: wp.array2d(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec3d)):
+    """out = a − b."""
+    env, i = wp.tid()
+    out[env, i] = a[env, i] - b[env, i]

@@ -197,6 +197,7 @@ def node_elastic_gradient(
 
 @wp.kernel
 def block_hessian(
+    upper: wp.array2d(dtype=wp.int32),
     part_start: wp.array(dtype=wp.int32),
     part: wp.array(dtype=wp.int32),
     grads: wp.array2d(dtype=wp.vec3d),
@@ -213,10 +214,14 @@ def block_hessian(
     # outputs
     blocks: wp.array2d(dtype=wp.mat33d),
 ):
-    """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements."""
-    env, k = wp.tid()
+    """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements.
+
+    Each row of ``upper`` names a block on or above the diagonal, where it is to lie, and where its transpose.
+    """
+    env, u = wp.tid()
     if active[env] == 0:
         return
+    k = upper[u, 0]
     one = wp.identity(n=3, dtype=wp.float64)
     H = (mass[k] * inertia_scale[env] + drag[k]) * one
     for s in range(part_start[k], part_start[k + 1]):
@@ -239,7 +244,9 @@ def block_hessian(
                 + lam[e] * wp.outer(C * ga, C * gb)
                 - f[1] * wp.skew(F * wp.cross(ga, gb))
             )
-    blocks[env, k] = H
+    blocks[env, upper[u, 1]] = H
+    if upper[u, 2] != upper[u, 1]:
+        blocks[env, upper[u, 2]] = wp.transpose(H)
 
 
 @wp.kernel
@@ -255,13 +262,13 @@ def element_energy_change(
     active: wp.array(dtype=wp.int32),
     # outputs
     change: wp.array2d(dtype=wp.float64),
-    min_det: wp.array(dtype=wp.float64),
+    det: wp.array2d(dtype=wp.float64),
 ):
-    """Ψ(y1) − Ψ(y0) of every element [J], and the least J at y1; a sum of differences keeps digits that a difference of sums loses."""
+    """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; a sum of differences keeps digits that a difference of sums loses."""
     env, e = wp.tid()
     if active[env] == 0:
         return
     F0 = deformation(env, e, y0, tets, grads)
     F1 = deformation(env, e, y1, tets, grads)
     change[env, e] = volume[e] * strain_energy_change(F0, F1, model[e], mu[e], lam[e])
-    wp.atomic_min(min_det, env, wp.determinant(F1))
+    det[env, e] = wp.determinant(F1)

@@ -19,7 +19,17 @@ import warp as wp
 
 from ipc.contact import Contacts, push_row
 
-__all__ = ["Lagged", "friction_change", "friction_rows", "lag_contacts", "lag_difference"]
+__all__ = [
+    "Lagged",
+    "clear_change",
+    "friction_change",
+    "friction_rows",
+    "keep_lagged",
+    "lag_contacts",
+    "lag_difference",
+    "share_of_change",
+    "size_of_change",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,28 +83,34 @@ def sliding(
 
 
 @wp.kernel
+def keep_lagged(lagged: Lagged, active: wp.array(dtype=wp.int32), out: Lagged):
+    """Copies the lagged pairs of the active environments."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        out.count[env] = lagged.count[env]
+    if i < lagged.count[env]:
+        out.verts[env, i] = lagged.verts[env, i]
+        out.coef[env, i] = lagged.coef[env, i]
+        out.normal[env, i] = lagged.normal[env, i]
+        out.limit[env, i] = lagged.limit[env, i]
+
+
+@wp.kernel
 def lag_contacts(
     contacts: Contacts,
     mu: wp.array(dtype=wp.float64),
-    old: Lagged,
     active: wp.array(dtype=wp.int32),
     # outputs
     out: Lagged,
 ):
-    """Freezes the contacts of the active environments; the others keep what they had."""
+    """Freezes the contacts of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
-        if i == 0:
-            out.count[env] = old.count[env]
-        if i < old.count[env]:
-            out.verts[env, i] = old.verts[env, i]
-            out.coef[env, i] = old.coef[env, i]
-            out.normal[env, i] = old.normal[env, i]
-            out.limit[env, i] = old.limit[env, i]
-            out.pair[env, i] = old.pair[env, i]
         return
     if i == 0:
-        out.count[env] = contacts.count[env]
+        out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
     if i < contacts.count[env]:
         out.verts[env, i] = contacts.verts[env, i]
         out.coef[env, i] = contacts.coef[env, i]
@@ -103,21 +119,18 @@ def lag_contacts(
         out.pair[env, i] = contacts.pair[env, i]
 
 
-@wp.kernel
-def friction_rows(
+@wp.func
+def add_friction(
+    env: wp.int32,
+    i: wp.int32,
     x: wp.array2d(dtype=wp.vec3d),
     start: wp.array2d(dtype=wp.vec3d),
     lagged: Lagged,
     eps: wp.float64,
-    active: wp.array(dtype=wp.int32),
-    # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
     out: Contacts,
 ):
     """Friction forces and rows."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= lagged.count[env]:
-        return
     limit = lagged.limit[env, i]
     if limit <= wp.float64(0.0):
         return
@@ -144,20 +157,39 @@ def friction_rows(
 
 
 @wp.kernel
-def friction_change(
+def friction_rows(
+    x: wp.array2d(dtype=wp.vec3d),
+    start: wp.array2d(dtype=wp.vec3d),
+    lagged: Lagged,
+    eps: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    out: Contacts,
+):
+    """Friction forces and rows."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    n = wp.min(lagged.count[env], lagged.limit.shape[1])
+    while i < n:
+        add_friction(env, i, x, start, lagged, eps, gradient, out)
+        i += lanes
+
+
+@wp.func
+def add_friction_change(
+    env: wp.int32,
+    i: wp.int32,
     x0: wp.array2d(dtype=wp.vec3d),
     x1: wp.array2d(dtype=wp.vec3d),
     start: wp.array2d(dtype=wp.vec3d),
     lagged: Lagged,
     eps: wp.float64,
-    active: wp.array(dtype=wp.int32),
-    # outputs
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the friction potential from x0 to x1 [J]."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= lagged.count[env]:
-        return
     verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
     y0 = wp.length(sliding(x0, start, env, verts, c, n))
     y1 = wp.length(sliding(x1, start, env, verts, c, n))
@@ -165,10 +197,54 @@ def friction_change(
 
 
 @wp.kernel
+def friction_change(
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    start: wp.array2d(dtype=wp.vec3d),
+    lagged: Lagged,
+    eps: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the friction potential from x0 to x1 [J]."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    n = wp.min(lagged.count[env], lagged.limit.shape[1])
+    while i < n:
+        add_friction_change(env, i, x0, x1, start, lagged, eps, change)
+        i += lanes
+
+
+@wp.func
+def add_difference(
+    env: wp.int32,
+    i: wp.int32,
+    lagged: Lagged,
+    sign: wp.float64,
+    force: wp.array2d(dtype=wp.vec3d),
+    size: wp.array(dtype=wp.float64),
+):
+    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
+
+    Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
+    """
+    verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+    for k in range(4):
+        if verts[k] >= 0:
+            wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
+    if sign > wp.float64(0.0):
+        wp.atomic_add(size, env, lagged.limit[env, i])
+
+
+@wp.kernel
 def lag_difference(
     lagged: Lagged,
     sign: wp.float64,
     active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
     # outputs
     force: wp.array2d(dtype=wp.vec3d),
     size: wp.array(dtype=wp.float64),
@@ -178,11 +254,41 @@ def lag_difference(
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
     """
     env, i = wp.tid()
-    if active[env] == 0 or i >= lagged.count[env]:
+    if active[env] == 0:
         return
-    verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-    for k in range(4):
-        if verts[k] >= 0:
-            wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
-    if sign > wp.float64(0.0):
-        wp.atomic_add(size, env, lagged.limit[env, i])
+    n = wp.min(lagged.count[env], lagged.limit.shape[1])
+    while i < n:
+        add_difference(env, i, lagged, sign, force, size)
+        i += lanes
+
+
+@wp.kernel
+def clear_change(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    change: wp.array2d(dtype=wp.vec3d),
+    force: wp.array(dtype=wp.float64),
+    changed: wp.array(dtype=wp.float64),
+):
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    change[env, v] = wp.vec3d()
+    if v == 0:
+        force[env] = wp.float64(0.0)
+        changed[env] = wp.float64(0.0)
+
+
+@wp.kernel
+def size_of_change(change: wp.array2d(dtype=wp.vec3d), active: wp.array(dtype=wp.int32), size: wp.array2d(dtype=wp.float64)):
+    env, v = wp.tid()
+    if active[env] != 0:
+        size[env, v] = wp.length(change[env, v])
+
+
+@wp.kernel
+def share_of_change(force: wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.float64)):
+    """changed ← changed / Σ μ λ."""
+    env = wp.tid()
+    if active[env] != 0:
+        changed[env] = changed[env] / wp.max(force[env], wp.float64(1.0e-300))

@@ -41,10 +41,16 @@ class Layout:
 
     Attributes:
         names: body names, in order.
-        framed: body has a driven frame (kinematic, half-space, or soft with bonded vertices), shape (bodies,).
+        frame_names: names of the frames: one a body, in order, then grips and aims of driven affine bodies, ``"<body>.<grip>"`` and
+            ``"<body>.aim"``.
+        framed: frame is driven (kinematic, half-space, soft with bonded vertices, grip, aim), shape (frames,).
+        frame_body: (frames,).    frame_moves: 1 where a frame carries something rigidly, 0 for bodies without one and aims (frames,).
+        frame_pose: position [m] and quaternion (w, x, y, z) at the start (frames, 7).
         node_start, vert_start, edge_start, face_start, tet_start: first index of each body, with the total at the end.
         node_rest: start positions in the body's frame [m] (N, 3).    node_free: 1 for an unknown, 0 for a bonded node (N,).
         node_body: (N,).    node_damping: α m [kg/s] (N,).
+        grip_node, grip_frame (G,): gripped nodes and their frames.    grip_local: their positions there [m] (G, 3).
+        node_drive: strength s of the drive (N,).    node_aim: its frame, −1 without (N,).    aim_local: position there [m] (N, 3).
         tets: nodes (T, 4).    grads: ∇w of each corner [1/m] (T, 4, 3).    volume: [m³] (T,).
         model, mu, lam: energy code and coefficients [Pa] (T,).
         row_start (N+1,), col (K,): block pattern of the matrix.    mass: [kg] (K,).
@@ -61,7 +67,11 @@ class Layout:
     """
 
     names: tuple[str, ...]
+    frame_names: tuple[str, ...]
     framed: NDArray[np.bool_]
+    frame_body: Ints
+    frame_moves: Ints
+    frame_pose: Floats
     half_space: NDArray[np.bool_]
     node_start: Ints
     vert_start: Ints
@@ -72,6 +82,12 @@ class Layout:
     node_free: Ints
     node_body: Ints
     node_damping: Floats
+    grip_node: Ints
+    grip_frame: Ints
+    grip_local: Floats
+    node_drive: Floats
+    node_aim: Ints
+    aim_local: Floats
     tets: Ints
     grads: Floats
     volume: Floats
@@ -171,8 +187,14 @@ def build_layout(
     count, vert_nodes, vert_weight, vert_local, vert_area, edges, edge_area, edge_rest2, faces = ([] for _ in range(9))
     node_start, vert_start, edge_start, face_start, tet_start = ([0] for _ in range(5))
     shortest, fallback = np.inf, np.inf
-
+    frame_names, frame_bodies, frame_moves = list(names), list(range(len(bodies))), []
     for body in bodies:
+        frame_moves.append(
+            int(isinstance(body, KinematicBody | HalfSpace) or (isinstance(body, SoftBody) and len(body.bonded) > 0))
+        )
+    grip_node, grip_frame, grip_local, node_drive, node_aim, aim_local = ([] for _ in range(6))
+
+    for number, body in enumerate(bodies):
         nodes, verts = node_start[-1], vert_start[-1]
         surface: TriMesh | None = None
         if isinstance(body, SoftBody):
@@ -184,6 +206,17 @@ def build_layout(
                 raise IpcError(f"{body.name}: vertex {int(np.argmin(lumped))} belongs to no tetrahedron")
             free = np.ones(len(x), np.int32)
             free[body.bonded] = 0
+            for grip, ids in body.grips.items():
+                free[ids] = 0
+                grip_node.append(ids + nodes)
+                grip_frame.append(np.full(len(ids), len(frame_names)))
+                grip_local.append(x[ids])
+                frame_names.append(f"{body.name}.{grip}")
+                frame_bodies.append(number)
+                frame_moves.append(1)
+            node_drive.append(np.zeros(len(x)))
+            node_aim.append(np.full(len(x), -1))
+            aim_local.append(np.zeros((len(x), 3)))
             node_rest.append(placed)
             node_free.append(free)
             node_damping.append(body.material.mass_damping * lumped)
@@ -207,6 +240,13 @@ def build_layout(
             corners, w, m, vol = _affine_parts(body)
             node_rest.append(corners @ rotation_matrix(body.pose.rotation).T + body.pose.position)
             node_free.append(np.ones(4, np.int32))
+            node_drive.append(np.full(4, body.drive))
+            node_aim.append(np.full(4, len(frame_names) if body.drive else -1))
+            aim_local.append(corners)
+            if body.drive:
+                frame_names.append(f"{body.name}.aim")
+                frame_bodies.append(number)
+                frame_moves.append(0)
             node_damping.append(np.zeros(4))
             tets.append(np.arange(4)[None] + nodes)
             grads.append(_corner_gradients(corners[None]))
@@ -287,10 +327,18 @@ def build_layout(
             if not mu_list[-1] >= 0:
                 raise IpcError(f"friction of {names[i]!r} and {names[j]!r} is {mu_list[-1]}: it cannot be negative")
     lengths = np.diff(vert_start)
+    framed = np.array([moves == 1 or i >= len(bodies) for i, moves in enumerate(frame_moves)])
     return Layout(
         names=names,
-        framed=np.array(
-            [isinstance(b, KinematicBody | HalfSpace) or (isinstance(b, SoftBody) and len(b.bonded) > 0) for b in bodies]
+        frame_names=tuple(frame_names),
+        framed=framed,
+        frame_body=np.array(frame_bodies, np.int32),
+        frame_moves=np.array(frame_moves, np.int32),
+        frame_pose=np.array(
+            [
+                (*bodies[b].pose.position, *bodies[b].pose.rotation) if f else (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+                for b, f in zip(frame_bodies, framed, strict=True)
+            ]
         ),
         half_space=np.array([isinstance(b, HalfSpace) for b in bodies]),
         node_start=np.array(node_start, np.int32),
@@ -302,6 +350,12 @@ def build_layout(
         node_free=ints(node_free),
         node_body=np.repeat(np.arange(len(bodies)), np.diff(node_start)).astype(np.int32),
         node_damping=floats(node_damping),
+        grip_node=ints(grip_node),
+        grip_frame=ints(grip_frame),
+        grip_local=floats(grip_local, 3),
+        node_drive=floats(node_drive),
+        node_aim=ints(node_aim),
+        aim_local=floats(aim_local, 3),
         tets=all_tets,
         grads=np.ascontiguousarray(np.concatenate(grads), dtype=np.float64),
         volume=floats(volume),

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact import Contacts
+from ipc.contact import Contacts, mat34d
 from ipc.linear import SystemView, row_column
 
 __all__ = ["LowRank", "Rest", "Small", "contacts_of", "rest_entry", "sum_of_parts"]
@@ -114,18 +114,23 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def measure_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
+def measure_rows(
+    system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
+):
     """The strength of every surface node."""
     env, r = wp.tid()
-    if active[env] == 0 or r >= contacts.row_count[env]:
+    if active[env] == 0:
         return
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    for k in range(4):
-        s = surface_of_vertex(system, rest, verts[k])
-        if s >= 0:
-            size = wp.length_sq(row_column(row, k))
-            if size > wp.float64(0.0):
-                wp.atomic_max(small.strength, env, s, size)
+    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    while r < n:
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        for k in range(4):
+            s = surface_of_vertex(system, rest, verts[k])
+            if s >= 0:
+                size = wp.length_sq(row_column(row, k))
+                if size > wp.float64(0.0):
+                    wp.atomic_max(small.strength, env, s, size)
+        r += lanes
 
 
 @wp.kernel
@@ -148,20 +153,9 @@ def choose_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
         small.slot[env, s] = place
 
 
-@wp.kernel
-def clear_small(active: wp.array(dtype=wp.int32), small: Small):
-    env, i, j = wp.tid()
-    if active[env] != 0 and wp.max(i, j) < contacts_of(small, env):
-        small.a[env, i, j] = wp.mat33d()
-
-
-@wp.kernel
-def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
-    """S = Σ q qᵀ between the contact nodes, in the frames of their bodies."""
-    env, r = wp.tid()
-    if active[env] == 0 or r >= contacts.row_count[env]:
-        return
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+@wp.func
+def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, rest: Rest, small: Small):
+    """S += q qᵀ between the contact nodes, in the frames of their bodies."""
     for k in range(4):
         s = surface_of_vertex(system, rest, verts[k])
         if s >= 0:
@@ -175,6 +169,18 @@ def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.arra
                         if j >= 0:
                             qj = wp.transpose(system.R[env, system.vert_body[verts[m]]]) * row_column(row, m)
                             wp.atomic_add(small.a, env, i, j, wp.outer(qi, qj))
+
+
+@wp.kernel
+def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+    """S = Σ q qᵀ."""
+    env, r = wp.tid()
+    if active[env] == 0:
+        return
+    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    while r < n:
+        add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
+        r += lanes
 
 
 @wp.func
@@ -222,7 +228,7 @@ def compliance(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
 
 @wp.kernel
 def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
-    """W from S, one block of threads an environment."""
+    """W from S, one block of threads an environment; leaves ``a`` zero for the next S."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -238,19 +244,21 @@ def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, 
             j = e - m * i
             small.a[env, i, j] = small.a[env, i, j] + compliance(rest, small.node[env, i], small.node[env, j])
         good = invert_small(small, env, m, lane, lanes)
-    if not good:
+    wait_for_lanes()
+    if good:
+        for e in range(lane, m * m, lanes):
+            i = e / m
+            j = e - m * i
+            W = wp.float64(0.5) * (small.a[env, i, j] + wp.transpose(small.a[env, j, i]))
+            for p in range(3):
+                for q in range(3):
+                    small.w[env, 3 * i + p, 3 * j + q] = wp.float32(W[p, q])
+    elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
-        wait_for_lanes()
-        if lane == 0:
-            small.count[env] = 0
-        return
+        small.count[env] = 0
+    wait_for_lanes()
     for e in range(lane, m * m, lanes):
-        i = e / m
-        j = e - m * i
-        W = wp.float64(0.5) * (small.a[env, i, j] + wp.transpose(small.a[env, j, i]))
-        for p in range(3):
-            for q in range(3):
-                small.w[env, 3 * i + p, 3 * j + q] = wp.float32(W[p, q])
+        small.a[env, e / m, e % m] = wp.mat33d()
 
 
 @wp.func
@@ -285,11 +293,12 @@ class LowRank:
         rest: K_0⁻¹ on the surfaces.
         batch: number of environments.
         room: contact nodes an environment that are treated.
+        row_lanes: threads that share the contact rows of an environment; one adds them in order.
         device: Warp device.
     """
 
-    def __init__(self, rest: Rest, batch: int, room: int, device: wp.Device) -> None:
-        self.rest, self.batch, self.device = rest, batch, device
+    def __init__(self, rest: Rest, batch: int, room: int, row_lanes: int, device: wp.Device) -> None:
+        self.rest, self.batch, self.row_lanes, self.device = rest, batch, row_lanes, device
         self.lanes = LANES if device.is_cuda else 1
         nodes = max(1, len(rest.surface_node))
         room = max(1, min(room, nodes))
@@ -313,10 +322,10 @@ class LowRank:
         rest, small = self.rest, self.small
         self._launch(forget_contacts, small.strength.shape, [active, small])
         if rows:
-            self._launch(measure_rows, (self.batch, rows), [system, contacts, rest, active, small])
+            inputs = [system, contacts, rest, active, self.row_lanes, small]
+            self._launch(measure_rows, (self.batch, self.row_lanes), inputs)
             self._launch(choose_contacts, small.strength.shape, [rest, active, small])
-            self._launch(clear_small, small.a.shape, [active, small])
-            self._launch(add_rows, (self.batch, rows), [system, contacts, rest, active, small])
+            self._launch(add_rows, (self.batch, self.row_lanes), inputs)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, running: wp.array) -> None:

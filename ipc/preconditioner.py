@@ -11,14 +11,15 @@ from ipc.linear import BlockJacobi, Preconditioner
 from ipc.rest_inverse import RestInverse
 from ipc.rest_stiffness import bonded_bodies
 from ipc.settings import Settings
+from ipc.substructure import choose_partition, entries
 
-__all__ = ["MAX_DENSE_NODES", "make_preconditioner"]
+__all__ = ["MAX_ENTRIES", "make_preconditioner"]
 
-MAX_DENSE_NODES = 2500
-"""Free nodes of a bonded body up to which its rest matrix is inverted: the inverse takes 36 bytes a node squared."""
+MAX_ENTRIES = 60_000_000
+"""Numbers of four bytes up to which the rest inverse of a body is built; it takes the host minutes above that."""
 
 
-def make_preconditioner(layout: Layout, settings: Settings, batch: int, device: wp.Device) -> Preconditioner:
+def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: int, device: wp.Device) -> Preconditioner:
     """The one that ``settings.preconditioner`` names; ``"auto"`` takes what was measured to be fastest on the device.
 
     Raises:
@@ -26,17 +27,16 @@ def make_preconditioner(layout: Layout, settings: Settings, batch: int, device: 
     """
     wanted = settings.preconditioner
     if wanted == "block_jacobi" or (wanted == "auto" and not device.is_cuda):
-        return BlockJacobi(batch, len(layout.node_rest), device)
-    spans = [slice(*layout.node_start[b : b + 2]) for b in bonded_bodies(layout)]
-    most = max((int((layout.node_free[span] != 0).sum()) for span in spans), default=0)
-    if 0 < most <= MAX_DENSE_NODES:
+        return BlockJacobi(batch, len(layout.node_rest), lanes, device)
+    sizes = [entries(layout, *choose_partition(layout, body)) for body in bonded_bodies(layout)]
+    if sizes and max(sizes) <= MAX_ENTRIES:
         try:
-            return RestInverse(layout, settings, batch, device)
+            return RestInverse(layout, settings, batch, lanes, device)
         except np.linalg.LinAlgError as error:
             if wanted != "auto":
                 rule = "a rest matrix is too ill-conditioned to be inverted in single precision"
                 raise IpcError(f"preconditioner = {wanted!r}: {rule}; choose 'block_jacobi'") from error
     elif wanted != "auto":
-        rule = f"the largest bonded body has {most} free nodes, and there must be 1 to {MAX_DENSE_NODES}"
+        rule = f"no body is bonded, or one is too large (inverses of {sizes} numbers, at most {MAX_ENTRIES})"
         raise IpcError(f"preconditioner = {wanted!r}: {rule}; choose 'block_jacobi' or 'auto'")
-    return BlockJacobi(batch, len(layout.node_rest), device)
+    return BlockJacobi(batch, len(layout.node_rest), lanes, device)

@@ -247,6 +247,7 @@ class RestInverse:
         layout: with a bonded body at least.
         settings: time step and integrator.
         batch: number of environments.
+        lanes: threads that share the contact rows of an environment.
         device: Warp device.
         max_contacts: contact nodes an environment that are treated exactly.
         patches: into how many the inside of every body is cut, a power of two; 0 for none; None: as few operations as possible.
@@ -260,6 +261,7 @@ class RestInverse:
         layout: Layout,
         settings: Settings,
         batch: int,
+        lanes: int,
         device: wp.Device,
         max_contacts: int = MAX_CONTACTS,
         patches: int | None = None,
@@ -288,7 +290,7 @@ class RestInverse:
         rest.start, rest.first, rest.width = ints(starts[:-1]), ints(firsts[:-1]), ints(widths)
         rest.unknown, rest.part, rest.surface, rest.surface_node = ints(unknown), ints(part), ints(surface), ints(on_surface)
         self.rest = rest
-        self.low_rank = LowRank(rest, batch, max_contacts, device)
+        self.low_rank = LowRank(rest, batch, max_contacts, lanes, device)
         self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
         views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
         self.products = [
@@ -299,7 +301,7 @@ class RestInverse:
         for body in bodies:
             for patch in body.patches:
                 covered[patch.nodes] = True
-        self.others = BlockJacobi(batch, count, device) if (layout.node_free != 0)[~covered].any() else None
+        self.others = BlockJacobi(batch, count, lanes, device) if (layout.node_free != 0)[~covered].any() else None
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product, with the padding that tiles want."""

@@ -32,6 +32,10 @@ class Settings:
             part; ``ipc/rest_inverse.py``), or ``"auto"``: the rest inverse on CUDA where there is a bonded body of moderate size.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
+        cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
+            ``World.timers``.
+        deterministic: on CUDA, add contact forces and rows in a fixed order, one thread an environment: the same call gives the same
+            bits, and an environment of a batch those of a world of its own. Slower; a CPU does it anyway.
     """
 
     dt: float = 0.01
@@ -45,11 +49,13 @@ class Settings:
     friction_velocity: float = 1e-4
     friction_relags: int = 2
     friction_tolerance: float = 0.01
-    linear_tolerance: float = 1e-3
+    linear_tolerance: float = 1e-2
     max_linear: int = 2000
     preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
     motion_fraction: float = 0.8
+    cuda_graph: bool = True
+    deterministic: bool = False
 
     def __post_init__(self) -> None:
         for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):

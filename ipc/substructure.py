@@ -84,7 +84,7 @@ def partition(layout: Layout, nodes: Ints, parts: int) -> Ints:
     return label
 
 
-def _single(inverse: Floats) -> Singles:
+def _single(inverse: NDArray[np.floating]) -> Singles:
     """An inverse in single precision.
 
     Raises:

@@ -10,13 +10,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from ipc import dynamics
 from ipc.bodies import Body, HalfSpace, SoftBody
 from ipc.errors import IpcError, OverlapError
 from ipc.layout import build_layout, rotation_matrix
-from ipc.linear import row_sum
 from ipc.newton import Newton
 from ipc.overlap import find_overlap
+from ipc.potential import Potential
 from ipc.report import ContactPairs, StepReport, Wrench
 from ipc.settings import Settings
 
@@ -33,7 +32,7 @@ class State:
         y: node positions in their body's frame [m] (B, N, 3).
         velocity, velocity_before: node velocities, world frame [m/s] (B, N, 3).
         position_before: node positions one step earlier, world frame [m] (B, N, 3).
-        frame_rotation, frame_position: frames, quaternion (w, x, y, z) (B, bodies, 4) and [m] (B, bodies, 3).
+        frame_rotation, frame_position: frames of bodies, grips and aims, quaternion (w, x, y, z) (B, frames, 4) and [m] (B, frames, 3).
         second_order: BDF2 has a history (B,).
         kappa: [Pa] (B,).
         failed: (B,).
@@ -53,6 +52,20 @@ class State:
 def _host(array: wp.array) -> NDArray[Any]:
     """The array in NumPy: a view on the CPU, a copy from CUDA."""
     return array.numpy()
+
+
+def _quaternions(rotations: Floats) -> Floats:
+    """Unit quaternions (w, x, y, z) of rotation matrices, (..., 3, 3) to (..., 4): the eigenvector of Bar-Itzhack's matrix."""
+    m = np.moveaxis(rotations, (-2, -1), (0, 1))
+    zero = m[0, 0] * 0
+    rows = [
+        [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+        [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+        [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+    ]
+    matrix = np.stack([np.stack([zero + e for e in row], axis=-1) for row in rows], axis=-2)
+    return np.linalg.eigh(matrix)[1][..., -1]
 
 
 class World:
@@ -97,21 +110,22 @@ class World:
             ) from error
         self.d_hat = self.settings.d_hat or 0.1 * self.layout.min_edge
         self.kappa = self.settings.kappa or self.layout.max_young or 1e5
-        self._solver = Newton(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
+        self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
+        self._newton = Newton(self._potential, self.layout, self.settings)
         self._failed = np.zeros(num_envs, bool)
-        self._moving = np.zeros(num_envs, bool)
-        frames = [
-            (body.pose.position, body.pose.rotation) if framed else ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-            for body, framed in zip(self.bodies, self.layout.framed, strict=True)
-        ]
+        frames = self.layout.frame_pose
+        # What the device is told before a step, kept here so that telling it costs one copy and no wait.
+        self._goal_p = np.zeros((num_envs, len(frames), 3))
+        self._goal_q = np.zeros((num_envs, len(frames), 4))
+        self._told = False
         nodes = np.broadcast_to(self.layout.node_rest, (num_envs, *self.layout.node_rest.shape))
         self._start = State(
             y=nodes.copy(),
             velocity=np.zeros(nodes.shape),
             velocity_before=np.zeros(nodes.shape),
             position_before=np.zeros(nodes.shape),
-            frame_rotation=np.broadcast_to(np.array([f[1] for f in frames], float), (num_envs, len(frames), 4)).copy(),
-            frame_position=np.broadcast_to(np.array([f[0] for f in frames], float), (num_envs, len(frames), 3)).copy(),
+            frame_rotation=np.broadcast_to(frames[:, 3:], (num_envs, len(frames), 4)).copy(),
+            frame_position=np.broadcast_to(frames[:, :3], (num_envs, len(frames), 3)).copy(),
             second_order=np.zeros(num_envs, np.int32),
             kappa=np.full(num_envs, self.kappa),
             failed=np.zeros(num_envs, bool),
@@ -125,12 +139,16 @@ class World:
             raise IpcError(f"no body is named {name!r}: choose from {', '.join(self.layout.names)}")
         return self.layout.names.index(name)
 
-    def _framed(self, name: str) -> int:
-        body = self._index(name)
-        if not self.layout.framed[body]:
-            choices = ", ".join(n for n, f in zip(self.layout.names, self.layout.framed, strict=True) if f) or "none"
-            raise IpcError(f"{name!r} moves freely and takes no pose; driven bodies: {choices}")
-        return body
+    def _frame(self, name: str) -> int:
+        """Frame of a driven body, of a grip, or the aim of a driven affine body."""
+        names = self.layout.frame_names
+        for candidate in (f"{name}.aim", name):
+            if candidate in names and self.layout.framed[names.index(candidate)]:
+                return names.index(candidate)
+        choices = ", ".join(n for n, f in zip(names, self.layout.framed, strict=True) if f) or "none"
+        if name in names:
+            raise IpcError(f"{name!r} moves freely and takes no pose; driven frames: {choices}")
+        raise IpcError(f"no body or grip is named {name!r}: choose from {choices}")
 
     def _per_env(self, values: ArrayLike, shape: tuple[int, ...], what: str, dtype: type = float) -> NDArray:
         array = np.asarray(values, dtype=dtype)
@@ -159,26 +177,24 @@ class World:
         """Say where a driven body's frame shall be at the end of the next step; it stays there until told otherwise.
 
         Args:
-            name: a kinematic body, a half-space, or a soft body with bonded vertices.
+            name: a kinematic body, a half-space, a soft body with bonded vertices, a grip ``"<body>.<grip>"``, or an affine body with
+                a drive, which goes there as far as its drive and contacts let it.
             position: frame origin in the world [m], shape (3,) or (B, 3); None keeps the last target's.
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps the last target's. Steps turn by less than half a turn.
         """
-        body = self._framed(name)
-        goal_p, goal_q = _host(self._solver.goal_p).copy(), _host(self._solver.goal_q).copy()
+        frame = self._frame(name)
         if position is not None:
-            goal_p[:, body] = self._per_env(position, (3,), "position")
+            self._goal_p[:, frame] = self._per_env(position, (3,), "position")
         if rotation is not None:
             q = self._per_env(rotation, (4,), "rotation")
             if not np.allclose(np.linalg.norm(q, axis=-1), 1, atol=1e-6):
                 raise IpcError(f"rotation = {rotation}: a quaternion (w, x, y, z) must have length 1")
-            goal_q[:, body] = (q / np.linalg.norm(q, axis=-1, keepdims=True))[:, [1, 2, 3, 0]]
-        self._solver.goal_p.assign(goal_p)
-        self._solver.goal_q.assign(goal_q)
-        self._moving[:] = True
+            self._goal_q[:, frame] = (q / np.linalg.norm(q, axis=-1, keepdims=True))[:, [1, 2, 3, 0]]
+        self._told = False
 
     def set_gravity(self, gravity: ArrayLike) -> None:
         """Set the acceleration of every body [m/s²], world frame, shape (3,) or (B, 3)."""
-        self._solver.acceleration.assign(np.ascontiguousarray(self._per_env(gravity, (3,), "gravity")))
+        self._potential.acceleration.assign(np.ascontiguousarray(self._per_env(gravity, (3,), "gravity")))
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame."""
@@ -187,62 +203,54 @@ class World:
         if first == last:
             raise IpcError(f"{name!r} has no unknowns: drive it with set_target")
         mask = self._mask(envs)
-        v = _host(self._solver.v).copy()
+        v = _host(self._potential.v).copy()
         v[mask, first:last] = self._per_env(velocity, (3,), "velocity")[mask, None]
-        self._solver.v.assign(v)
+        self._potential.v.assign(v)
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
     def step(self) -> StepReport:
         """Advance every environment that has not failed by ``settings.dt``."""
-        solver = self._solver
-        alive = ~self._failed
-        # Who is told to stay where it is has no way to go.
-        self._moving &= (_host(solver.goal_p) != _host(solver.frame_p)).any(axis=(1, 2)) | (
-            _host(solver.goal_q) != _host(solver.frame_q)
-        ).any(axis=(1, 2))
-        counts = solver.step(alive, self._moving & alive)
-        # Frames that got where they were told are at rest from now on; blocked ones keep trying.
-        self._moving &= counts.blocked > 0
-        self._failed |= counts.failed
-        everything = solver.device_mask(np.ones(self.num_envs, bool))
-        elastic, kinetic = (wp.zeros(self.num_envs, dtype=wp.float64, device=self.device) for _ in range(2))
-        row_sum(solver.el_energy, everything, elastic)
-        inputs = [solver.v, solver.row_start, solver.col, solver.mass]
-        wp.launch(dynamics.kinetic_energy, dim=solver.v.shape, inputs=inputs, outputs=[solver.node_change], device=self.device)
-        row_sum(solver.node_change, everything, kinetic)
+        pot, alive = self._potential, ~self._failed
+        if not self._told:
+            pot.goal_p.assign(self._goal_p)
+            pot.goal_q.assign(self._goal_q)
+            self._told = True
+        found = self._newton.step(alive)
+        failed = found["failed"].astype(bool)
+        self._failed |= failed
         return StepReport(
-            converged=counts.converged & alive,
+            converged=found["converged"].astype(bool),
             failed=self._failed.copy(),
-            stalled=counts.stalled,
-            blocked=counts.blocked,
-            min_gap=counts.min_gap,
-            min_det=counts.min_det,
-            newton=counts.newton,
-            linear=counts.linear,
-            line_search=counts.line_search,
-            relags=counts.relags,
-            projected=counts.projected,
-            ccd=counts.ccd,
-            speed=counts.residual_speed,
-            pairs=_host(solver.collision.contacts.count).astype(np.int64),
-            kappa=_host(solver.kappa).copy(),
-            elastic=_host(elastic).copy(),
-            kinetic=_host(kinetic).copy(),
-            barrier=_host(solver.barrier_energy).copy(),
+            stalled=found["stalled"].astype(bool),
+            blocked=1.0 - found["share"],
+            min_gap=found["min_gap"],
+            min_det=found["min_det"],
+            newton=found["newton"].astype(np.int64),
+            linear=found["linear"].astype(np.int64),
+            line_search=found["line_search"].astype(np.int64),
+            relags=np.maximum(found["relags"], 0).astype(np.int64),
+            projected=_host(pot.project).astype(bool),
+            ccd=found["ccd"],
+            speed=found["speed"],
+            pairs=_host(pot.collision.contacts.count).astype(np.int64),
+            kappa=_host(pot.kappa).copy(),
+            elastic=_host(pot.elastic_energy).copy(),
+            kinetic=_host(pot.kinetic).copy(),
+            barrier=_host(pot.barrier).copy(),
         )
 
     @property
     def timers(self) -> dict[str, float]:
-        """Seconds spent in each stage of the steps so far (on CUDA: until the host has queued the work)."""
-        return dict(self._solver.timers)
+        """Seconds spent in ``step`` so far, and in each of its stages (on CUDA only with ``Settings.cuda_graph`` off)."""
+        return dict(self._newton.timers)
 
     # --- outputs ---------------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
-        """``world_from_body`` of a driven body: rotations (B, 3, 3) and positions [m] (B, 3)."""
-        body = self._framed(name)
-        return _host(self._solver.R)[:, body].copy(), _host(self._solver.t)[:, body].copy()
+        """Where a driven body's or a grip's frame is in the world: rotations (B, 3, 3) and positions [m] (B, 3)."""
+        body = self._frame(name)
+        return _host(self._potential.R)[:, body].copy(), _host(self._potential.t)[:, body].copy()
 
     def positions(self, name: str, frame: str = "world") -> Floats:
         """Positions [m] of a body, (B, n, 3): all vertices of a soft body's mesh, else its surface's vertices.
@@ -256,7 +264,7 @@ class World:
             raise IpcError(f"{name!r} is a half-space and has no vertices")
         if frame not in ("world", "body"):
             raise IpcError(f"frame = {frame!r}: choose 'world' or 'body'")
-        solver = self._solver
+        solver = self._potential
         if isinstance(self.bodies[body], SoftBody):
             y = _host(solver.y)[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
             if frame == "body":
@@ -272,7 +280,7 @@ class World:
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
             raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return _host(self._solver.v)[:, first:last].copy()
+        return _host(self._potential.v)[:, first:last].copy()
 
     def affine_pose(self, name: str) -> tuple[Floats, Floats]:
         """A (B, 3, 3) and p [m] (B, 3) of an affine body's map x = A X + p."""
@@ -282,7 +290,7 @@ class World:
             raise IpcError(f"{name!r} is no affine body")
         pose = self.bodies[body].pose
         corner = rotation_matrix(pose.rotation).T @ (self.layout.node_rest[first] - pose.position)
-        y = _host(self._solver.y)[:, first:last]
+        y = _host(self._potential.y)[:, first:last]
         A = np.einsum("bki,kj->bij", y, self.layout.grads[self.layout.tet_start[body]])
         return A, y[:, 0] - A @ corner
 
@@ -299,7 +307,7 @@ class World:
         """Contact and friction force on each surface vertex [N], world frame, (B, n, 3); order as in :meth:`surface`."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
-        return -_host(self._solver.vert_gradient)[:, first:last]
+        return -_host(self._potential.vert_gradient)[:, first:last]
 
     def traction(self, name: str) -> Floats:
         """Contact force per rest area at each surface vertex [Pa], world frame, (B, n, 3)."""
@@ -310,27 +318,37 @@ class World:
     def wrench(self, name: str) -> Wrench:
         """What the others do to a body: contact forces on a kinematic or affine body or half-space, the bond's pull on a pad's frame.
 
-        For a soft body with bonded vertices this is the force of the pad on what holds it; for a free one, the sum of its contacts.
+        For a soft body with bonded vertices this is the force of the pad on what holds it, and ``"<body>.<grip>"`` gives the force on
+        that grip; for a free soft body it is the sum of its contacts.
         """
+        solver, layout = self._potential, self.layout
+        if name in layout.frame_names[len(layout.names) :] and not name.endswith(".aim"):
+            frame = layout.frame_names.index(name)
+            return self._bond_wrench(int(layout.frame_body[frame]), frame, layout.grip_node[layout.grip_frame == frame])
         body = self._index(name)
-        solver, layout = self._solver, self.layout
         origin = _host(solver.t)[:, body] if layout.framed[body] else np.zeros((self.num_envs, 3))
         first, last = layout.vert_start[body : body + 2]
         if isinstance(self.bodies[body], HalfSpace):
             points, forces = self._plane_forces(body)
         elif isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
             nodes = np.arange(layout.node_start[body], layout.node_start[body + 1])
-            nodes = nodes[layout.node_free[nodes] == 0]
-            R = _host(solver.R)[:, body]
-            forces = -np.einsum("bij,bnj->bni", R, _host(solver.gradient)[:, nodes])
-            points = np.einsum("bij,bnj->bni", R, _host(solver.y)[:, nodes]) + origin[:, None]
+            held = nodes[(layout.node_free[nodes] == 0) & ~np.isin(nodes, layout.grip_node)]
+            return self._bond_wrench(body, body, held)
         else:
             points, forces = _host(solver.x)[:, first:last], -_host(solver.vert_gradient)[:, first:last]
         return Wrench(forces.sum(axis=1), np.cross(points - origin[:, None], forces).sum(axis=1))
 
+    def _bond_wrench(self, body: int, frame: int, nodes: NDArray[np.int32]) -> Wrench:
+        """What the body's bonded nodes do to the frame that holds them, about its origin."""
+        solver = self._potential
+        R, t = _host(solver.R)[:, body], _host(solver.t)
+        forces = -np.einsum("bij,bnj->bni", R, _host(solver.gradient)[:, nodes])
+        points = np.einsum("bij,bnj->bni", R, _host(solver.y)[:, nodes]) + t[:, None, body]
+        return Wrench(forces.sum(axis=1), np.cross(points - t[:, None, frame], forces).sum(axis=1))
+
     def _plane_forces(self, body: int) -> tuple[Floats, Floats]:
         """Points and forces on a half-space: the reactions of its contacts, friction included, (B, n, 3)."""
-        solver = self._solver
+        solver = self._potential
         collision = solver.collision
         forces = np.zeros((*solver.x.shape, 3))
         plane_of = self.layout.pairs[:, 1]
@@ -357,7 +375,7 @@ class World:
         """The contact pairs of one environment at the end of the last step."""
         if not 0 <= env < self.num_envs:
             raise IpcError(f"env = {env}: environments are 0 to {self.num_envs - 1}")
-        found = self._solver.collision.contacts
+        found = self._potential.collision.contacts
         n = int(_host(found.count)[env])
         pairs = self.layout.pairs[_host(found.pair)[env, :n]]
         names = self.layout.names
@@ -374,7 +392,7 @@ class World:
 
     def save(self) -> State:
         """A copy of the state of every environment."""
-        s = self._solver
+        s = self._potential
         return State(
             y=_host(s.y).copy(),
             velocity=_host(s.v).copy(),
@@ -397,7 +415,7 @@ class World:
         Raises:
             OverlapError: if surfaces cross or touch in that state.
         """
-        mask, s = self._mask(envs), self._solver
+        mask, s = self._mask(envs), self._potential
         if state.y.shape != _host(s.y).shape:
             raise IpcError(f"the state has nodes of shape {state.y.shape}: this world has {_host(s.y).shape}")
         self._check_overlap(state, mask)
@@ -417,12 +435,11 @@ class World:
             merged = _host(target).copy()
             merged[mask] = values[mask]
             target.assign(merged)
+        self._goal_p[mask], self._goal_q[mask] = state.frame_position[mask], quaternions[mask]
         self._failed[mask] = state.failed[mask]
-        self._moving[mask] = False
         s.collision.forget(mask)
         s.collision.drop_lag(mask)
-        s.share.fill_(0.0)
-        s.set_frames(s.share, s.R, s.t)
+        s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
         s.place_vertices(s.y, s.R, s.t, s.x)
 
     def reset(self, envs: ArrayLike | None = None) -> None:
@@ -443,15 +460,29 @@ class World:
         Raises:
             OverlapError: if surfaces would cross or touch there.
         """
-        body, mask, state = self._framed(name), self._mask(envs), self.save()
+        frame, mask, state = self._frame(name), self._mask(envs), self.save()
+        before = rotation_matrix(state.frame_rotation), state.frame_position.copy()
         if position is not None:
-            state.frame_position[mask, body] = self._per_env(position, (3,), "position")[mask]
+            state.frame_position[mask, frame] = self._per_env(position, (3,), "position")[mask]
         if rotation is not None:
-            state.frame_rotation[mask, body] = self._per_env(rotation, (4,), "rotation")[mask]
+            state.frame_rotation[mask, frame] = self._per_env(rotation, (4,), "rotation")[mask]
+        body = int(self.layout.frame_body[frame])
+        if frame == body:
+            self._carry_grips(state, body, mask, before)
         nodes = slice(self.layout.node_start[body], self.layout.node_start[body + 1])
         state.velocity[mask, nodes] = 0.0
         state.second_order[mask] = 0
         self.restore(state, mask)
+
+    def _carry_grips(self, state: State, body: int, mask: NDArray[np.bool_], before: tuple[Floats, Floats]) -> None:
+        """Grips keep their places in the frame of the body that was moved."""
+        turn = rotation_matrix(state.frame_rotation[:, body]) @ np.swapaxes(before[0][:, body], -1, -2)
+        for grip in np.flatnonzero((self.layout.frame_body == body) & (self.layout.frame_moves == 1)):
+            if grip == body:
+                continue
+            arm = np.einsum("bij,bj->bi", turn, before[1][:, grip] - before[1][:, body])
+            state.frame_position[mask, grip] = (state.frame_position[:, body] + arm)[mask]
+            state.frame_rotation[mask, grip] = _quaternions(turn @ before[0][:, grip])[mask]
 
     def _check_overlap(self, state: State, mask: NDArray[np.bool_]) -> None:
         """Refuse surfaces that cross; environments that look alike are checked once."""

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from raytac.cli.bake import BakeArgs
+from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare import CompareArgs
 from raytac.cli.doctor import DoctorArgs
 from raytac.cli.press import PressArgs
@@ -19,6 +20,7 @@ __all__ = ["main"]
 _Command = (
     Annotated[PressArgs, tyro.conf.subcommand("press")]
     | Annotated[BakeArgs, tyro.conf.subcommand("bake")]
+    | Annotated[CalibrateArgs, tyro.conf.subcommand("calibrate")]
     | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from raytac.gel.product import product
+
 __all__ = ["GaussianBlur", "gaussian_matrix"]
 
 _LOW_RANK_FROM = 6.0
 """Width [nodes] from which the truncated cosine basis beats the banded product (measured on a 399 × 328 grid, two cores)."""
 _TAIL = 1e-6
 """Weight, relative to the peak, below which matrix entries and basis vectors are dropped."""
-_ONE_THREAD = 250_000
-"""Multiply-adds in one product. OpenBLAS wakes its threads above 262,144, which for work so small costs more than it saves, and
-far more on a busy machine; below it, the result does not depend on the number of threads either."""
 
 
 def gaussian_matrix(nodes: int, width: float) -> np.ndarray:
@@ -40,8 +39,8 @@ class GaussianBlur:
         """Smoothed copy of ``field``, (Ny, Nx) float32."""
         rows, columns = self._along_y, self._along_x
         if isinstance(rows, tuple) and isinstance(columns, tuple):
-            core = _product(_product(rows[1], field), columns[1].T)
-            return _product(rows[0], _product(core, columns[0].T))
+            core = product(product(rows[1], field), columns[1].T)
+            return product(rows[0], product(core, columns[0].T))
         return _apply_right(_apply_left(rows, field), columns)
 
 
@@ -94,33 +93,17 @@ def _kernel(width: float) -> np.ndarray:
 
 def _apply_left(operator: _Operator, field: np.ndarray) -> np.ndarray:
     if isinstance(operator, tuple):
-        return _product(operator[0], _product(operator[1], field))
+        return product(operator[0], product(operator[1], field))
     out = np.empty_like(field)
     for rows, columns, weights in operator:
-        _product(weights, field[columns], out[rows])
+        product(weights, field[columns], out[rows])
     return out
 
 
 def _apply_right(field: np.ndarray, operator: _Operator) -> np.ndarray:
     if isinstance(operator, tuple):
-        return _product(_product(field, operator[1].T), operator[0].T)
+        return product(product(field, operator[1].T), operator[0].T)
     out = np.empty_like(field)
     for rows, columns, weights in operator:
-        _product(field[:, columns], weights.T, out[:, rows])
-    return out
-
-
-def _product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32, in pieces along the longer free side small enough to stay on the calling thread."""
-    rows, inner = a.shape
-    columns = b.shape[1]
-    out = np.empty((rows, columns), np.float32) if out is None else out
-    if rows >= columns:
-        step = max(_ONE_THREAD // (inner * columns), 1)
-        for start in range(0, rows, step):
-            out[start : start + step] = a[start : start + step] @ b
-    else:
-        step = max(_ONE_THREAD // (inner * rows), 1)
-        for start in range(0, columns, step):
-            out[:, start : start + step] = a @ b[:, start : start + step]
+        product(field[:, columns], weights.T, out[:, rows])
     return out

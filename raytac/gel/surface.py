@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from raytac.gel.coat_mesh import DeformedCoat
+
 __all__ = ["GelSurface", "PadGrid", "summary"]
 
 
@@ -62,6 +64,8 @@ class GelSurface:
     contact_centre [m], shape (B, 2): x, y of the pressure-weighted (here: indentation-weighted) contact centroid, NaN without
     contact.
     pad_from_object, shape (B, 4, 4): pose of the object, or None when there is no object.
+    coat: the same surface as a mesh that moves sideways too, where the physics simulates the gel; None elsewhere.
+    ink, shape (B, Ny, Nx), float32: share of the skin that marker dots cover around each node, in [0, 1]; None without dots.
     """
 
     grid: PadGrid
@@ -69,6 +73,8 @@ class GelSurface:
     contact: np.ndarray
     contact_centre: np.ndarray
     pad_from_object: np.ndarray | None = None
+    coat: DeformedCoat | None = None
+    ink: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return summary(self)

@@ -20,6 +20,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.base import OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatLayout
+from raytac.optics.ink import checked_ink, darkened, ink_at
 from raytac.optics.memory import ROUNDING, check_batch, largest_batch
 from raytac.optics.raytrace import RayTracer
 from raytac.optics.recording import no_collection
@@ -49,6 +50,8 @@ class ImageHeights:
     """(width, height) [px]."""
     aspect: float = 1.0
     """Pitch along x over pitch along y."""
+    ink: Any = None
+    """Share of marker dots; None without dots."""
 
     def pixel(self, mi: Any) -> tuple[Any, Any, Any, Any]:
         """(index, index in the image, column, row) of every pixel of the batch."""
@@ -68,12 +71,21 @@ class ImageHeights:
 
 
 def see_heights(
-    mi: Any, layout: CoatLayout, camera: Pinhole, pitch: tuple[float, float], rest: Any, heights: Any, contact: Any
+    mi: Any,
+    layout: CoatLayout,
+    camera: Pinhole,
+    pitch: tuple[float, float],
+    rest: Any,
+    heights: Any,
+    contact: Any,
+    ink: Any = None,
 ) -> ImageHeights:
     """Heights that the pixels' central rays meet.
 
-    ``rest`` (Ny·Nx) and ``heights`` (B·Ny·Nx) [m] are device Floats, ``contact`` (B·Ny·Nx) a UInt8 or None, ``pitch`` the size of an
-    image pixel on z = 0 [m]. On a ray p(z) = o + (z − o_z) (t_x, t_y, 1) the coat Z(x, y) is met where Z(p(z)) = z. Newton's step is
+    ``rest`` (Ny·Nx) and ``heights`` (B·Ny·Nx) [m] are device Floats, ``contact`` (B·Ny·Nx) a UInt8 or None, ``ink`` (B·Ny·Nx) a Float or
+    None, ``pitch`` the size of an image pixel on z = 0 [m].
+
+    On a ray p(z) = o + (z − o_z) (t_x, t_y, 1) the coat Z(x, y) is met where Z(p(z)) = z. Newton's step is
     z ← z + (Z − z) / (1 − ∇Z · t), two of them from z = 0; where the coat is steeper than half the ray the step is that of slope 1/2.
     """
     g = layout
@@ -113,7 +125,8 @@ def see_heights(
     if contact is not None:
         nearest = k + dr.select(wx > 0.5, 1, 0) + dr.select(wy > 0.5, g.nx, 0)
         touched = dr.gather(mi.UInt8, contact, first + nearest)
-    return ImageHeights(-blend(now), moved, touched, envs, (width, height), pitch[0] / pitch[1])
+    dots = None if ink is None else ink_at(mi, g, ink, env, ox + (z - oz) * tx, oy + (z - oz) * ty)
+    return ImageHeights(-blend(now), moved, touched, envs, (width, height), pitch[0] / pitch[1], dots)
 
 
 class ImageMode(ABC):
@@ -208,7 +221,7 @@ class ImageMode(ABC):
             return images
         heights, contact, failed = self._upload(surface)
         width, height = self.camera.resolution
-        rgb, flags = self.render_device(heights, contact)
+        rgb, flags = self.render_device(heights, contact, self._upload_ink(surface))
         image = np.array(rgb).reshape(surface.batch, height, width, 3)
         image[failed] = 0
         return replace(images, rgb=image, uncovered=self._uncovered(np.array(flags), failed))
@@ -216,8 +229,7 @@ class ImageMode(ABC):
     def render_levels(self, surface: GelSurface) -> np.ndarray:
         """The image before rounding and clipping [levels, 0-255], shape (B, H, W, 3), float32; NaN where an environment failed."""
         heights, contact, failed = self._upload(surface)
-        seen = self._see(heights, contact, self._rest)
-        channels, _ = self._levels(seen, self._inputs)
+        channels, _ = self._inked_levels(self._see(heights, contact, self._rest, self._upload_ink(surface)), self._inputs)
         width, height = self.camera.resolution
         image = np.stack([np.array(c) for c in channels], axis=-1).reshape(surface.batch, height, width, 3)
         image[failed] = np.nan
@@ -226,15 +238,15 @@ class ImageMode(ABC):
     def image_heights(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """(−z, rest − z) of the coat through every pixel's centre [image pixels], each (B, H, W) float32."""
         heights, contact, failed = self._upload(surface)
-        seen = self._see(heights, contact, self._rest)
+        seen = self._see(heights, contact, self._rest, None)
         width, height = self.camera.resolution
         found = [np.array(v).reshape(surface.batch, height, width) for v in (seen.height, seen.moved)]
         for image in found:
             image[failed] = np.nan
         return found[0], found[1]
 
-    def render_device(self, heights: Any, contact: Any = None) -> tuple[Any, Any]:
-        """On device arrays: heights (B·Ny·Nx) [m] and contact (B·Ny·Nx, UInt8, or None) to (image, flags).
+    def render_device(self, heights: Any, contact: Any = None, ink: Any = None) -> tuple[Any, Any]:
+        """On device arrays: heights (B·Ny·Nx) [m], contact (B·Ny·Nx, UInt8, or None) and ink (B·Ny·Nx, or None) to (image, flags).
 
         The image is B·H·W·3, UInt8. Heights must be finite, which is not checked here.
         Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
@@ -253,23 +265,32 @@ class ImageMode(ABC):
             raise InputError("contact", value=value, rule=f"this mode needs one value a node, {dr.width(heights)} here")
         envs = dr.width(heights) // nodes
         self._check_batch(envs, self._grid)
-        key = "frame", envs
+        key = "frame" if ink is None else "frame-ink", envs
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(self._frame)
         touched = contact if self.needs_contact else self.mi.UInt8(0)
         with no_collection():
-            return self._frozen[key](heights, touched, self._rest, self._inputs)
+            return self._frozen[key](heights, touched, self._rest, self._inputs, ink)
 
-    def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any) -> tuple[Any, Any]:
+    def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any, ink: Any) -> tuple[Any, Any]:
         mi = self.mi
-        channels, flags = self._levels(self._see(heights, contact, rest), inputs)
+        channels, flags = self._inked_levels(self._see(heights, contact, rest, ink), inputs)
         return mi.UInt8(dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))), flags
 
-    def _see(self, heights: Any, contact: Any, rest: Any) -> ImageHeights:
+    def _inked_levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
+        """``_levels`` with the dots of the markers, if there are some."""
+        channels, flags = self._levels(seen, inputs)
+        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.ink)), flags
+
+    def _see(self, heights: Any, contact: Any, rest: Any, ink: Any) -> ImageHeights:
         touched = contact if self.needs_contact else None
-        seen = see_heights(self.mi, self.layout, self.camera, self.pitch, rest, heights, touched)
-        dr.eval(seen.height, seen.moved, seen.contact)
+        seen = see_heights(self.mi, self.layout, self.camera, self.pitch, rest, heights, touched, ink)
+        dr.eval(seen.height, seen.moved, seen.contact, seen.ink)
         return seen
+
+    def _upload_ink(self, surface: GelSurface) -> Any:
+        ink = checked_ink(surface)
+        return None if ink is None else self.mi.Float(ink.ravel())
 
     def _upload(self, surface: GelSurface) -> tuple[Any, Any, np.ndarray]:
         check_shapes(surface)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.denoise import make_denoiser
 from raytac.optics.fast import PixelSample, direct_light, see
+from raytac.optics.ink import checked_ink, ink_at, inked_albedo
 from raytac.optics.lamp import Lamp
 from raytac.optics.memory import ROUNDING, check_batch, largest_batch
 from raytac.optics.recording import no_collection
@@ -39,6 +40,8 @@ class FastInputs:
     lamps: list[Lamp]
     bounce: BounceField | None
     scale: list[Any]
+    ink: Any = None
+    """Share of marker dots at the nodes, B·Ny·Nx; None without dots."""
 
 
 def total(layers: dict[str, np.ndarray]) -> np.ndarray:
@@ -214,11 +217,11 @@ class RayTracer:
         shape = (len(heights), height, width)
         rgb, layers = None, None
         if self._lit and self.integrator == "fast":
-            device = self.render_device(self._upload(heights))
+            device = self.render_device(self._upload(heights), self._upload_ink(surface))
             layers = self._to_numpy_layers(device["layers"], shape) if "layers" in self.outputs else None
             rgb = np.array(device["rgb"]).reshape(*shape, 3) if "rgb" in self.outputs else None
         elif self._lit:
-            by_layer = self._layers(heights)
+            by_layer = self._layers(heights, checked_ink(surface))
             layers = by_layer if "layers" in self.outputs else None
             rgb = self.response.encode_numpy(total(by_layer)) if "rgb" in self.outputs else None
         images = {"rgb": rgb} if rgb is not None else {}
@@ -236,7 +239,7 @@ class RayTracer:
                 "outputs", value=self.outputs, rule="layers need a tracer with an output of light", choices=("rgb", "layers")
             )
         heights, failed = self._checked(surface)
-        layers = self._layers(heights)
+        layers = self._layers(heights, checked_ink(surface))
         for image in layers.values():
             image[failed] = np.nan
         return layers
@@ -252,25 +255,25 @@ class RayTracer:
         self._prepare(surface.grid)
         return safe_heights(surface)
 
-    def _layers(self, heights: np.ndarray) -> dict[str, np.ndarray]:
+    def _layers(self, heights: np.ndarray, ink: np.ndarray | None = None) -> dict[str, np.ndarray]:
         width, height = self.camera.resolution
         if self.integrator == "fast":
-            inputs = FastInputs(self._rest, self.lamps, self._bounce, [])
+            inputs = FastInputs(self._rest, self.lamps, self._bounce, [], None if ink is None else self._upload(ink))
             return self._to_numpy_layers(self._linear(self._upload(heights), inputs), (len(heights), height, width))
         assert self.scene is not None
         images = []
         for b, one in enumerate(heights):
-            self.scene.set_surface(one)
+            self.scene.set_surface(one, None if ink is None else ink[b])
             images.append(self._sampled.render(self._scene_lamps, self.groups, self.spp, image_seed(self.seed, b)))
         stack = np.stack(images, axis=1)
         if self._denoiser is not None:
             stack = np.stack([[self._denoiser(image) for image in layer] for layer in stack])
         return dict(zip(self.layer_names, stack, strict=True))
 
-    def render_device(self, heights: Any) -> dict[str, Any]:
+    def render_device(self, heights: Any, ink: Any = None) -> dict[str, Any]:
         """``fast`` on device arrays: heights (B·Ny·Nx) [m] to ``rgb`` (B·H·W·3, UInt8-valued) and ``layers`` (list of channels).
 
-        Heights must be finite, which is not checked here.
+        ``ink`` (B·Ny·Nx): share of marker dots at each node, in [0, 1]. Heights must be finite, which is not checked here.
         Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
         """
         if self._grid is None:
@@ -278,16 +281,16 @@ class RayTracer:
         nodes = self.layout.nx * self.layout.ny
         if dr.width(heights) == 0 or dr.width(heights) % nodes:
             raise InputError("heights", value=dr.width(heights), rule=f"must hold a whole number of grids of {nodes} nodes")
-        rgb, layers = self._recorded(self._fast_frame, heights)
+        rgb, layers = self._recorded(self._fast_frame, heights, ink)
         return {"rgb": rgb, "layers": layers}
 
-    def _recorded(self, function: Any, heights: Any) -> Any:
+    def _recorded(self, function: Any, heights: Any, ink: Any = None) -> Any:
         """Call ``function(heights, inputs)``, recorded once for each number of environments and replayed afterwards."""
-        key = function.__name__, dr.width(heights)
+        key = function.__name__ + ("" if ink is None else "-ink"), dr.width(heights)
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(function)
         with no_collection():
-            return self._frozen[key](heights, self._inputs)
+            return self._frozen[key](heights, self._inputs if ink is None else replace(self._inputs, ink=ink))
 
     def _fast_frame(self, heights: Any, inputs: FastInputs) -> tuple[Any, list[Any]]:
         channels = self._linear(heights, inputs)
@@ -312,7 +315,7 @@ class RayTracer:
 
     def _shade(self, field: CoatField, seen: PixelSample, grids: list[Any] | None, inputs: FastInputs) -> list[Any]:
         mi, coat = self.mi, self.sensor.coat
-        diffuse_albedo = [(1 - coat.specular) * r for r in coat.reflectance]
+        diffuse_albedo = [(1 - coat.specular) * r for r in self._albedo(seen, inputs)]
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
         for lamp, group in zip(inputs.lamps, self.groups, strict=True):
             diffuse, specular = direct_light(mi, field, coat, seen, lamp, self.led_points, self.shadows, slab=self.slab)
@@ -323,16 +326,23 @@ class RayTracer:
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
 
+    def _albedo(self, seen: PixelSample, inputs: FastInputs) -> list[Any]:
+        """Diffuse albedo of the coat or its dots at the seen points, a channel each."""
+        if inputs.ink is None:
+            return list(self.sensor.coat.reflectance)
+        return inked_albedo(self.sensor, ink_at(self.mi, self.layout, inputs.ink, seen.env, seen.p.x, seen.p.y))
+
     def _radiosity(self, field: CoatField, inputs: FastInputs) -> Any:
         """Direct radiosity B of the coat at a sample, a channel each, for the coat's own inter-reflection."""
         mi, coat = self.mi, self.sensor.coat
 
         def radiosity(seen: PixelSample) -> list[Any]:
+            albedo = self._albedo(seen, inputs)
             out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
             for lamp, group in zip(inputs.lamps, self.groups, strict=True):
                 diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False, slab=self.slab)
                 for c in range(3):
-                    out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * coat.reflectance[c] + coat.specular)
+                    out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * albedo[c] + coat.specular)
             return out
 
         return radiosity
@@ -349,6 +359,10 @@ class RayTracer:
 
     def _upload(self, heights: np.ndarray) -> Any:
         return self.mi.Float(heights.ravel())
+
+    def _upload_ink(self, surface: GelSurface) -> Any:
+        ink = checked_ink(surface)
+        return None if ink is None else self._upload(ink)
 
     def _geometry(self, surface: GelSurface, heights: np.ndarray, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
         """Normals, positions, camera depth and contact seen through the pixel centres; only what the outputs name."""

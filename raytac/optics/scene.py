@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid
 from raytac.optics import led as led_plugin
+from raytac.optics.ink import inked_albedo
 from raytac.optics.lamp import Lamp
 from raytac.optics.refraction import Slab
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
@@ -24,12 +25,14 @@ than a pixel on the pad, so the scene is built in millimetres."""
 __all__ = ["UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
 
 
-def coat_bsdf(coat: CoatSpec) -> dict[str, Any]:
+def coat_bsdf(coat: CoatSpec, *, dotted: bool = False) -> dict[str, Any]:
     """Mitsuba's dictionary of the coat: a Lambertian base blended with a rough conductor of full reflectance.
 
-    The blend gives f = (1 − s) ρ / π + s · D G / (4 cos θ_i cos θ_o), the same f that the fast integrator evaluates.
+    The blend gives f = (1 − s) ρ / π + s · D G / (4 cos θ_i cos θ_o), the same f that the fast integrator evaluates. With ``dotted``, ρ
+    is the mesh's attribute ``vertex_albedo``.
     """
-    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(coat.reflectance)}}
+    plain = {"type": "rgb", "value": list(coat.reflectance)}
+    diffuse = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_albedo"} if dotted else plain}
     if coat.specular == 0:
         return diffuse
     mirror = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": coat.roughness}
@@ -57,6 +60,7 @@ class SensorScene:
 
         self.mi, self.dr, self.sensor, self.grid = mi, drjit, sensor, grid
         ny, nx = grid.shape
+        self._dotted = sensor.markers.rows > 0
         x, y = np.meshgrid(grid.x, grid.y)
         self._xy = (UNIT * np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
         scene: dict[str, Any] = {"type": "scene", "coat": self._coat_mesh(grid_faces(nx, ny))}
@@ -81,8 +85,10 @@ class SensorScene:
     def _coat_mesh(self, faces: np.ndarray) -> Any:
         mi = self.mi
         props = mi.Properties()
-        props["bsdf"] = mi.load_dict(coat_bsdf(self.sensor.coat))
+        props["bsdf"] = mi.load_dict(coat_bsdf(self.sensor.coat, dotted=self._dotted))
         mesh = mi.Mesh("coat", len(self._xy), len(faces), has_vertex_normals=True, props=props)
+        if self._dotted:
+            mesh.add_attribute("vertex_albedo", 3, self._albedo(None))
         params = mi.traverse(mesh)
         vertices = self._vertices(self.grid.rest)
         params["vertex_positions"] = mi.Float(vertices)
@@ -137,9 +143,19 @@ class SensorScene:
         z = UNIT * np.asarray(height, dtype=np.float32).reshape(-1, 1)
         return np.concatenate([self._xy, z], axis=1).ravel().astype(np.float32)
 
-    def set_surface(self, height: np.ndarray) -> None:
-        """Move the coat's nodes to ``height`` (Ny, Nx) [m]; Mitsuba rebuilds its normals and acceleration structure."""
+    def _albedo(self, ink: np.ndarray | None) -> np.ndarray:
+        """Diffuse albedo of every node and channel, flat, under ``ink`` (Ny, Nx)."""
+        share = np.zeros(self.grid.shape, np.float32) if ink is None else ink
+        return np.stack(inked_albedo(self.sensor, share), axis=-1).astype(np.float32).ravel()
+
+    def set_surface(self, height: np.ndarray, ink: np.ndarray | None = None) -> None:
+        """Move the coat's nodes to ``height`` (Ny, Nx) [m]; Mitsuba rebuilds its normals and acceleration structure.
+
+        ``ink`` (Ny, Nx): share of marker dots at each node; a sensor without markers has none.
+        """
         self.params["coat.vertex_positions"] = self.mi.Float(self._vertices(height))
+        if self._dotted:
+            self.params["coat.vertex_albedo"] = self.mi.Float(self._albedo(ink))
         self.params.update()
 
     def height_at(self, x: Any, y: Any) -> Any:

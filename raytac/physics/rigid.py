@@ -7,53 +7,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from raytac.errors import InputError, MeshError, SpecError
+from raytac.errors import InputError, SpecError
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
-from raytac.gel.part import Part
 from raytac.gel.surface import GelSurface
+from raytac.physics.contact_state import ContactState
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
-from raytac.physics.objects import object_parts
+from raytac.physics.press_plan import (
+    CLEARANCE,
+    about_z,
+    check_trajectory,
+    peak_state,
+    per_environment,
+    rotation_matrix,
+    scene_parts,
+)
 from raytac.physics.rig import PressRig
-from raytac.specs.press import MOVES, PressScene
-from raytac.specs.press_file import STAGE_SCHEMA
+from raytac.specs.press import PressScene
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CLEARANCE", "ContactState", "RigidPad"]
-
-CLEARANCE = 1e-3
-"""Height above first touch [m] at which an object waits before the press and after a release."""
-
-
-@dataclass(frozen=True)
-class ContactState:
-    """B environments at one instant. Forces are those of the object on the gel, pad frame.
-
-    pad_from_object, shape (B, 4, 4): pose of the object. world_from_pad, shape (B, 4, 4): pose of the case; the identity unless the
-    scene moves it (world and pad frame are one at first touch). depth [m], (B,): travel below first touch at zero shear and twist;
-    negative when lifted. normal_force [N], (B,): towards −z, >= 0. shear_force [N], (B, 2): along x and y. twist_torque [N m],
-    (B,): about +z. force_law_area [m²], (B,): area of contact by the load law, which the forces follow. failed, (B,) bool: the
-    state of this environment is not finite or did not settle (its pose is then NaN).
-    """
-
-    stage: int
-    """Index in the trajectory; −1 before the first stage."""
-    kind: str
-    """Kind of that stage, or ``start``."""
-    fraction: float
-    """How much of the stage is done, in (0, 1]."""
-    pad_from_object: np.ndarray
-    world_from_pad: np.ndarray
-    depth: np.ndarray
-    normal_force: np.ndarray
-    shear_force: np.ndarray
-    twist_torque: np.ndarray
-    force_law_area: np.ndarray
-    failed: np.ndarray
-    scene: PressScene | None = None
-    """Scene that the object belongs to; None if it is not known."""
 
 
 @dataclass
@@ -114,13 +89,13 @@ class RigidPad:
         if num_envs < 1:
             raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
         self.grid = make_grid(sensor.gelpad, pitch)
-        self.parts = self._object_parts()
+        self.parts = scene_parts(scene)
         self._surround = ElasticSurround(self.grid)
-        self._offsets = _per_environment("offsets", offsets, (num_envs, 2))
-        self._depths = None if depths is None else _per_environment("depths", depths, (num_envs,))
-        self._rotation = _rotation(scene.object.quaternion)
+        self._offsets = per_environment("offsets", offsets, (num_envs, 2))
+        self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
+        self._rotation = rotation_matrix(scene.object.quaternion)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
-        self._check_trajectory()
+        check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
 
     def run(self, steps_per_stage: int = 1) -> Iterator[ContactState]:
         """States along the trajectory: one before it (lifted by ``CLEARANCE``), then ``steps_per_stage`` through each stage.
@@ -148,10 +123,7 @@ class RigidPad:
 
     def peak(self, states: Iterable[ContactState]) -> ContactState:
         """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
-        for state in states:
-            if state.stage == self.scene.peak_stage and state.fraction == 1.0:
-                return state
-        raise InputError("states", value=self.scene.peak_stage, rule="hold no state at the end of the scene's peak stage")
+        return peak_state(self.scene, states)
 
     def surface(self, state: ContactState) -> GelSurface:
         """Gel surface at a state."""
@@ -165,44 +137,6 @@ class RigidPad:
         highest = float(self.grid.rest.max())
         height = object_height(self.parts, pad_from_object, self.grid.x, self.grid.y, below=highest)
         return self._surround.surface(height, pad_from_object if self.parts else None)
-
-    def _object_parts(self) -> tuple[Part, ...]:
-        try:
-            return object_parts(self.scene.object)
-        except MeshError:  # names its own file
-            raise
-        except SpecError as error:
-            raise SpecError(
-                error.rule, file=self.scene.source, key=error.key, value=error.value, choices=error.choices
-            ) from error
-
-    def _check_trajectory(self) -> None:
-        if self.scene.moves not in MOVES:
-            raise SpecError("must be a known side", file=self.scene.source, key="moves", value=self.scene.moves, choices=MOVES)
-        thickness = self.sensor.gelpad.thickness
-        within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
-        if self.scene.trajectory and not self.parts:
-            rule = "a scene without object must have no trajectory"
-            raise SpecError(rule, file=self.scene.source, key="object.kind", value=self.scene.object.kind)
-        for index, stage in enumerate(self.scene.trajectory):
-            key = f"trajectory[{index}]"
-            if stage.kind not in STAGE_SCHEMA:
-                choices = tuple(STAGE_SCHEMA)
-                raise SpecError("unknown stage", file=self.scene.source, key=f"{key}.kind", value=stage.kind, choices=choices)
-            if stage.kind != "indent":
-                continue
-            if (stage.depth is None) == (stage.force is None):
-                raise SpecError(
-                    "needs exactly one of depth and force", file=self.scene.source, key=key, value=(stage.depth, stage.force)
-                )
-            if stage.depth is not None and not 0.0 < stage.depth < thickness:
-                raise SpecError(within, file=self.scene.source, key=f"{key}.depth_mm", value=stage.depth * 1e3)
-            if stage.force is not None and not 0.0 < stage.force < np.inf:
-                raise SpecError("must be finite and > 0 [N]", file=self.scene.source, key=f"{key}.force_n", value=stage.force)
-        if self._depths is not None:
-            bad = self._depths[np.isfinite(self._depths) & ~((self._depths > 0.0) & (self._depths < thickness))]
-            if len(bad):
-                raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
 
     def _start(self, b: int) -> _Environment:
         x, y = np.asarray(self.scene.object.position[:2]) + self._offsets[b]
@@ -237,7 +171,7 @@ class RigidPad:
     def _touch(self, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
         """First-touch height of the object's origin and load law at a place and angle; kept, since environments share them."""
         pose = np.eye(4)
-        pose[:3, :3] = _about_z(twist) @ self._rotation
+        pose[:3, :3] = about_z(twist) @ self._rotation
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
@@ -326,30 +260,3 @@ class RigidPad:
                 for array in (pose, case, depth, force, shear, torque, area):
                     array[b] = np.nan
         return ContactState(stage, kind, fraction, pose, case, depth, force, shear, torque, area, failed, self.scene)
-
-
-def _per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.zeros(shape) if values is None else np.asarray(values, float)
-    if array.shape != shape:
-        raise InputError(name, value=array.shape, rule=f"must have shape {shape}")
-    return array
-
-
-def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
-    """Rotation matrix (3, 3) of a quaternion wxyz of any length > 0."""
-    q = np.asarray(quaternion, float)
-    if not np.isfinite(q).all() or np.linalg.norm(q) == 0.0:
-        raise SpecError("must be four finite numbers, not all 0", key="object.quaternion_wxyz", value=quaternion)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
-
-
-def _about_z(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from raytac.specs.files import available
+from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.press_file import load_press, validate_press
@@ -28,6 +29,7 @@ __all__ = [
     "GelpadSpec",
     "LedSpec",
     "LightsSpec",
+    "MarkerMotionSpec",
     "MarkerSpec",
     "ObjectSpec",
     "PressScene",
@@ -37,6 +39,7 @@ __all__ = [
     "StageSpec",
     "available",
     "load_lights",
+    "load_marker_motion",
     "load_mesh",
     "load_press",
     "load_sensor",

@@ -7,10 +7,16 @@ from pathlib import Path
 
 from raytac.specs.sensor import Vec3
 
-__all__ = ["MOVES", "ObjectSpec", "PressScene", "StageSpec"]
+__all__ = ["DYNAMICS", "MOVES", "PADS", "PHYSICS", "ObjectSpec", "PressScene", "StageSpec"]
 
 MOVES = ("object", "case")
 """What a press can move; the other side stands still."""
+PHYSICS = ("rigid", "ipc")
+"""How a gel can deform: by geometry and Gaussians, or simulated."""
+PADS = ("coarse", "medium", "fine")
+"""How finely a simulated pad can be cut."""
+DYNAMICS = ("kinematic", "affine", "soft")
+"""What an object can be to a simulated pad: driven and rigid, free and near-rigid, or driven and soft."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,12 @@ class ObjectSpec:
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
     """Mass on the drive [kg]; matters only for the way to a force, not for where it settles."""
+    dynamics: str = "kinematic"
+    """One of ``DYNAMICS``; the rigid pad takes every object as rigid and driven."""
+    youngs_modulus: float = 1e6
+    """Of a soft object [Pa]."""
+    poisson_ratio: float = 0.4
+    """Of a soft object."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,10 @@ class PressScene:
     moves: str = "object"
     """Which side the trajectory moves, one of ``MOVES``. Targets are the object's against the pad either way."""
     source: Path | None = None
+    physics: str | None = None
+    """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""
+    pad: str | None = None
+    """One of ``PADS``; None leaves it to whoever presses."""
 
     @property
     def peak_stage(self) -> int:

@@ -10,7 +10,7 @@ from typing import Any, Final
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import find_file, is_file
 from raytac.specs.mesh import load_mesh
-from raytac.specs.press import MOVES, ObjectSpec, PressScene, StageSpec
+from raytac.specs.press import DYNAMICS, MOVES, PADS, PHYSICS, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
 
@@ -38,13 +38,20 @@ OBJECT_SCHEMA: Final[dict[str, Schema]] = {
 }
 """Kind of object to the keys of its own in ``[object]``."""
 
-SCENE_SCHEMA: Final[Schema] = {"moves": Text(choices=MOVES, default="object")}
+SCENE_SCHEMA: Final[Schema] = {
+    "moves": Text(choices=MOVES, default="object"),
+    "physics": Text(choices=PHYSICS, default=None),
+    "pad": Text(choices=PADS, default=None),
+}
 """Keys at the top of a scene."""
 
 POSE_SCHEMA: Final[Schema] = {
     "position_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
     "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
     "mass_kg": Number("[0.0001, 100]", default=0.1),
+    "dynamics": Text(choices=DYNAMICS, default="kinematic"),
+    "youngs_modulus_kpa": Number("[1, 100000]", default=None),
+    "poisson_ratio": Number("[0, 0.49]", default=None),
 }
 """Keys of ``[object]`` that every kind but ``none`` has."""
 
@@ -76,16 +83,25 @@ def load_press(name_or_path: str | Path) -> PressScene:
     """
     path = find_file("press scene", name_or_path)
     top = read_toml(path)
-    moves = top.read(SCENE_SCHEMA, sections=("object", "trajectory"))["moves"]
+    scene = top.read(SCENE_SCHEMA, sections=("object", "trajectory"))
     target = _read_object(top.section("object"))
     stages = top.sections("trajectory")
     if target.kind == "none" and "moves" in top.data:
-        raise top.error("must be absent where there is no object", "moves", moves)
+        raise top.error("must be absent where there is no object", "moves", scene["moves"])
+    if scene["pad"] is not None and scene["physics"] != "ipc":
+        raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", scene["pad"])
     if target.kind == "none" and stages:
         raise top.error("must be absent where there is no object", "trajectory")
     if target.kind != "none" and not stages:
         raise top.error("at least one [[trajectory]] stage is needed to press the object", "trajectory")
-    return PressScene(path.stem, target, _read_trajectory(stages), moves, source=path)
+    trajectory = _read_trajectory(stages)
+    free = target.dynamics == "affine" and [
+        s.kind for s in trajectory if s.kind not in ("indent", "release") or s.depth is not None
+    ]
+    if free:
+        rule = "a free body (affine) can only be laid on the pad by its weight: indent with force_n, and release"
+        raise top.section("object").error(rule, "dynamics", target.dynamics)
+    return PressScene(path.stem, target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
 
 
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
@@ -121,7 +137,12 @@ def _read_object(table: Table) -> ObjectSpec:
     if kind == "none":
         return ObjectSpec(kind, {}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0)
     x, y = values.pop("position")
-    quaternion, mass = values.pop("quaternion"), values.pop("mass")
+    quaternion, mass, dynamics = values.pop("quaternion"), values.pop("mass"), values.pop("dynamics")
+    elastic = {name: values.pop(name) for name in ("youngs_modulus", "poisson_ratio")}
+    elastic = {name: value for name, value in elastic.items() if value is not None}
+    if elastic and dynamics != "soft":
+        key = "youngs_modulus_kpa" if "youngs_modulus" in elastic else "poisson_ratio"
+        raise table.error('is the material of a soft object, so dynamics must be "soft"', key, table.data[key])
     length = math.hypot(*quaternion)
     if abs(length - 1) > 0.01:
         rule = f"must be a unit quaternion w, x, y, z (to 1 %, then normalised); its length is {length:.4g}"
@@ -134,7 +155,7 @@ def _read_object(table: Table) -> ObjectSpec:
         _check_mesh(table, values)
     elif kind == "mjcf" and not is_file(Path(values["path"])):
         raise table.error(f"the model file does not exist ({values['path']})", "path", table.data["path"])
-    return ObjectSpec(kind, values, (x, y, 0.0), (w, i, j, k), mass)
+    return ObjectSpec(kind, values, (x, y, 0.0), (w, i, j, k), mass, dynamics, **elastic)
 
 
 def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:

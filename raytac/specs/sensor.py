@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from raytac.specs.marker_motion import MarkerMotionSpec
+
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
 __all__ = [
+    "BONDED",
     "CameraSpec",
     "CaseSpec",
     "CoatSpec",
@@ -26,6 +29,9 @@ __all__ = [
     "ResponseSpec",
     "SensorSpec",
 ]
+
+BONDED = ("back", "back_and_sides")
+"""Faces of a gelpad that the case can hold."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,8 @@ class GelpadSpec:
     """Mass density ρ [kg/m³]."""
     friction: float
     """Coulomb friction coefficient μ against the object."""
+    bonded: str = "back"
+    """What the case holds, one of ``BONDED``; only the soft pad knows it."""
 
     def sag(self, x: Any, y: Any) -> Any:
         """How far the surface at rest lies below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays that broadcast.
@@ -123,7 +131,9 @@ class MarkerSpec:
     """A regular grid of dots printed on the coat; rows = columns = 0 means none."""
 
     rows: int
+    """Number of dots along y."""
     columns: int
+    """Number of dots along x."""
     pitch: Vec2
     """Spacing along x (columns) and y (rows) [m]."""
     offset: Vec2
@@ -198,5 +208,7 @@ class SensorSpec:
     markers: MarkerSpec
     refraction: RefractionSpec
     lights: LightsSpec
+    marker_motion: MarkerMotionSpec | None = None
+    """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
     source: Path | None = None
     """File that it was read from."""

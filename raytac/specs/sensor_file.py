@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from raytac.specs.files import find_file
+from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.sensor import (
+    BONDED,
     CameraSpec,
     CaseSpec,
     CoatSpec,
@@ -28,7 +30,7 @@ __all__ = ["LED_SCHEMA", "SENSOR_SCHEMA", "load_lights", "load_sensor", "with_li
 _NAME = Text(pattern=r"[a-z][a-z0-9_]*", described="a name of lower-case letters, digits and underscores")
 
 SENSOR_SCHEMA: Final[dict[str, Schema]] = {
-    "": {"lights": Text()},
+    "": {"lights": Text(), "base": Text(default=""), "marker_motion": Text(default="")},
     "gelpad": {
         "size_mm": Number("[2, 200]", length=2),
         "thickness_mm": Number("[0.2, 50]"),
@@ -37,6 +39,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "poisson_ratio": Number("[0, 0.5)"),
         "density_kg_m3": Number("[100, 10000]"),
         "friction": Number("[0, 10]"),
+        "bonded": Text(choices=BONDED, default="back"),
     },
     "coat": {
         "reflectance": Number("[0, 1]", length=3),
@@ -77,6 +80,16 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
 }
 """Table (``""``: the top of the file) to its keys."""
 
+_PARTS: Final = {
+    "gelpad": GelpadSpec,
+    "coat": CoatSpec,
+    "case": CaseSpec,
+    "camera": CameraSpec,
+    "response": ResponseSpec,
+    "markers": MarkerSpec,
+    "refraction": RefractionSpec,
+}
+
 LED_SCHEMA: Final[Schema] = {
     "name": _NAME,
     "layer": _NAME,
@@ -102,23 +115,31 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, or a sensor that cannot
             work (see ``validate_sensor``).
     """
-    path = find_file("sensor", name_or_path)
+    return _read_sensor(find_file("sensor", name_or_path), may_have_base=True)
+
+
+def _read_sensor(path: Path, *, may_have_base: bool) -> SensorSpec:
+    """A sensor file; with ``base``, that sensor with every table and file that this one gives in place of its own."""
     top = read_toml(path)
     parts = {name: schema for name, schema in SENSOR_SCHEMA.items() if name}
-    lights = top.read(SENSOR_SCHEMA[""], sections=tuple(parts))["lights"]
-    values = {name: top.section(name).read(schema) for name, schema in parts.items()}
-    sensor = SensorSpec(
-        name=path.stem,
-        gelpad=GelpadSpec(**values["gelpad"]),
-        coat=CoatSpec(**values["coat"]),
-        case=CaseSpec(**values["case"]),
-        camera=CameraSpec(**values["camera"]),
-        response=ResponseSpec(**values["response"]),
-        markers=MarkerSpec(**values["markers"]),
-        refraction=RefractionSpec(**values["refraction"]),
-        lights=_read_lights(find_file("lights", lights, base=path.parent)),
-        source=path,
-    )
+    base = None
+    if "base" in top.data:
+        if not may_have_base:
+            raise top.error("must be a sensor that has no base itself", "base", top.data["base"])
+        named = top.read_one("base", SENSOR_SCHEMA[""]["base"])
+        base = _read_sensor(find_file("sensor", named, base=path.parent), may_have_base=False)
+    schema = dict(SENSOR_SCHEMA[""])
+    if base is not None:
+        schema["lights"] = Text(default="")
+    head = top.read(schema, sections=tuple(parts))
+    given = [name for name in parts if base is None or name in top.data]
+    changes: dict[str, Any] = {name: _PARTS[name](**top.section(name).read(parts[name])) for name in given}
+    if head["lights"]:
+        changes["lights"] = _read_lights(find_file("lights", head["lights"], base=path.parent))
+    if head["marker_motion"]:
+        changes["marker_motion"] = load_marker_motion(head["marker_motion"], base=path.parent)
+    changes |= {"name": path.stem, "source": path}
+    sensor = SensorSpec(**changes) if base is None else replace(base, **changes)
     validate_sensor(sensor)
     return sensor
 

@@ -24,12 +24,15 @@ REQUIRED: Final = object()
 
 _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "m_per_unit": (1.0, 1.0, "m per file unit"),
+    "per_mm2": (1e6, 1.0, "1/mm²"),
+    "per_mm3": (1e9, 1.0, "1/mm³"),
     "w_per_sr": (1.0, 1.0, "W/sr"),
     "kg_m3": (1.0, 1.0, "kg/m³"),
     "wxyz": (1.0, 1.0, ""),
     "kpa": (1000.0, 1.0, "kPa"),
     "deg": (math.pi, 180.0, "°"),
     "mm": (1.0, 1000.0, "mm"),
+    "um": (1.0, 1e6, "µm"),
     "px": (1.0, 1.0, "px"),
     "kg": (1.0, 1.0, "kg"),
     "n": (1.0, 1.0, "N"),

@@ -39,9 +39,9 @@ def test_press_balances_forces_and_stays_apart() -> None:
     mesh = collision_mesh(world)
     reports = []
     for _ in range(8):
-        before = world._solver.x.numpy()[0].copy()
+        before = world._potential.x.numpy()[0].copy()
         reports += press(world, 0.1e-3, 1)
-        after = np.asfortranarray(world._solver.x.numpy()[0])
+        after = np.asfortranarray(world._potential.x.numpy()[0])
         assert not ipctk.has_intersections(mesh, after)
         assert np.abs(after - before).max() > 0
     for r in reports:
@@ -80,10 +80,14 @@ def test_bonded_vertices_do_not_move_and_follow_their_frame() -> None:
 
 
 def test_a_pad_moved_onto_a_ball_is_a_ball_moved_into_a_pad() -> None:
-    """At rest only the relative pose counts: solving in the moving frame costs nothing."""
+    """At rest only the relative pose counts: solving in the moving frame costs nothing.
+
+    Off centre: right above a vertex and without friction the symmetric state is unstable, and rounding chooses the side.
+    """
     results = []
     for mover in ("ball", "pad"):
         world = make_world(velocity_tolerance=1e-7)
+        world.teleport("ball", (4e-4, 3e-4, RADIUS + GAP))
         start = world.frame(mover)[1][0]
         for k in range(6):
             world.set_target(mover, start + np.array([0, 0, (1 if mover == "pad" else -1) * 1e-4 * (k + 1)]))
@@ -104,7 +108,7 @@ def test_batch_equals_singles() -> None:
         single = make_world(friction=0.5)
         press(single, depth, 5, side=2e-4)
         difference = np.abs(single.positions("pad")[0] - batch.positions("pad")[i]).max()
-        assert difference <= 1e-12, f"environment {i} is off by {difference:.3g} m"
+        assert difference == 0.0, f"environment {i} is off by {difference:.3g} m"
 
 
 def test_reset_in_contact_is_a_fresh_start() -> None:

@@ -1,0 +1,63 @@
+"""The coat as a triangle mesh that moves with the gel: what a simulated pad knows of its skin besides the height."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError
+
+__all__ = ["CoatMesh", "DeformedCoat"]
+
+
+@dataclass(frozen=True, repr=False)
+class CoatMesh:
+    """The outer face of a pad at rest, pad frame.
+
+    The vertices are the crossings of grid lines, row by row: vertex (j, i) of ny rows and nx columns has number j·nx + i and lies at
+    x = ``lines_x[i]``, y = ``lines_y[j]``. Grid lines need not be evenly spaced.
+    """
+
+    rest: np.ndarray
+    """Vertices [m], shape (V, 3), float64, z the height of the surface at rest."""
+    faces: np.ndarray
+    """Vertex numbers, shape (F, 3), int32, counter-clockwise seen from +z (from the object); they cover the face without overlap."""
+    lines_x: np.ndarray
+    """x of the columns [m], shape (nx,), ascending, from edge to edge of the pad."""
+    lines_y: np.ndarray
+    """y of the rows [m], shape (ny,), likewise."""
+
+    def __post_init__(self) -> None:
+        if self.rest.shape != (len(self.lines_x) * len(self.lines_y), 3):
+            rule = f"must have shape (V, 3) with V = {len(self.lines_y)} rows x {len(self.lines_x)} columns"
+            raise InputError("rest", value=self.rest.shape, rule=rule)
+
+    def __repr__(self) -> str:
+        return f"CoatMesh({len(self.lines_y)} x {len(self.lines_x)} vertices, {len(self.faces)} faces)"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of vertices (ny, nx)."""
+        return len(self.lines_y), len(self.lines_x)
+
+
+@dataclass(frozen=True, repr=False)
+class DeformedCoat:
+    """The coat of B pads at one instant; ``GelSurface.coat`` holds it wherever the physics simulates the gel, None elsewhere."""
+
+    mesh: CoatMesh
+    positions: np.ndarray
+    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (the barrier's stand-off is taken out)."""
+
+    def __post_init__(self) -> None:
+        if self.positions.ndim != 3 or self.positions.shape[1:] != self.mesh.rest.shape:
+            raise InputError("positions", value=self.positions.shape, rule=f"must have shape (B, {len(self.mesh.rest)}, 3)")
+
+    def __repr__(self) -> str:
+        return f"DeformedCoat({self.mesh!r}, batch {len(self.positions)})"
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Way of every vertex from rest [m], shape (B, V, 3)."""
+        return self.positions - self.mesh.rest[None]

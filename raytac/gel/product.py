@@ -1,0 +1,32 @@
+"""Products of small matrices on the calling thread."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["product", "sandwich"]
+
+_ONE_THREAD = 250_000
+"""Multiply-adds in one product. OpenBLAS wakes its threads above 262,144, which for work so small costs more than it saves, and
+far more on a busy machine; below it, the result does not depend on the number of threads either."""
+
+
+def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """a @ b, float32, in pieces along the longer free side small enough to stay on the calling thread."""
+    rows, inner = a.shape
+    columns = b.shape[1]
+    out = np.empty((rows, columns), np.float32) if out is None else out
+    if rows >= columns:
+        step = max(_ONE_THREAD // (inner * columns), 1)
+        for start in range(0, rows, step):
+            out[start : start + step] = a[start : start + step] @ b
+    else:
+        step = max(_ONE_THREAD // (inner * rows), 1)
+        for start in range(0, columns, step):
+            out[:, start : start + step] = a @ b[:, start : start + step]
+    return out
+
+
+def sandwich(rows: np.ndarray, core: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """rows @ core @ columns, float32."""
+    return product(product(rows, core.astype(np.float32)), columns)

@@ -1,0 +1,140 @@
+"""The clearance that a barrier keeps between object and coat, and how it is taken out of what is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.gel.coat_surface import CoatPlaces, CoatSurface
+from raytac.gel.product import sandwich
+from raytac.gel.spline import hat_matrix
+
+__all__ = ["ContactFit", "StandOff"]
+
+_ROUNDS = 3
+"""Passes of the local correction; each leaves about a fifth of what the one before left."""
+_COVERED = 0.5
+"""Share of a vertex's surroundings that must be in contact for the whole local correction; with less, it fades to none."""
+_SAG = 3.0
+"""Allowance for a facet's sag on a convex object, in units of how far the object lies below its own mean over a cell: for curvature κ
+that is κ cell²/6, and a vertex was seen to lie up to 0.35 κ cell² below the facets around it (ball of 3.2 mm on cells of 1 mm)."""
+_SLACK = 1.0 / 64.0
+"""Further allowance, as a share of the cell."""
+_FADING, _OPEN = 4.0, 12.0
+"""Gaps, in units of d̂, from which on their closing fades, and of which nothing is closed."""
+_TOUCHING = 0.3
+"""Gap, in units of d̂, up to which a place counts as touching: 0.02 of it are left."""
+_CUT = 0.5e-3
+"""Height above the object's lowest point [m] up to which its underside counts in that mean; beyond the object it counts as so high."""
+
+
+@dataclass(frozen=True)
+class ContactFit:
+    """How one coat lies against its object."""
+
+    clearance: float
+    """Mean clearance, weighted by pressure [m]: the object has to be brought down by so much to touch. NaN out of contact."""
+    shift: np.ndarray
+    """What the coat's vertices are then moved up by [m], shape (V,)."""
+
+
+class StandOff:
+    """Takes the barrier's clearance out of a contact, one pad at a time.
+
+    The barrier holds the coat's facets a little off the object, and where the coat wraps a curved object its vertices lie deeper than
+    its facets. Both are artefacts of the discretisation: a real coat touches. Let c = underside of the object − smooth coat.
+
+    1. *Mean* (``fit``): over samples that bear pressure and where c is no more than barrier and sag explain (more is a recess of the
+       object; and facets sag only where the object is convex, so lower than its own mean over a cell), the clearance of the press is the
+       mean of c weighted by pressure. The object is taken to be that much lower than the solver has it, and a press to a depth drives
+       it that much higher: the coat, not the barrier's shell, is at the commanded depth.
+    2. *Vertices* (``fit``): each vertex in contact moves by the mean of what is left of c around it, in three passes, fading out at
+       the rim. Vertices out of contact stay where the solver put them.
+    3. *Nodes* (``close``): what is left of small gaps is closed, g → g³/(1 + g²) with g = c/d̂ (and 0 for g < 0, where the smooth coat
+       reaches into the object). In contact the coat so takes the object's own shape, as a coat without facets would; no node moves
+       by more than d̂/2 that the object does not push. All the rest of the surface is the solver's.
+    """
+
+    def __init__(self, surface: CoatSurface, rest: np.ndarray, x: np.ndarray, y: np.ndarray, d_hat: float) -> None:
+        """Samples at ``x`` (Nx,) and ``y`` (Ny,) [m], where the coat at rest has the height ``rest`` (Ny, Nx) [m]."""
+        self.x, self.y, self.rest = x, y, rest
+        self._surface, self._d_hat = surface, d_hat
+        self._rows, self._columns = (m.astype(np.float32) for m in surface.matrices(x, y))
+        mesh = surface.mesh
+        self._hat_y, self._hat_x = (
+            hat_matrix(lines, t).astype(np.float32) for lines, t in ((mesh.lines_y, y), (mesh.lines_x, x))
+        )
+        self._everywhere = np.outer(self._hat_y.sum(axis=0), self._hat_x.sum(axis=0))
+        cell_x, cell_y = (_cell_length(lines, t) for lines, t in ((mesh.lines_x, x), (mesh.lines_y, y)))
+        self._reach = d_hat + _SLACK * np.maximum(cell_y[:, None], cell_x[None, :])
+
+    def heights(self, rise: np.ndarray) -> np.ndarray:
+        """Coat over the samples [m], (Ny, Nx), from the lattice of ``CoatSurface.rise``."""
+        return self.rest + sandwich(self._rows, rise, self._columns)
+
+    def fit(self, places: CoatPlaces, upwards: np.ndarray, pressure: np.ndarray, underside: np.ndarray) -> ContactFit:
+        """Clearance and local shifts of one pad.
+
+        Args:
+            places: material points of the coat (see ``CoatSurface.places``).
+            upwards: displacement of its vertices along z [m], shape (V,).
+            pressure: on its vertices [Pa], shape (V,), 0 out of contact.
+            underside: z of the object over the samples [m], shape (Ny, Nx), not finite where it is not.
+        """
+        shape = self._surface.mesh.shape
+        borne = sandwich(self._hat_y, np.maximum(pressure, 0.0).reshape(shape), self._hat_x.T)
+        shift = np.zeros(len(upwards))
+        there = np.isfinite(underside)
+        gap = np.where(there, underside, 0.0) - self.heights(self._surface.rise(places, upwards))
+        near = there & (borne > 0.0) & (gap < self._reach + _SAG * self._bulge(underside, there))
+        weight = np.where(near, borne, 0.0)
+        if not weight.sum() > 0.0:
+            return ContactFit(float("nan"), shift)
+        clearance = float((weight * gap).sum() / weight.sum())
+        gap = gap - clearance
+        for again in range(_ROUNDS):
+            if again:
+                moved = self._surface.rise(places, upwards + shift)
+                gap = np.where(there, underside, 0.0) - clearance - self.heights(moved)
+            counted = (near | (there & (gap < 0.0))).astype(np.float32)
+            share = sandwich(self._hat_y.T, counted, self._hat_x)
+            mean = sandwich(self._hat_y.T, counted * gap, self._hat_x) / np.maximum(share, 1e-6)
+            shift += (np.clip(share / self._everywhere / _COVERED, 0.0, 1.0) * mean).ravel()
+        return ContactFit(clearance, shift)
+
+    def close(self, height: np.ndarray, underside: np.ndarray, borne: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The coat with its last gaps in contact closed, and where it touches; all over one grid, shape (Ny, Nx).
+
+        Args:
+            height: smooth coat [m].
+            underside: z of the object, lowered by the clearance [m]; not finite where it is not.
+            borne: pressure or load, any unit, 0 where there is none; touching needs some.
+        """
+        gap = np.where(np.isfinite(underside), underside, np.inf) - height
+        closed = self._d_hat * _closed(gap / self._d_hat)
+        return (height + closed).astype(np.float32), (borne > 0.0) & (gap <= _TOUCHING * self._d_hat)
+
+    def _bulge(self, underside: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """How far the object lies below its mean over a cell around [m], (Ny, Nx), 0 where it lies above."""
+        highest = underside[there].min() + _CUT
+        cut = np.minimum(np.where(there, underside, highest), highest).astype(np.float32)
+        mean = sandwich(self._hat_y.T, cut, self._hat_x) / self._everywhere
+        return np.maximum(sandwich(self._hat_y, mean, self._hat_x.T) - cut, 0.0)
+
+
+def _closed(gap: np.ndarray) -> np.ndarray:
+    """How much of a gap is closed, both in units of d̂: g / (1 + g²), all of it for g <= 0, none beyond ``_OPEN``.
+
+    What is left, g³/(1 + g²), has a slope between 0 and 9/8 and two continuous derivatives: a passage that is narrower, or steeper, would
+    draw a ring around the contact. At most half of d̂ is closed.
+    """
+    near, far = _FADING, _OPEN
+    t = np.clip((np.minimum(gap, far) - near) / (far - near), 0.0, 1.0)
+    g = np.minimum(gap, far)
+    return np.where(g <= 0.0, g, g / (1.0 + g * g) * (1.0 - t**3 * (10.0 + t * (6.0 * t - 15.0))))
+
+
+def _cell_length(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
+    cell = np.clip(np.searchsorted(lines, t, side="right") - 1, 0, len(lines) - 2)
+    return np.diff(lines)[cell]

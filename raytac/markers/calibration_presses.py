@@ -1,0 +1,121 @@
+"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared or twisted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from raytac.errors import RaytacError
+from raytac.gel.surface import GelSurface
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["FIT", "HELD_OUT", "LOADS", "QUICK_FIT", "QUICK_HELD_OUT", "Press", "PressFrame", "press_frames"]
+
+LOADS = ("normal", "shear", "twist")
+"""Kinds of load that errors are given for."""
+_PITCH = 0.1e-3
+_STEPS = 4
+"""States a stage."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m] or twisted by ``twist`` [rad]."""
+
+    name: str
+    kind: str
+    params: dict[str, float | int | str]
+    place: tuple[float, float]
+    depth: float
+    shear: tuple[float, float] = (0.0, 0.0)
+    twist: float = 0.0
+
+    def scene(self) -> PressScene:
+        target = ObjectSpec(self.kind, self.params, (*self.place, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
+        stages = [StageSpec("indent", depth=self.depth)]
+        if any(self.shear):
+            stages.append(StageSpec("shear", shear=self.shear))
+        if self.twist:
+            stages.append(StageSpec("twist", twist=self.twist))
+        return PressScene(self.name, target, tuple(stages))
+
+    def __str__(self) -> str:
+        sizes = " ".join(
+            f"{key} {1e3 * value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in self.params.items()
+        )
+        text = f"{self.kind} ({sizes}) mm at ({1e3 * self.place[0]:g}, {1e3 * self.place[1]:g}) mm, {1e3 * self.depth:g} mm deep"
+        if any(self.shear):
+            text += f", sheared ({1e3 * self.shear[0]:g}, {1e3 * self.shear[1]:g}) mm"
+        return text + (f", twisted {math.degrees(self.twist):g} deg" if self.twist else "")
+
+
+def _presses(
+    name: str,
+    kind: str,
+    params: dict[str, float | int | str],
+    place: tuple[float, float],
+    depth: float,
+    shear: tuple[float, float],
+    twist_deg: float,
+) -> tuple[Press, Press]:
+    """An object sheared, and the same twisted."""
+    sheared = Press(f"{name}-shear", kind, params, place, depth, shear=shear)
+    return sheared, Press(f"{name}-twist", kind, params, place, 0.8 * depth, twist=math.radians(twist_deg))
+
+
+FIT = (
+    *_presses("ball4", "sphere", {"radius": 4e-3}, (0.0, 0.0), 1.0e-3, (1.0e-3, 0.0), 30.0),
+    *_presses("ball8", "sphere", {"radius": 8e-3}, (2.0e-3, -1.0e-3), 0.8e-3, (-0.5e-3, 0.7e-3), -25.0),
+    *_presses("punch3", "cylinder", {"radius": 3e-3, "length": 6e-3}, (-1.0e-3, 1.0e-3), 0.7e-3, (0.0, -1.0e-3), 30.0),
+    *_presses("ring", "torus", {"major_radius": 3e-3, "minor_radius": 1e-3}, (1.0e-3, 0.5e-3), 0.8e-3, (0.6e-3, 0.6e-3), 20.0),
+)
+"""Presses that models are fitted to."""
+HELD_OUT = (
+    *_presses("ball6", "sphere", {"radius": 6e-3}, (-2.5e-3, 1.5e-3), 0.9e-3, (0.5e-3, -0.6e-3), 25.0),
+    *_presses("punch2", "cylinder", {"radius": 2e-3, "length": 6e-3}, (3.0e-3, -1.5e-3), 0.8e-3, (-0.8e-3, 0.0), -30.0),
+    *_presses(
+        "cone", "cone", {"radius": 4e-3, "height": 3e-3, "tip_radius": 1.5e-3}, (0.5e-3, -2.0e-3), 0.9e-3, (0.0, 0.8e-3), 20.0
+    ),
+)  # fmt: skip
+"""Presses that no fit sees: other objects, other places, other directions."""
+QUICK_FIT, QUICK_HELD_OUT = FIT[:2], HELD_OUT[:2]
+"""Few presses, to see that all runs."""
+
+
+@dataclass(frozen=True)
+class PressFrame:
+    """One state of a press.
+
+    ``surface`` is what the rigid pad makes of the object at this pose, which is what models of heights are used on, with the ``coat`` of
+    the simulated pad at the same state, which ``surface`` tracking uses.
+    """
+
+    press: Press
+    load: str
+    """One of ``LOADS``; ``start`` before the touch."""
+    surface: GelSurface
+
+
+def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> Iterator[PressFrame]:
+    """Run a press on the simulated pad of level ``pad`` and give its states in order.
+
+    Raises:
+        RaytacError: the press did not settle.
+        SpecError: the press does not fit this sensor.
+    """
+    from raytac.physics.rigid import RigidPad
+    from raytac.physics.soft import SoftPad
+
+    scene = press.scene()
+    soft = SoftPad(sensor, scene, pitch=_PITCH, pad=pad, device=device)
+    rigid = RigidPad(sensor, scene, pitch=_PITCH)
+    for state in soft.run(steps_per_stage=_STEPS):
+        if state.failed.any():
+            raise RaytacError(f"the press {press} did not settle")
+        load = {"indent": "normal", "start": "start"}.get(state.kind, state.kind)
+        by_geometry = rigid.surface_from_pose(np.asarray(state.pad_from_object))
+        yield PressFrame(press, load, replace(by_geometry, coat=soft.surface(state).coat))

@@ -1,0 +1,104 @@
+"""The dots on the coat at rest: where they are, and that the camera sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError, SpecError
+from raytac.gel.pad import rest_height
+from raytac.optics.camera import Pinhole
+from raytac.specs.sensor import MarkerSpec, SensorSpec
+
+__all__ = ["MarkerPattern", "camera_of", "marker_centres"]
+
+
+def marker_centres(spec: MarkerSpec) -> np.ndarray:
+    """x, y of the dots at rest [m], pad frame, shape (M, 2), row by row: dot (j, i) of ``rows`` and ``columns`` is j · columns + i."""
+    x = spec.offset[0] + (np.arange(spec.columns) - 0.5 * (spec.columns - 1)) * spec.pitch[0]
+    y = spec.offset[1] + (np.arange(spec.rows) - 0.5 * (spec.rows - 1)) * spec.pitch[1]
+    return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
+
+
+def camera_of(sensor: SensorSpec, resolution: tuple[int, int] | None = None) -> Pinhole:
+    """The camera that makes the sensor's images, at ``resolution`` (width, height) [px]; None is the sensor's own."""
+    if sensor.refraction.model == "none":
+        return Pinhole.from_spec(sensor.camera, resolution)
+    from raytac.optics.refraction import Slab
+
+    return Pinhole.from_spec(sensor.camera, resolution, Slab.from_spec(sensor))
+
+
+@dataclass(frozen=True)
+class MarkerPattern:
+    """Dots at rest, the same in B environments or shifted in each.
+
+    ``rest`` [m], shape (1 or B, M, 3), pad frame, on the surface at rest; ``pixel`` [px], shape (1 or B, M, 2): where ``camera``
+    shows them. ``radius`` [m]: of a dot.
+    """
+
+    rest: np.ndarray
+    pixel: np.ndarray
+    camera: Pinhole
+    radius: float
+
+    @classmethod
+    def of(
+        cls,
+        sensor: SensorSpec,
+        resolution: tuple[int, int] | None = None,
+        *,
+        shift: np.ndarray | None = None,
+        turn: np.ndarray | None = None,
+    ) -> MarkerPattern:
+        """Place the sensor's dots, moved by ``shift`` (B, 2) [m] and turned by ``turn`` (B,) [rad] about the pad's centre if given.
+
+        Raises:
+            InputError: the sensor has no markers, or a shift takes one off the pad or out of the view.
+            SpecError: a marker at rest lies outside the camera's view; names the sensor's file.
+        """
+        spec, pad = sensor.markers, sensor.gelpad
+        if spec.rows == 0:
+            rule = "has no markers; give it a pattern ([markers] in its file), or take a sensor that has one, such as gelsight_mini_7x9"
+            raise InputError("sensor", value=sensor.name, rule=rule)
+        xy = marker_centres(spec)[None]
+        moved = shift is not None or turn is not None
+        if turn is not None:
+            c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+            xy = np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
+        if shift is not None:
+            xy = xy + np.asarray(shift, float)[:, None, :]
+        if (np.abs(xy) > 0.5 * np.asarray(pad.size)).any():
+            raise InputError(
+                "shift", value=1e3 * float(np.abs(xy).max()), rule="takes a marker off the pad (largest |x|, |y| in mm)"
+            )
+        rest = np.concatenate([xy, rest_height(pad, xy[..., 0], xy[..., 1])[..., None]], axis=-1)
+        camera = camera_of(sensor, resolution)
+        pixel = camera.project(rest)
+        outside = ((pixel < 0) | (pixel > np.asarray(camera.resolution))).any(axis=-1)
+        if outside.any():
+            b, m = np.argwhere(outside)[0]
+            row, column = divmod(int(m), spec.columns)
+            at = tuple(round(float(v), 1) for v in pixel[b, m])
+            width, height = camera.resolution
+            rule = f"marker (row {row}, column {column}) lies outside the view: at pixel {at} of an image of {width} x {height}"
+            if moved:
+                raise InputError("shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its place in mm)")
+            raise SpecError(rule, file=sensor.source, key="markers.pitch_mm", value=[1e3 * p for p in spec.pitch])
+        return cls(rest, pixel, camera, spec.radius)
+
+    @property
+    def count(self) -> int:
+        """Number of dots M."""
+        return self.rest.shape[1]
+
+    def for_batch(self, batch: int) -> np.ndarray:
+        """``rest`` for ``batch`` environments, shape (B, M, 3).
+
+        Raises:
+            InputError: the pattern was shifted for another number of environments.
+        """
+        if len(self.rest) not in (1, batch):
+            raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
+        return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))

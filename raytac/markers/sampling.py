@@ -1,0 +1,61 @@
+"""What a marker finds at its place: height and slope of the surface, and how far the object has moved there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+from raytac.markers.contacts import Contacts
+
+__all__ = ["height_and_slope", "height_at", "object_way"]
+
+
+def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Indices (env, row, column) of the cells' first nodes and the place in the cell along x and y, each (B, M); clipped to the pad."""
+    grid = surface.grid
+    dx, dy = grid.pitch
+    fx = np.clip((xy[..., 0] - grid.x[0]) / dx, 0, len(grid.x) - 1.001)
+    fy = np.clip((xy[..., 1] - grid.y[0]) / dy, 0, len(grid.y) - 1.001)
+    column, row = fx.astype(int), fy.astype(int)
+    return (np.arange(len(xy))[:, None], row, column), fx - column, fy - row
+
+
+def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
+    """z of the surface at points (B, M, 2) [m], bilinear, shape (B, M)."""
+    (env, row, column), wx, wy = _corners(surface, xy)
+    height = surface.height
+    top = (1 - wx) * height[env, row, column] + wx * height[env, row, column + 1]
+    bottom = (1 - wx) * height[env, row + 1, column] + wx * height[env, row + 1, column + 1]
+    return (1 - wy) * top + wy * bottom
+
+
+def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(z [m] (B, M), its gradient along x, y [-] (B, M, 2), whether the object touches the nearest node (B, M)) at points (B, M, 2) [m]."""
+    (env, row, column), wx, wy = _corners(surface, xy)
+    dx, dy = surface.grid.pitch
+    h = surface.height
+    a, b = h[env, row, column], h[env, row, column + 1]
+    c, d = h[env, row + 1, column], h[env, row + 1, column + 1]
+    z = (1 - wy) * ((1 - wx) * a + wx * b) + wy * ((1 - wx) * c + wx * d)
+    along_x = ((1 - wy) * (b - a) + wy * (d - c)) / dx
+    along_y = ((1 - wx) * (c - a) + wx * (d - b)) / dy
+    contact = np.asarray(surface.contact)
+    touched = contact[env, row + (wy > 0.5), column + (wx > 0.5)]
+    return z, np.stack([along_x, along_y], axis=-1), touched
+
+
+def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
+    """Tangential way since first touch [m], (B, M, 2), of the object at points ``xy`` (B, M, 2) [m]; that of the nearest contact.
+
+    Δs + (R(Δθ) − 1)(M − G), as a rigid body moves; 0 in an environment without contact.
+    """
+    out = xy[:, :, None] - contacts.centre[:, None]
+    apart = np.where(contacts.active[:, None], (out**2).sum(axis=-1), np.inf)
+    nearest = apart.argmin(axis=2)
+    rows = np.arange(len(xy))[:, None]
+    out = np.take_along_axis(out, nearest[..., None, None], axis=2)[:, :, 0]
+    angle = contacts.twist[rows, nearest]
+    c, s = np.cos(angle) - 1.0, np.sin(angle)
+    turned = np.stack([c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]], axis=-1)
+    way = contacts.shear[rows, nearest] + turned
+    return np.where(contacts.active.any(axis=1)[:, None, None], way, 0.0)

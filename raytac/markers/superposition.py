@@ -1,0 +1,82 @@
+"""Superposition: the pad's linear response to the loads that hold the contact where the object has put it.
+
+Taxim (Si and Yuan, RA-L 2022, section III-D) adds up displacement fields of unit loads, from a finite-element model, with the weights that
+give the contact its known displacement. Here the fields are those of the soft pad's own tetrahedra at rest (``raytac.markers.compliance``).
+With C the compliance of the coat's vertices and A those in contact:
+
+    C_AA f = u_A,    u = C_·A f,
+
+u_A: down to the object along z, along x and y with the object since first touch (it sticks). A vertex that the object would have to pull
+is let go, and the rest solved again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+from raytac.markers.contacts import Contacts, ContactSamples
+from raytac.markers.sampling import height_and_slope, object_way
+from raytac.markers.surface import bind
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["SuperpositionMarkers"]
+
+_ROUNDS = 8
+"""How often vertices under tension are let go; those that are left then keep it."""
+_LEVEL = "coarse"
+"""Pad whose unit-load fields are used."""
+
+
+class SuperpositionMarkers:
+    """The model ``superposition``; needs the package ``raytac[ipc]`` for the pad's tetrahedra, and no calibration."""
+
+    name = "superposition"
+    needs_contacts = True
+    device = "cpu"
+
+    def __init__(self, sensor: SensorSpec) -> None:
+        from raytac.markers.compliance import cached_compliance
+        from raytac.physics.soft_mesh import pad_mesh
+
+        mesh = pad_mesh(sensor.gelpad, _LEVEL)
+        self.coat = mesh.coat
+        self._compliance = cached_compliance(mesh, sensor.gelpad)
+        self._bound: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def displacement(
+        self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
+    ) -> np.ndarray:
+        """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
+        assert contacts is not None
+        batch = len(rest)
+        places = np.broadcast_to(self.coat.rest[:, :2], (batch, len(self.coat.rest), 2))
+        height, _, touched = height_and_slope(surface, places)
+        way = object_way(contacts, places)
+        wanted = np.concatenate([way, (height - self.coat.rest[:, 2])[..., None]], axis=-1)
+        held = touched & (wanted[..., 2] < 0)
+        moved = np.zeros((batch, len(self.coat.rest), 3))
+        for b in np.flatnonzero(held.any(axis=1)):
+            moved[b] = self._superpose(wanted[b], held[b])
+        vertices, weights = self._bind(rest)
+        env = np.arange(batch)[:, None, None]
+        return (weights[..., None] * moved[env, vertices, :2]).sum(axis=2)
+
+    def _superpose(self, wanted: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Displacement of all vertices (V, 3) that takes the ``held`` ones where ``wanted`` (V, 3) says."""
+        held = held.copy()
+        for _ in range(_ROUNDS):
+            at = np.flatnonzero(held)
+            dof = (3 * at[:, None] + np.arange(3)).ravel()
+            load = np.linalg.solve(self._compliance[np.ix_(dof, dof)].astype(float), wanted[at].ravel())
+            pulled = load.reshape(-1, 3)[:, 2] > 0
+            if not pulled.any() or pulled.all():
+                break
+            held[at[pulled]] = False
+        return (self._compliance[:, dof] @ load).reshape(-1, 3)
+
+    def _bind(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        one = rest[:1] if rest.strides[0] == 0 else rest
+        if self._bound is None or not np.array_equal(self._bound[0], one):
+            self._bound = np.array(one), *bind(self.coat, one[..., :2])
+        return self._bound[1], self._bound[2]

@@ -1,0 +1,202 @@
+"""``MarkerTracker``: surfaces in, marker displacements out, in metres on the pad and in pixels of the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid, summary
+from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker, chosen_envs
+from raytac.markers.pattern import MarkerPattern
+from raytac.markers.perturbation import MarkerPerturbation, Perturber
+from raytac.markers.sampling import height_at
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["MARKER_MODELS", "MarkerFrame", "MarkerModel", "MarkerTracker", "make_model"]
+
+MARKER_MODELS = ("fots", "surface", "superposition", "force_field")
+"""Names that ``markers=`` accepts."""
+
+
+class MarkerModel(Protocol):
+    """One way to move markers."""
+
+    name: str
+    needs_contacts: bool
+    """Whether it reads contact samples and the object's motion."""
+    device: str
+
+    def displacement(
+        self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
+    ) -> np.ndarray:
+        """Displacement [m] of markers at ``rest`` (B, M, 3): along x and y, (B, M, 2), or along x, y and z, (B, M, 3).
+
+        With two components the marker stays on the surface, whose height gives the third.
+        """
+        ...
+
+
+@dataclass(frozen=True, repr=False)
+class MarkerFrame:
+    """Markers of B pads at one instant, M each, row by row of the pattern."""
+
+    displacement: np.ndarray
+    """Along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is not visible or an environment that failed."""
+    displacement_px: np.ndarray
+    """Along u, v of the image [px], shape (B, M, 2), with what perspective adds where the coat moves along z; NaN likewise."""
+    rest: np.ndarray
+    """Places at rest, pad frame [m], shape (B, M, 3)."""
+    rest_px: np.ndarray
+    """Places at rest in the image [px], shape (B, M, 2)."""
+    position: np.ndarray
+    """Places now, pad frame [m], shape (B, M, 3), without noise or losses: where the dots are printed."""
+    visible: np.ndarray
+    """Whether the tracker finds the marker, shape (B, M), bool."""
+
+    def __repr__(self) -> str:
+        return summary(self)
+
+    @property
+    def pixel(self) -> np.ndarray:
+        """Where the markers are found in the image [px], shape (B, M, 2)."""
+        return self.rest_px + self.displacement_px
+
+
+class MarkerTracker:
+    """Moves a sensor's markers with one model.
+
+    .. code-block:: python
+
+        tracker = MarkerTracker(sensor, "fots", grid)
+        for surface in surfaces:
+            markers = tracker.update(surface)
+            markers.displacement_px  # (B, M, 2)
+
+    ``update`` is called for every surface in order: models of pads whose height is all that is known need the object's way since first
+    touch. ``reset`` forgets it.
+    """
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        model: str | MarkerModel,
+        grid: PadGrid,
+        *,
+        num_envs: int = 1,
+        resolution: tuple[int, int] | None = None,
+        device: str = "auto",
+        seed: int = 0,
+        perturbation: MarkerPerturbation | None = None,
+    ) -> None:
+        """Place the pattern and build the model.
+
+        Args:
+            sensor: gives the pattern, the camera and, for fitted models, the marker motion.
+            model: one of ``MARKER_MODELS``, or a model that is built already.
+            grid: of the surfaces to come.
+            num_envs: number of environments B.
+            resolution: (width, height) of the image that pixels are of [px]; None is the sensor's own.
+            device: ``auto``, ``cpu`` or ``cuda``; where ``fots`` computes.
+            seed: of ``perturbation``.
+            perturbation: noise, losses and shifts of the pattern; None is none.
+
+        Raises:
+            InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
+                takes a marker out of the view.
+            SpecError: a marker lies outside the camera's view.
+            BackendError: the model's backend does not work here.
+        """
+        self.sensor, self.grid, self.num_envs = sensor, grid, num_envs
+        self._resolution = resolution
+        self._perturber = Perturber(perturbation or MarkerPerturbation(), seed, num_envs)
+        self._shift, self._turn = np.zeros((num_envs, 2)), np.zeros(num_envs)
+        self._place(range(num_envs))
+        self.model = make_model(model, sensor, grid, device) if isinstance(model, str) else model
+        self._cells = ContactCells.over(grid) if self.model.needs_contacts else None
+        self._contacts = ContactTracker(num_envs)
+
+    def _place(self, envs: range | list[int]) -> None:
+        if not self._perturber.settings.moves_pattern:
+            if not hasattr(self, "pattern"):
+                self.pattern = MarkerPattern.of(self.sensor, self._resolution)
+            return
+        for b in envs:
+            self._shift[b], self._turn[b] = self._perturber.placement(b)
+        self.pattern = MarkerPattern.of(self.sensor, self._resolution, shift=self._shift, turn=self._turn)
+
+    def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
+        """Start environments (a mask (B,), a list, or None for all) anew: no history of contact, a new placement of the pattern.
+
+        Raises:
+            InputError: an environment that does not exist.
+        """
+        which = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        self._contacts.reset(which)
+        self._place(which)
+
+    def update(self, surface: GelSurface) -> MarkerFrame:
+        """Markers on ``surface``; call once for every surface of the motion, in order.
+
+        Raises:
+            InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
+        """
+        if surface.batch != self.num_envs:
+            raise InputError("surface", value=surface.batch, rule=f"must have {self.num_envs} environments, as this tracker")
+        samples, contacts = None, None
+        if self._cells is not None:
+            samples = self._cells.sample(surface)
+            contacts = self._contacts.update(surface, samples)
+        rest = self.pattern.for_batch(self.num_envs)
+        moved = self.model.displacement(rest, surface, samples, contacts)
+        if moved.shape[-1] == 3:
+            position = rest + moved
+        else:
+            # Differences of heights first, so that a marker at rest has moved by exactly nothing.
+            xy = rest[..., :2] + moved
+            still = GelSurface.at_rest(self.grid)
+            before = height_at(still, rest[..., :2].reshape(1, -1, 2)).reshape(rest.shape[:2])
+            z = rest[..., 2] + height_at(surface, xy) - before
+            position = np.concatenate([xy, z[..., None]], axis=-1)
+        return self._frame(rest, position)
+
+    def _frame(self, rest: np.ndarray, position: np.ndarray) -> MarkerFrame:
+        pixel = np.broadcast_to(self.pattern.pixel, (*rest.shape[:2], 2))
+        displacement = position[..., :2] - rest[..., :2]
+        displacement_px = self.pattern.camera.project(position) - pixel
+        noise = self._perturber.noise(self.pattern.count)
+        if noise is not None:
+            displacement_px = displacement_px + noise
+            displacement = displacement + noise * np.asarray(self.sensor.camera.pitch_at(self.pattern.camera.resolution))
+        visible = self._perturber.visible(self.pattern.count)
+        if not visible.all():
+            displacement, displacement_px = (np.where(visible[..., None], d, np.nan) for d in (displacement, displacement_px))
+        return MarkerFrame(displacement, displacement_px, rest, pixel, position, visible)
+
+
+def make_model(name: str, sensor: SensorSpec, grid: PadGrid, device: str = "auto") -> MarkerModel:
+    """The model of that name.
+
+    Raises:
+        InputError: an unknown name, or a sensor without the marker motion that the model needs.
+        BackendError: its backend does not work here.
+    """
+    if name not in MARKER_MODELS:
+        raise InputError("markers", value=name, rule="must be a known marker model", choices=MARKER_MODELS)
+    if name == "fots":
+        from raytac.markers.fots import FotsMarkers
+
+        return FotsMarkers(sensor, grid, device=device)
+    if name == "surface":
+        from raytac.markers.surface import SurfaceMarkers
+
+        return SurfaceMarkers()
+    if name == "superposition":
+        from raytac.markers.superposition import SuperpositionMarkers
+
+        return SuperpositionMarkers(sensor)
+    from raytac.markers.force_field import ForceFieldMarkers
+
+    return ForceFieldMarkers(sensor)

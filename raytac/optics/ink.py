@@ -1,0 +1,68 @@
+"""Dots on the coat in an image: the ink's share at a point of the skin, and what it does to light and to an encoded level."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface
+from raytac.optics.coat import CoatLayout
+from raytac.specs.sensor import SensorSpec
+
+SPECULAR = 0.57
+"""q of ``darkened``. From the reference integrator on the untouched Mini with 7 x 9 dots, 64 samples a pixel: a dot of albedo 0.05 on a
+coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21)."""
+
+__all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
+
+
+def checked_ink(surface: GelSurface) -> np.ndarray | None:
+    """The surface's ink, (B, Ny, Nx) float32; None if it has none.
+
+    Raises:
+        InputError: another shape than the heights', or values outside [0, 1].
+    """
+    if surface.ink is None:
+        return None
+    ink = np.ascontiguousarray(surface.ink, dtype=np.float32)
+    if ink.shape != surface.height.shape:
+        raise InputError("surface.ink", value=ink.shape, rule=f"must have the shape of the heights, {surface.height.shape}")
+    if not (ink.min() >= 0 and ink.max() <= 1):
+        raise InputError("surface.ink", value=(float(ink.min()), float(ink.max())), rule="must be a share in [0, 1]")
+    return ink
+
+
+def ink_at(mi: Any, layout: CoatLayout, ink: Any, env: Any, x: Any, y: Any) -> Any:
+    """Share of ink at the points (x, y) [m] of environments ``env``, bilinear; ``ink`` is (B·Ny·Nx) on the device."""
+    g = layout
+    fx, fy = dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001), dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)
+    ix, iy = mi.UInt32(fx), mi.UInt32(fy)
+    wx, wy, k = fx - mi.Float(ix), fy - mi.Float(iy), (env * g.ny + iy) * g.nx + ix
+    a, b, c, d = (dr.gather(mi.Float, ink, k + offset) for offset in (0, 1, g.nx, g.nx + 1))
+    return dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+
+
+def inked_albedo(sensor: SensorSpec, ink: Any) -> list[Any]:
+    """Diffuse albedo of the three channels where this share is ink; the specular lobe is that of the coat, dots or not."""
+    return [r + (sensor.markers.reflectance - r) * ink for r in sensor.coat.reflectance]
+
+
+def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
+    """Image levels (0-255, three channels) of a plain coat with dots printed on it, for modes that know levels and no light.
+
+    In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
+    coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat.
+    """
+    coat, response = sensor.coat, sensor.response
+    s = coat.specular
+    found = []
+    for c, dotted in enumerate(inked_albedo(sensor, ink)):
+        level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
+        share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
+        linear: Any = dr.power(dr.maximum(level, 0) / 255, response.gamma) - black
+        dark: Any = dr.power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255
+        found.append(dr.select(ink > 0, dark, level))
+    return found

@@ -1,0 +1,189 @@
+"""FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
+
+Zhao, Qian, Duan and Luo, FOTS, RA-L 2024, section III-B, in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
+contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c, G_c being the place at rest of the skin
+under the contact's centre, which is that centre less the drag:
+
+    dilate   Δd_d = g Σ_i a Δh_i (M − C_i) exp(−λ_d ‖M − C_i‖²)
+    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                     e_c = exp(−λ_s ‖M − G_c‖²)
+    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)   e_c = exp(−λ_t ‖M − G_c‖²)
+
+w_c = e_c / max(1, Σ e_c): the published factor for one contact, and no more than one motion in all where contacts are close. a is the area
+of a sample and g the gain [1/m³] that the published sum over pixels hides in its unit of length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.optics.recording import no_collection
+from raytac.optics.variant import load_mitsuba
+
+__all__ = ["FotsConstants", "FotsKernel"]
+
+_NEGLIGIBLE = 16.0
+"""A Gaussian's exponent beyond which it is left out: e⁻¹⁶ is what float32 cannot add to 1."""
+_ROW = 8
+"""Floats a contact: active, G_x, G_y, Δs_x, Δs_y, Δθ and two unused, so that two packet gathers bring one."""
+
+
+@dataclass(frozen=True)
+class FotsConstants:
+    """λ [1/m²], gain [1/m³] and caps ([m], [rad]) of ``raytac.specs.MarkerMotionSpec``."""
+
+    dilate_gain: float
+    dilate_lambda: float
+    shear_lambda: float
+    shear_max: float
+    twist_lambda: float
+    twist_max: float
+
+
+class FotsKernel:
+    """Marker displacements from contact samples and contacts; recorded once for each batch size and number of contacts."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
+        """``x`` (nx,), ``y`` (ny,) [m]: where the contact is sampled, evenly spaced.
+
+        Raises:
+            BackendError: Dr.Jit cannot run on ``device``.
+        """
+        self.mi, self.device = load_mitsuba(device)
+        self.nx, self.ny = len(x), len(y)
+        self._origin = float(x[0]), float(y[0])
+        self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
+        self._frozen: dict[tuple[int, int], Any] = {}
+        self._markers: tuple[np.ndarray, Any] | None = None
+        self._numbers: tuple[FotsConstants, Any] | None = None
+
+    def displacement(
+        self,
+        markers: np.ndarray,
+        depth: np.ndarray,
+        contact: np.ndarray,
+        contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        constants: FotsConstants,
+    ) -> np.ndarray:
+        """Displacement [m] of markers at rest, shape (B, M, 2), float32.
+
+        Args:
+            markers: x, y at rest [m], (B, M, 2).
+            depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
+            contact: (B, ny, nx) bool; bounds the sums.
+            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad]).
+            constants: of the pad.
+        """
+        mi = self.mi
+        batch, count = markers.shape[:2]
+        k = 1 << (contacts[0].shape[1] - 1).bit_length()
+        table = np.zeros((batch, k, _ROW), dtype=np.float32)
+        active, centre, shear, twist = contacts
+        filled = table[:, : active.shape[1]]
+        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5] = active, centre, shear, twist
+        inputs = (
+            self._on_device(markers),
+            mi.Float(np.ascontiguousarray(depth, dtype=np.float32).ravel()),
+            mi.UInt32(_boxes(contact).ravel()),
+            mi.Float(table.ravel()),
+            self._constants(constants),
+        )
+        key = batch, k
+        if key not in self._frozen:
+            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, *arrays))
+        with no_collection():
+            moved = self._frozen[key](*inputs)
+        return np.array(moved).reshape(batch, count, 2)
+
+    def _on_device(self, markers: np.ndarray) -> Any:
+        """Places at rest hardly ever change, so the upload is kept."""
+        if self._markers is None or self._markers[0].shape != markers.shape or not np.array_equal(self._markers[0], markers):
+            self._markers = np.array(markers), self.mi.Float(np.ascontiguousarray(markers, dtype=np.float32).ravel())
+        return self._markers[1]
+
+    def _constants(self, constants: FotsConstants) -> Any:
+        if self._numbers is None or self._numbers[0] != constants:
+            c = constants
+            values = [c.dilate_gain, c.dilate_lambda, c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max]
+            self._numbers = constants, self.mi.Float(np.array(values, dtype=np.float32))
+        return self._numbers[1]
+
+    def _sums(self, batch: int, count: int, k: int, xy: Any, depth: Any, boxes: Any, contacts: Any, constants: Any) -> Any:
+        mi = self.mi
+        i = dr.arange(mi.UInt32, batch * count)
+        env = i // count
+        place = dr.gather(mi.Point2f, xy, i)
+        gain, ld, ls, smax, lt, tmax = (dr.gather(mi.Float, constants, n) for n in range(6))
+        dilate = self._dilate(env, place, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
+        moved = dilate + _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax))
+        return dr.ravel(moved)
+
+    def _dilate(self, env: Any, place: Any, depth: Any, boxes: Any, ld: Any) -> Any:
+        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker."""
+        mi, (x0, y0), (dx, dy) = self.mi, self._origin, self._pitch
+        reach = dr.sqrt(_NEGLIGIBLE / ld)
+        c0, c1, r0, r1 = (mi.Int32(dr.gather(mi.UInt32, boxes, 4 * env + n)) for n in range(4))
+        c0, c1 = (
+            dr.maximum(c0, mi.Int32(dr.ceil((place.x - reach - x0) / dx))),
+            dr.minimum(c1, mi.Int32((place.x + reach - x0) / dx) + 1),
+        )
+        r0, r1 = (
+            dr.maximum(r0, mi.Int32(dr.ceil((place.y - reach - y0) / dy))),
+            dr.minimum(r1, mi.Int32((place.y + reach - y0) / dy) + 1),
+        )
+        first = mi.Int32(env) * (self.nx * self.ny)
+
+        def inside(c: Any, r: Any, sx: Any, sy: Any) -> Any:
+            return (r < r1) & (c0 < c1)
+
+        def add(c: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
+            h = dr.gather(mi.Float, depth, first + r * self.nx + c)
+            ex, ey = place.x - (x0 + mi.Float(c) * dx), place.y - (y0 + mi.Float(r) * dy)
+            w = h * dr.exp(-ld * (ex * ex + ey * ey))
+            wrap = c + 1 >= c1
+            return dr.select(wrap, c0, c + 1), dr.select(wrap, r + 1, r), sx + w * ex, sy + w * ey
+
+        start = (mi.Int32(c0), mi.Int32(r0), mi.Float(0), mi.Float(0))
+        _, _, sx, sy = dr.while_loop(start, inside, add, label="dilate")
+        return mi.Vector2f(sx, sy)
+
+
+def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple[Any, Any, Any, Any]) -> Any:
+    """Shear and twist of all contacts of a marker's pad."""
+    ls, smax, lt, tmax = constants
+
+    def more(n: Any, *sums: Any) -> Any:
+        return n < k
+
+    def add(n: Any, es: Any, shear: Any, et: Any, twist: Any) -> tuple[Any, ...]:
+        a = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n))
+        b = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n) + 1)
+        way = mi.Vector2f(a.w, b.x)
+        way *= dr.minimum(1, smax / dr.maximum(dr.norm(way), 1e-12))
+        out = place - (mi.Point2f(a.y, a.z) - way)
+        r2 = dr.squared_norm(out)
+        ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
+        angle = dr.clip(b.y, -tmax, tmax)
+        s = dr.sin(angle)
+        half = dr.sin(0.5 * angle)
+        less = -2 * half * half  # cos − 1 without cancellation
+        turned = mi.Vector2f(less * out.x - s * out.y, s * out.x + less * out.y)
+        return n + 1, es + ws, shear + ws * way, et + wt, twist + wt * turned
+
+    start = (mi.UInt32(0), mi.Float(0), mi.Vector2f(0), mi.Float(0), mi.Vector2f(0))
+    _, es, shear, et, twist = dr.while_loop(start, more, add, label="drag")
+    return shear / dr.maximum(1, es) + twist / dr.maximum(1, et)
+
+
+def _boxes(contact: np.ndarray) -> np.ndarray:
+    """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
+    columns, rows = contact.any(axis=1), contact.any(axis=2)
+    box = np.zeros((len(contact), 4), dtype=np.uint32)
+    for first, along in ((0, columns), (2, rows)):
+        box[:, first] = along.argmax(axis=1)
+        box[:, first + 1] = along.shape[1] - along[:, ::-1].argmax(axis=1)
+    box[~rows.any(axis=1)] = 0
+    return box

@@ -1,0 +1,391 @@
+"""The soft pad: the gel simulated with contact, friction and large deformation; object or case driven, or the object lying free."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError, SpecError
+from raytac.gel.coat_mesh import DeformedCoat
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface
+from raytac.physics.contact_state import ContactState
+from raytac.physics.first_touch import first_touch_z, gap_at_touch
+from raytac.physics.load_law import LoadLaw
+from raytac.physics.press_plan import (
+    CLEARANCE,
+    about_z,
+    check_trajectory,
+    peak_state,
+    per_environment,
+    rotation_matrix,
+    scene_parts,
+)
+from raytac.physics.soft_bodies import object_body
+from raytac.physics.soft_contact import SoftContact
+from raytac.physics.soft_mesh import PadMesh, pad_mesh
+from raytac.physics.soft_reading import SoftReader, SoftReading
+from raytac.specs.press import PressScene, StageSpec
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["STEP", "SoftPad", "SoftState"]
+
+STEP = 1e-4
+"""Longest way of the object in one step of the solver [m]."""
+_TURN = 0.035
+"""Largest turn in one step [rad]: 0.1 mm at 3 mm from the axis."""
+_LIFT = 3.0
+"""A release may go in steps so many times as long."""
+_CLOSE = 1e-6
+"""A depth is reached within this [m]."""
+_TIGHT = 5e-4
+"""A force is reached within this share."""
+_PATIENCE, _REFINEMENTS = 120, 4
+_STILL = 2e-5
+"""Speed below which a free object lies still [m/s]."""
+
+
+@dataclass(frozen=True)
+class SoftState(ContactState):
+    """B environments at one instant (see ``ContactState``), and the coat that the solver knows.
+
+    ``pad_from_object`` is where the object is shown: lowered by the clearance that the barrier kept, so that it touches.
+    ``force_law_area`` is nothing of a law here: the area that bears pressure, as ``GelSurface.contact`` counts it.
+    """
+
+    reading: SoftReading | None = None
+    """The smooth coat with its mesh, the force on each of its vertices, and the clearance."""
+
+
+class SoftPad:
+    """Press scene on a sensor with a simulated pad (see docs/soft-pad.md); used as ``RigidPad`` is.
+
+    .. code-block:: python
+
+        pad = SoftPad(sensor, scene, pitch=0.1e-3, pad="medium")
+        for state in pad.run(steps_per_stage=8):
+            surface = pad.surface(state)
+    """
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        scene: PressScene,
+        *,
+        pitch: float,
+        pad: str | PadMesh = "coarse",
+        num_envs: int = 1,
+        seed: int = 0,
+        offsets: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
+        device: str = "cpu",
+    ) -> None:
+        """Cut the pad, make the object's surface and put both into the solver.
+
+        Args:
+            sensor: gives the gelpad.
+            scene: object and trajectory.
+            pitch: spacing of the grid that surfaces are given on [m].
+            pad: a level of ``PAD_LEVELS``, or a mesh of one's own.
+            num_envs: number of environments B.
+            seed: accepted for symmetry with sampled physics; nothing here is random.
+            offsets: added to the object's x, y per environment [m], shape (B, 2). Not finite: that environment fails.
+            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+            device: where the solver runs, ``cpu`` or ``cuda``.
+
+        Raises:
+            InputError: an unknown level, arguments of the wrong shape, ``depths`` deeper than the pad.
+            SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
+            RaytacError: the object overlaps the pad where it starts.
+        """
+        if num_envs < 1:
+            raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
+        self.sensor, self.scene, self.seed, self.num_envs = sensor, scene, seed, num_envs
+        self.mesh = pad if isinstance(pad, PadMesh) else pad_mesh(sensor.gelpad, pad)
+        self.grid = make_grid(sensor.gelpad, pitch)
+        self.parts = scene_parts(scene)
+        self._offsets = per_environment("offsets", offsets, (num_envs, 2))
+        self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
+        check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
+        self._rotation = rotation_matrix(scene.object.quaternion)
+        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, self.parts)
+        self._touches: dict[tuple[float, float, float], float] = {}
+        self._contact: SoftContact | None = None
+        self._is_free = scene.object.dynamics == "affine"
+        self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
+        self._lost: np.ndarray = ~np.isfinite(self._offsets).all(axis=1)
+        if self._depths is not None:
+            self._lost |= ~np.isfinite(self._depths)
+        self._origin = np.zeros((num_envs, 3))
+        self._forget()
+        if self.parts:
+            self._origin[:] = [self._first_place(b) for b in range(num_envs)]
+            self._contact = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
+
+    # --- trajectory ------------------------------------------------------------------------------------------------------------
+
+    def run(self, steps_per_stage: int = 1) -> Iterator[SoftState]:
+        """States along the trajectory from the start: one before it (lifted by ``CLEARANCE``), ``steps_per_stage`` through each stage.
+
+        Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
+        depth: what the barrier keeps between it and the object is added to the object's height. One to a force moves the object until
+        the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to rest. A
+        ``release`` lifts the object ``CLEARANCE`` above the gel.
+
+        Raises:
+            InputError: ``steps_per_stage`` below 1.
+        """
+        if steps_per_stage < 1:
+            raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
+        self.reset()
+        yield self._state(-1, "start", 1.0)
+        for index, stage in enumerate(self.scene.trajectory):
+            before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
+            for step in range(1, steps_per_stage + 1):
+                self._advance(stage, step / steps_per_stage, *before)
+                yield self._state(index, stage.kind, step / steps_per_stage)
+
+    def peak(self, states: Iterable[SoftState]) -> SoftState:
+        """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
+        return peak_state(self.scene, states)
+
+    def surface(self, state: ContactState) -> GelSurface:
+        """Gel surface at a state of this pad."""
+        if not isinstance(state, SoftState) or state.reading is None:
+            raise InputError("state", value=type(state).__name__, rule="must be a state that this pad's run() gave")
+        return state.reading.surface
+
+    def reset(self) -> None:
+        """Forget all history: the pad at rest, the object above it."""
+        self._forget()
+        if self._contact is not None:
+            self._contact.reset()
+
+    # --- driving ---------------------------------------------------------------------------------------------------------------
+
+    def _forget(self) -> None:
+        batch = self.num_envs
+        self._depth = np.full(batch, -CLEARANCE)
+        self._shear, self._twist = np.zeros((batch, 2)), np.zeros(batch)
+        self._force = np.full(batch, np.nan)
+        """Normal force that is being kept [N]; NaN while a depth is."""
+        self._kept = np.full(batch, 0.6 * self.mesh.d_hat)
+        """Clearance that the object is held higher by [m]."""
+        self._stiffness = np.full(batch, np.nan)
+        self._failed = self._lost.copy()
+
+    def _advance(
+        self, stage: StageSpec, fraction: float, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, force: np.ndarray
+    ) -> None:
+        """From where the stage began (``depth`` …) to ``fraction`` of it."""
+        if stage.kind == "shear":
+            self._go(self._depth, shear + fraction * (np.asarray(stage.shear) - shear), self._twist)
+        elif stage.kind == "twist":
+            self._go(self._depth, self._shear, twist + fraction * (stage.twist - twist))
+        elif stage.kind == "release":
+            self._force[:] = np.nan
+            self._release(depth, fraction)
+        elif stage.force is not None:
+            begun = np.where(np.isfinite(force), force, 0.0)
+            self._force[:] = begun + fraction * (stage.force - begun)
+            self._load()
+        else:
+            self._force[:] = np.nan
+            target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
+            start = np.maximum(depth, 0.0)
+            self._go(start + fraction * (np.where(np.isfinite(target), target, 0.0) - start), self._shear, self._twist)
+            if fraction == 1.0:
+                self._settle_depth()
+
+    def _go(self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0) -> None:
+        """Drive straight to a place in steps short enough; a force that is kept is kept on the way."""
+        begun = np.maximum(self._depth, -self.mesh.d_hat) if stretch == 1.0 else self._depth
+        ways = np.abs(depth - begun), np.linalg.norm(shear - self._shear, axis=1), np.abs(twist - self._twist) * (STEP / _TURN)
+        steps = max(int(np.ceil(max(way.max() for way in ways) / (STEP * stretch) - 1e-9)), 1)
+        old_shear, old_twist = self._shear, self._twist
+        for step in range(1, steps + 1):
+            share = step / steps
+            self._shear, self._twist = old_shear + share * (shear - old_shear), old_twist + share * (twist - old_twist)
+            self._depth = begun + share * (depth - begun)
+            self._step()
+            if np.isfinite(self._force).any():
+                self._load()
+                begun = depth = self._depth
+
+    def _step(self) -> None:
+        assert self._contact is not None
+        poses = self._poses(self._depth)
+        case = None
+        if self.scene.moves == "case":
+            case = self._case()
+        self._failed |= self._contact.drive(poses, case)
+
+    def _settle_depth(self) -> None:
+        """Drive until the coat, not the barrier's shell, is at the depth."""
+        assert self._contact is not None
+        for _ in range(_REFINEMENTS):
+            clearance = self._reader.clearance(self._contact, self._poses(self._depth))
+            off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
+            if np.abs(off).max() < _CLOSE:
+                return
+            self._kept = self._kept + off
+            self._step()
+
+    def _release(self, depth: np.ndarray, fraction: float) -> None:
+        assert self._contact is not None
+        lift = np.array(
+            [
+                place[2] - self._touch(place[0] + shear[0], place[1] + shear[1], twist)
+                for place, shear, twist in zip(self._origin, self._shear, self._twist, strict=True)
+            ]
+        )
+        if self._is_free:
+            if fraction == 1.0:
+                self._contact.reset()
+                self._depth = lift - CLEARANCE
+            return
+        self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
+
+    def _load(self) -> None:
+        """Let the contact bear ``self._force``: a free object by its weight, a driven one by a secant search of its depth."""
+        if self._is_free:
+            self._lie()
+            return
+        self._depth = np.maximum(self._depth, -self.mesh.d_hat)
+        if not np.isfinite(self._stiffness).all():
+            self._stiffness = np.array([self._first_stiffness(b) for b in range(self.num_envs)])
+        borne = self._normal_force()
+        for _ in range(_PATIENCE):
+            missing = np.where(np.isfinite(self._force) & ~self._failed, self._force - borne, 0.0)
+            if (np.abs(missing) <= _TIGHT * np.nan_to_num(self._force)).all():
+                return
+            way = np.clip(missing / self._stiffness, -STEP, STEP)
+            self._depth = self._depth + way
+            self._step()
+            before, borne = borne, self._normal_force()
+            moved = np.abs(way) > 1e-9
+            found = (borne - before)[moved] / way[moved]
+            usable = found > 0.1 * self._stiffness[moved]
+            self._stiffness[moved] = np.where(usable, found, self._stiffness[moved])
+        self._failed |= np.abs(missing) > _TIGHT * np.nan_to_num(self._force)
+
+    def _lie(self) -> None:
+        """Let a free object come to rest under its weight."""
+        assert self._contact is not None and self._weight > 0.0
+        self._contact.weigh(float(self._force[0]) / self._weight)
+        for _ in range(4 * _PATIENCE):
+            self._failed |= self._contact.drive(self._poses(self._depth))
+            if (self._contact.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
+                return
+        self._failed |= self._contact.speed() >= _STILL
+
+    # --- reading ---------------------------------------------------------------------------------------------------------------
+
+    def _normal_force(self) -> np.ndarray:
+        assert self._contact is not None
+        return -self._contact.forces()[:, :, 2].sum(axis=1)
+
+    def _state(self, stage: int, kind: str, fraction: float) -> SoftState:
+        batch = self.num_envs
+        if self._contact is None:
+            poses, zero = np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
+            rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
+            coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
+            surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
+            reading = SoftReading(surface, np.zeros_like(coat.positions), np.full(batch, np.nan), poses)
+            failed = np.zeros(batch, bool)
+            return SoftState(
+                stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
+            )
+        failed = self._failed.copy()
+        reading = self._reader.read(self._contact, self._poses(self._depth), failed)
+        surface, forces = reading.surface, reading.forces
+        assert surface.coat is not None
+        total = forces.sum(axis=1)
+        arm = surface.coat.positions[:, :, :2] - np.nan_to_num(surface.contact_centre)[:, None]
+        torque = (arm[:, :, 0] * forces[:, :, 1] - arm[:, :, 1] * forces[:, :, 0]).sum(axis=1)
+        cell = self.grid.pitch[0] * self.grid.pitch[1]
+        area = np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
+        depth = np.where(failed, np.nan, self._origin[:, 2] - reading.poses[:, 2, 3])
+        case = self._case() if self.scene.moves == "case" else np.tile(np.eye(4), (batch, 1, 1))
+        case[failed] = np.nan
+        return SoftState(
+            stage,
+            kind,
+            fraction,
+            reading.poses,
+            case,
+            depth,
+            -total[:, 2],
+            total[:, :2],
+            torque,
+            area,
+            failed,
+            self.scene,
+            reading,
+        )
+
+    # --- places ----------------------------------------------------------------------------------------------------------------
+
+    def _poses(self, depth: np.ndarray) -> np.ndarray:
+        """``pad_from_object`` with the coat ``depth`` [m] (B,) below first touch: the object is higher by the clearance; (B, 4, 4)."""
+        poses = np.tile(np.eye(4), (self.num_envs, 1, 1))
+        for b in range(self.num_envs):
+            poses[b, :3, :3] = about_z(self._twist[b]) @ self._rotation
+        poses[:, :3, 3] = self._origin
+        poses[:, :2, 3] += self._shear
+        poses[:, 2, 3] += self._kept - depth
+        return poses
+
+    def _case(self) -> np.ndarray:
+        """``world_from_pad`` (B, 4, 4) of a case that moves: the object stays where it is at first touch, as in ``PressRig``."""
+        poses = np.tile(np.eye(4), (self.num_envs, 1, 1))
+        for b in range(self.num_envs):
+            turn = about_z(-self._twist[b])
+            way = np.array([*self._shear[b], self._kept[b] - self._depth[b]])
+            poses[b, :3, :3] = turn
+            poses[b, :3, 3] = self._origin[b] - turn @ (way + self._origin[b])
+        return poses
+
+    def _first_place(self, b: int) -> np.ndarray:
+        """Where the object's origin is at first touch, (3,) [m]; at the pad's middle for an environment that is lost."""
+        x, y = np.zeros(2) if self._lost[b] else np.asarray(self.scene.object.position[:2]) + self._offsets[b]
+        try:
+            return np.array([x, y, self._touch(x, y, 0.0)])
+        except InputError as error:
+            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
+            raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
+
+    def _touch(self, x: float, y: float, twist: float) -> float:
+        """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
+        key = x, y, twist
+        if key not in self._touches:
+            pose = np.eye(4)
+            pose[:3, :3] = about_z(twist) @ self._rotation
+            pose[:2, 3] = x, y
+            self._touches[key] = first_touch_z(self.parts, pose, self.sensor.gelpad, self.grid)
+        return self._touches[key]
+
+    def _first_stiffness(self, b: int) -> float:
+        """Force over depth [N/m] that the layer's law expects where the force is reached: a start for the search."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = about_z(self._twist[b]) @ self._rotation, self._origin[b]
+        gap = gap_at_touch(self.parts, pose, self.grid)
+        law = LoadLaw(gap, self.grid.pitch[0] * self.grid.pitch[1], self.sensor.gelpad)
+        force = float(np.nan_to_num(self._force[b]))
+        return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
+
+    def _body(self):
+        deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
+        if self._depths is not None:
+            deepest = max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+        edge = 0.75 * float(np.diff(self.mesh.coat.lines_x).mean())
+        reach = deepest + float(np.ptp(self.grid.rest)) + CLEARANCE
+        try:
+            return object_body(self.parts, self.scene.object, self._rotation, weight=self._weight, edge_length=edge, lowest=reach)
+        except InputError as error:
+            raise SpecError(
+                error.rule, file=self.scene.source, key=error.name, value=error.value, choices=error.choices
+            ) from error

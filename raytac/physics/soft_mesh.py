@@ -1,0 +1,139 @@
+"""The gelpad as tetrahedra: graded towards the contact face and the middle, with mirrored cells that do not lock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import ipc
+from raytac.errors import InputError
+from raytac.gel.coat_mesh import CoatMesh
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["PAD_LEVELS", "PadLevel", "PadMesh", "pad_mesh"]
+
+_KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+"""Six tetrahedra about the diagonal from corner 0 to 7 of a cube (corner k has the bits x, y, z of k)."""
+
+
+@dataclass(frozen=True)
+class PadLevel:
+    """How finely a pad is cut."""
+
+    cell: float
+    """Mean length of a cell along x and y [m]; the count on each axis is the even number that comes closest."""
+    layers: int
+    spread: float
+    """Length of the outermost cell over that of the innermost, along x and y."""
+    layer_spread: float
+    """Height of the lowest layer over that of the uppermost."""
+    d_hat: float
+    """Distance below which object and coat repel [m]."""
+
+
+PAD_LEVELS = {
+    "coarse": PadLevel(1.6e-3, 3, 2.5, 2.0, 5e-5),
+    "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
+    "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
+}
+"""Names that ``pad=`` accepts; docs/soft-pad.md states the height error of each."""
+
+
+@dataclass(frozen=True)
+class PadMesh:
+    """A pad that can be simulated, pad frame."""
+
+    tets: ipc.TetMesh
+    coat: CoatMesh
+    coat_vertices: np.ndarray
+    """Vertex of ``tets`` under each vertex of ``coat``, shape (V,)."""
+    bonded: np.ndarray
+    """Vertices of ``tets`` that are fixed to the case."""
+    d_hat: float
+    """Distance below which object and coat repel [m]."""
+
+    def __post_init__(self) -> None:
+        if len(self.bonded) == 0:
+            rule = "must name at least one vertex: a pad that nothing holds would be pushed away"
+            raise InputError("bonded", value=[], rule=rule)
+        if len(self.bonded) == len(self.tets.vertices):
+            raise InputError("bonded", value=f"all {len(self.bonded)} vertices", rule="must leave vertices that can move")
+
+
+def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
+    """Cut the gelpad into tetrahedra, six a cell of a grid that follows the dome.
+
+    The six tetrahedra of a cell are those of its neighbour mirrored in the face between them. Linear tetrahedra all cut the same way lock
+    where the gel is nearly incompressible; cut so, with the faces at which they meet in planes, they hold enough volume-preserving motions
+    (the pattern is a barycentric subdivision, as in S. Zhang, Numer. Math. 2008, on Powell-Sabin grids; docs/soft-pad.md has the figures).
+
+    Args:
+        gelpad: size, thickness, dome, and what is bonded to the case: the back, or the back and the sides.
+        level: a name of ``PAD_LEVELS``, or a level of one's own.
+
+    Raises:
+        InputError: an unknown level, or one that leaves less than two cells along an axis.
+    """
+    if isinstance(level, str):
+        if level not in PAD_LEVELS:
+            raise InputError("pad", value=level, rule="must be a known level", choices=PAD_LEVELS)
+        level = PAD_LEVELS[level]
+    x, y = (_lines(size, level) for size in gelpad.size)
+    z = -ipc.graded(gelpad.thickness, level.layers, level.layer_spread ** (1.0 / max(level.layers - 1, 1)))[::-1]
+    tets = _mirrored_cells(x, y, z)
+    vertices = tets.vertices.copy()
+    vertices[:, 2] -= gelpad.sag(vertices[:, 0], vertices[:, 1]) * (1.0 + vertices[:, 2] / gelpad.thickness)
+    per_layer = len(x) * len(y)
+    coat_vertices = np.arange(len(vertices) - per_layer, len(vertices))
+    at_back = np.arange(len(vertices)) < per_layer
+    at_side = (np.abs(vertices[:, :2]) >= 0.5 * np.asarray(gelpad.size) * (1.0 - 1e-12)).any(axis=1)
+    bonded = np.flatnonzero(at_back | at_side if gelpad.bonded == "back_and_sides" else at_back)
+    coat = CoatMesh(vertices[coat_vertices], _coat_faces(tets.tets, coat_vertices[0], vertices), x, y)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat)
+
+
+def _lines(size: float, level: PadLevel) -> np.ndarray:
+    """Grid lines across the pad [m], symmetric, finest in the middle; an even number of cells."""
+    half = round(0.5 * size / level.cell)
+    if half < 1:
+        raise InputError("pad", value=level, rule=f"must leave at least two cells over the pad's {size} m")
+    ends = ipc.graded(0.5 * size, half, level.spread ** (1.0 / max(half - 1, 1)))
+    return np.concatenate([-ends[:0:-1], ends])
+
+
+def _mirrored_cells(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> ipc.TetMesh:
+    """A box on the grid of three rising coordinate lists; vertex (i, j, k) has the number (k·ny + j)·nx + i."""
+    nx, ny, nz = len(x), len(y), len(z)
+    above, across, along = np.meshgrid(z, y, x, indexing="ij")
+    vertices = np.stack([along, across, above], axis=-1).reshape(-1, 3)
+    k, j, i = (a.ravel() for a in np.meshgrid(*(np.arange(n - 1) for n in (nz, ny, nx)), indexing="ij"))
+    # Counted from the face that is touched, so that its pattern does not depend on the number of layers.
+    flip_x, flip_y, flip_z = i % 2, j % 2, (nz - 2 - k) % 2
+    corner = np.arange(8)
+    at_x, at_y, at_z = (
+        start[:, None] + ((corner >> bit & 1) ^ flip[:, None])
+        for start, flip, bit in ((i, flip_x, 0), (j, flip_y, 1), (k, flip_z, 2))
+    )
+    number = (at_z * ny + at_y) * nx + at_x
+    cells = number[:, _KUHN]
+    # An odd number of mirrored axes turns a cell inside out.
+    inside_out = ((flip_x + flip_y + flip_z) % 2).astype(bool)[:, None] ^ _inverted()[None, :]
+    cells[inside_out] = cells[inside_out][:, [0, 1, 3, 2]]
+    return ipc.TetMesh(vertices, cells.reshape(-1, 4))
+
+
+def _inverted() -> np.ndarray:
+    """Which of the tetrahedra of ``_KUHN`` have a negative volume, shape (6,)."""
+    corners = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)[_KUHN]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
+
+
+def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarray:
+    """Triangles of the uppermost layer in its own vertex numbers, counter-clockwise seen from +z; shape (F, 3)."""
+    faces = tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    faces = faces[(faces >= first).all(axis=1)]
+    a, b, c = (vertices[faces[:, k], :2] for k in range(3))
+    down = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0.0
+    faces[down] = faces[down][:, ::-1]
+    return (faces - first).astype(np.int32)

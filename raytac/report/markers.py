@@ -1,0 +1,173 @@
+"""Calibrate a pad's marker motion and write its folder: the fitted file, errors on held-out presses as table and figures, metrics."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from raytac.io.folder import result_folder
+from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.report.machine import machine
+from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
+from raytac.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from raytac.markers.calibration import ModelError
+    from raytac.markers.calibration_presses import Press, PressFrame
+
+__all__ = ["FILES", "MotionReport", "calibrate_markers", "error_table", "motion_metrics", "run_calibrate_markers"]
+
+FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
+"""Every file that a calibration writes."""
+
+
+@dataclass(frozen=True)
+class MotionReport:
+    """A fit and what it is worth."""
+
+    motion: MarkerMotionSpec
+    errors: list[ModelError]
+    """On held-out presses."""
+    fit_errors: list[ModelError]
+    """Of FOTS on the presses that it was fitted to."""
+    times_ms: dict[str, float]
+    """Median time of a frame of every model, at the probes."""
+    probes: int
+    held_out: list[PressFrame]
+
+
+def run_calibrate_markers(
+    sensor: SensorSpec, out: Path, *, pad: str, quick: bool, device: str, seed: int, start: float, progress: bool = True
+) -> list[Path]:
+    """Press the simulated pad, fit, test on held-out presses, and write ``FILES`` to ``out``; returns the files written.
+
+    Raises:
+        RaytacError: a press did not settle, or fits nowhere on this sensor.
+        BackendError: the solver or Dr.Jit cannot run.
+    """
+    from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
+    from raytac.report.markers_figure import write_arrows, write_errors
+
+    with result_folder(out, FILES) as folder:
+        fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
+        began = time.perf_counter()
+        pressed = _press_all(sensor, (*fit, *held_out), pad, device, progress)
+        press_s = time.perf_counter() - began
+        names = {press.name for press in fit}
+        report = calibrate_markers(
+            sensor,
+            [frame for frame in pressed if frame.press.name in names],
+            [frame for frame in pressed if frame.press.name not in names],
+            pad=pad,
+            device=device,
+        )
+        (folder / "marker_motion.toml").write_text(marker_motion_text(report.motion), encoding="utf-8")
+        load_marker_motion(folder / "marker_motion.toml")  # what is written can be read
+        (folder / "errors.md").write_text(error_table(report), encoding="utf-8")
+        write_errors(folder / "errors.png", report)
+        write_arrows(folder / "arrows.png", replace(sensor, marker_motion=report.motion), report.held_out, device=device)
+        metrics = motion_metrics(report) | {"sensor": sensor.name, "pad": pad, "seed": seed, "press_s": press_s}
+        metrics |= {"device": device, **versions((*VERSIONED, "warp-lang")), **machine()}
+        write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
+        found = sorted(path.name for path in folder.iterdir())
+    return [Path(out) / name for name in found]
+
+
+def _press_all(sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, progress: bool) -> list[PressFrame]:
+    from tqdm import tqdm
+
+    from raytac.device import resolve_device
+    from raytac.markers.calibration_presses import press_frames
+
+    solver = resolve_device(device, ray_tracing=False)
+    frames: list[PressFrame] = []
+    for press in tqdm(presses, desc=f"press {sensor.name}", unit="press", disable=None if progress else True):
+        frames += press_frames(sensor, press, pad=pad, device=solver)
+    return frames
+
+
+def calibrate_markers(
+    sensor: SensorSpec, fit: list[PressFrame], held_out: list[PressFrame], *, pad: str, device: str = "auto"
+) -> MotionReport:
+    """Fit to ``fit`` and test on ``held_out``: whole presses, in order, of the simulated pad of level ``pad``."""
+    from raytac.markers.calibration import ProbeData, fit_motion, model_errors, probe_sensor
+
+    data = ProbeData.of(sensor, fit)
+    motion = fit_motion(data, device=device)
+    fitted = replace(sensor, marker_motion=motion)
+    grid = fit[0].surface.grid
+    errors, times = model_errors(fitted, held_out, grid, device=device)
+    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots",), device=device)
+    markers = probe_sensor(sensor).markers
+    report = MotionReport(motion, errors, fit_errors, times, markers.rows * markers.columns, held_out)
+    return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad)))
+
+
+def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame], held_out: list[PressFrame], pad: str) -> str:
+    def listed(frames: list[PressFrame]) -> list[str]:
+        return [f"  {press}" for press in dict.fromkeys(str(frame.press) for frame in frames)]
+
+    def errors(rows: list[ModelError]) -> str:
+        return ", ".join(f"{row.load} {1e6 * row.mean:.1f} um" for row in rows if row.model == "fots")
+
+    gelpad = sensor.gelpad
+    return "\n".join(
+        [
+            f"Fitted {datetime.date.today().isoformat()} to surface tracking on the simulated pad, level {pad}, of {sensor.name}:",
+            f"E {1e-3 * gelpad.youngs_modulus:g} kPa, nu {gelpad.poisson_ratio:g}, friction {gelpad.friction:g}, held at "
+            f"{gelpad.bonded}.",
+            "Presses of the fit:",
+            *listed(fit),
+            "Presses held out:",
+            *listed(held_out),
+            f"Mean distance of FOTS, {report.probes} probes on a 1 mm grid, on the fit: {errors(report.fit_errors)};",
+            f"held out: {errors(report.errors)}.",
+        ]
+    )
+
+
+def motion_metrics(report: MotionReport) -> dict[str, Metric]:
+    """Constants and errors as flat keys."""
+    metrics: dict[str, Metric] = {"command": "calibrate-markers", "markers.probes": report.probes}
+    motion = report.motion
+    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
+        metrics[f"fots.{name}"] = getattr(motion, name)
+    for name in ("field_gain", "field_shear", "field_friction"):
+        metrics[name.replace("_", ".", 1)] = getattr(motion, name)
+    for part, rows in (("held_out", report.errors), ("fit", report.fit_errors)):
+        for row in rows:
+            key = f"{part}.{row.model}.{row.load}"
+            metrics |= {
+                f"{key}.mean_um": 1e6 * row.mean,
+                f"{key}.p95_um": 1e6 * row.p95,
+                f"{key}.mean_px": row.mean_px,
+                f"{key}.truth_mean_um": 1e6 * row.size,
+                f"{key}.frames": row.frames,
+            }
+            if math.isfinite(row.moved):
+                metrics[f"{key}.moved_um"] = 1e6 * row.moved
+    return metrics | {f"{model}.ms_per_frame": value for model, value in report.times_ms.items()}
+
+
+def error_table(report: MotionReport) -> str:
+    """Errors of every model as a Markdown table."""
+    lines = [
+        "# Marker models against surface tracking on held-out presses",
+        "",
+        f"Distance over {report.probes} markers on a 1 mm grid over the view; `moved`: over those that surface tracking moves by more",
+        "than 50 µm; `truth`: the mean displacement itself, which is the error of a model that never moves a marker.",
+        "",
+        "| model | load | frames | mean [µm] | p95 [µm] | moved [µm] | mean [px] | truth [µm] | a frame [ms] |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in report.errors:
+        moved = f"{1e6 * row.moved:.1f}" if math.isfinite(row.moved) else "–"
+        lines.append(
+            f"| {row.model} | {row.load} | {row.frames} | {1e6 * row.mean:.1f} | {1e6 * row.p95:.1f} | {moved} | {row.mean_px:.2f} | "
+            f"{1e6 * row.size:.1f} | {report.times_ms[row.model]:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
