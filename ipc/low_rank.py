@@ -21,14 +21,14 @@ import warp as wp
 from ipc.contact import Contacts, mat34d
 from ipc.linear import SystemView, row_column
 
-__all__ = ["LowRank", "Rest", "Small", "contacts_of", "rest_entry", "sum_of_parts"]
+__all__ = ["LANES", "LowRank", "Rest", "Small", "contacts_of", "rest_entry", "sum_of_parts"]
 
 wp.set_module_options({"enable_backward": False})
 
 REGULAR = 1e-6
 """Stiffness added to every contact node, as a share of its elastic one."""
 LANES = 256
-"""Threads that share the small system of an environment on CUDA."""
+"""Threads that share the small system of an environment on CUDA; the size of all blocks, so that a module is compiled once."""
 
 
 @wp.func_native("""

@@ -19,7 +19,7 @@ import warp as wp
 from ipc.contact import Contacts
 from ipc.layout import Layout
 from ipc.linear import BlockJacobi, SystemView
-from ipc.low_rank import LowRank, Rest, Small, contacts_of, rest_entry, sum_of_parts
+from ipc.low_rank import LANES, LowRank, Rest, Small, contacts_of, rest_entry, sum_of_parts
 from ipc.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.settings import Settings
 from ipc.substructure import Patch, choose_partition, condense
@@ -117,7 +117,7 @@ class Product:
         elif tiled(self.batch, device):
             dim = (patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
             wp.launch_tiled(
-                multiply_tiles, dim=dim, inputs=[*common, running], outputs=[self.y_whole], block_dim=128, device=device
+                multiply_tiles, dim=dim, inputs=[*common, running], outputs=[self.y_whole], block_dim=LANES, device=device
             )
         else:
             parts = self.y.shape[0]
