@@ -56,8 +56,7 @@ class RestAlone(RestInverse):
     """The rest inverse without the contacts of the moment."""
 
     def update(self, system: linear.SystemView, contacts: linear.Contacts, rows: int, active: wp.array) -> None:
-        if self.others is not None:
-            self.others.update(system, contacts, rows, active)
+        self.jacobi.update(system, contacts, rows, active)
 
 
 @wp.kernel

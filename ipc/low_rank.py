@@ -5,9 +5,9 @@ inverse C = K_0⁻¹ is known between all nodes of a surface. By Woodbury's iden
 
     (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹.
 
-S is not regular (friction may be missing), so a share REGULAR of the elastic stiffness of each contact node is added to it.
-K_0 + Jᵀ S J is positive definite whichever nodes J picks, so more contact nodes than there is room for only cost iterations: the
-stiffest are taken. W is found in double precision by one block of threads an environment.
+S is not regular (friction may be missing), so a share REGULAR of the elastic stiffness of each contact node is added to it. W is found
+in double precision by one block of threads an environment. An environment with more contact nodes than there is room for is marked as
+one that does not fit: with part of its contacts the identity is of little use.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -21,7 +21,7 @@ import warp as wp
 from ipc.contact import Contacts, mat34d
 from ipc.linear import SystemView, row_column
 
-__all__ = ["LANES", "LowRank", "Rest", "Small", "contacts_of", "rest_entry", "sum_of_parts"]
+__all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,12 +64,12 @@ class Rest:
 class Small:
     """The contact nodes of each environment and their systems; m is the room.
 
-    ``strength`` (B, s): largest ‖q‖² of a surface node [N/m].    ``slot`` (B, s): its place among the contact nodes, or −1.
-    ``count`` (B,): contact nodes, before they are limited to the room.    ``node`` (B, m).    ``a`` (B, m, m), ``row``, ``column`` (B, m):
-    work space.    ``w`` (B, 3m, 3m): W [N/m].    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
+    ``touched``, ``slot`` (B, s): whether a surface node touches, and its place among the contact nodes.    ``count`` (B,): contact nodes;
+    more than m do not fit.    ``node`` (B, m).    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
+    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
     """
 
-    strength: wp.array2d(dtype=wp.float64)
+    touched: wp.array2d(dtype=wp.int32)
     slot: wp.array2d(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
     node: wp.array2d(dtype=wp.int32)
@@ -88,8 +88,9 @@ def rest_entry(rest: Rest, part: wp.int32, u: wp.int32, v: wp.int32) -> wp.float
 
 
 @wp.func
-def contacts_of(small: Small, env: wp.int32) -> wp.int32:
-    return wp.min(small.count[env], small.node.shape[1])
+def fits(small: Small, env: wp.int32) -> wp.bool:
+    """Whether there is room for the contact nodes of an environment."""
+    return small.count[env] <= small.node.shape[1]
 
 
 @wp.kernel
@@ -99,8 +100,7 @@ def forget_contacts(active: wp.array(dtype=wp.int32), small: Small):
         return
     if s == 0:
         small.count[env] = 0
-    small.strength[env, s] = wp.float64(0.0)
-    small.slot[env, s] = -1
+    small.touched[env, s] = 0
 
 
 @wp.func
@@ -114,10 +114,10 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def measure_rows(
+def mark_contacts(
     system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
 ):
-    """The strength of every surface node."""
+    """Which surface nodes the rows act on."""
     env, r = wp.tid()
     if active[env] == 0:
         return
@@ -126,31 +126,24 @@ def measure_rows(
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         for k in range(4):
             s = surface_of_vertex(system, rest, verts[k])
-            if s >= 0:
-                size = wp.length_sq(row_column(row, k))
-                if size > wp.float64(0.0):
-                    wp.atomic_max(small.strength, env, s, size)
+            if s >= 0 and wp.length_sq(row_column(row, k)) > wp.float64(0.0):
+                small.touched[env, s] = 1
         r += lanes
 
 
 @wp.kernel
-def choose_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
-    """The places of the contact nodes: by strength, then by number, so that they do not depend on scheduling."""
+def place_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
+    """The places of the contact nodes, in the order of their numbers, so that they do not depend on scheduling."""
     env, s = wp.tid()
-    if active[env] == 0:
-        return
-    mine = small.strength[env, s]
-    if not (mine > wp.float64(0.0)):
+    if active[env] == 0 or small.touched[env, s] == 0:
         return
     wp.atomic_add(small.count, env, 1)
     place = wp.int32(0)
-    for other in range(small.strength.shape[1]):
-        theirs = small.strength[env, other]
-        if theirs > mine or (theirs == mine and other < s):
-            place += 1
+    for other in range(s):
+        place += small.touched[env, other]
+    small.slot[env, s] = place
     if place < small.node.shape[1]:
         small.node[env, place] = rest.surface_node[s]
-        small.slot[env, s] = place
 
 
 @wp.func
@@ -159,23 +152,21 @@ def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, res
     for k in range(4):
         s = surface_of_vertex(system, rest, verts[k])
         if s >= 0:
-            i = small.slot[env, s]
-            if i >= 0:
-                qi = wp.transpose(system.R[env, system.vert_body[verts[k]]]) * row_column(row, k)
+            qi = wp.transpose(system.R[env, system.vert_body[verts[k]]]) * row_column(row, k)
+            if wp.length_sq(qi) > wp.float64(0.0):
                 for m in range(4):
                     other = surface_of_vertex(system, rest, verts[m])
                     if other >= 0:
-                        j = small.slot[env, other]
-                        if j >= 0:
-                            qj = wp.transpose(system.R[env, system.vert_body[verts[m]]]) * row_column(row, m)
-                            wp.atomic_add(small.a, env, i, j, wp.outer(qi, qj))
+                        qj = wp.transpose(system.R[env, system.vert_body[verts[m]]]) * row_column(row, m)
+                        if wp.length_sq(qj) > wp.float64(0.0):
+                            wp.atomic_add(small.a, env, small.slot[env, s], small.slot[env, other], wp.outer(qi, qj))
 
 
 @wp.kernel
 def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
     """S = Σ q qᵀ."""
     env, r = wp.tid()
-    if active[env] == 0:
+    if active[env] == 0 or not fits(small, env):
         return
     n = wp.min(contacts.row_count[env], contacts.row.shape[1])
     while r < n:
@@ -230,9 +221,9 @@ def compliance(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
 def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
     """W from S, one block of threads an environment; leaves ``a`` zero for the next S."""
     env, lane = wp.tid()
-    if active[env] == 0:
+    if active[env] == 0 or not fits(small, env):
         return
-    m = contacts_of(small, env)
+    m = small.count[env]
     for i in range(lane, m, lanes):
         C = compliance(rest, small.node[env, i], small.node[env, i])
         soft = wp.float64(3.0 * REGULAR) / wp.trace(C)
@@ -273,9 +264,9 @@ def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) ->
 def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
     """W J K_0⁻¹ r, one block of threads an environment."""
     env, lane = wp.tid()
-    if running[env] == 0:
+    if running[env] == 0 or not fits(small, env):
         return
-    n = 3 * contacts_of(small, env)
+    n = 3 * small.count[env]
     for i in range(lane, n, lanes):
         small.t[env, i] = sum_of_parts(y, env, rest.unknown[small.node[env, i / 3]] + i % 3)
     wait_for_lanes()
@@ -287,12 +278,12 @@ def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.arra
 
 
 class LowRank:
-    """Chooses the contact nodes, factors their small systems, and applies W; all arrays keep their addresses.
+    """Finds the contact nodes, factors their small systems, and applies W; all arrays keep their addresses.
 
     Args:
         rest: K_0⁻¹ on the surfaces.
         batch: number of environments.
-        room: contact nodes an environment that are treated.
+        room: contact nodes that an environment may have.
         row_lanes: threads that share the contact rows of an environment; one adds them in order.
         device: Warp device.
     """
@@ -307,7 +298,7 @@ class LowRank:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         small = Small()
-        small.strength, small.slot = zeros(batch, nodes, dtype=wp.float64), zeros(batch, nodes, dtype=wp.int32)
+        small.touched, small.slot = zeros(batch, nodes, dtype=wp.int32), zeros(batch, nodes, dtype=wp.int32)
         small.count, small.node = zeros(batch, dtype=wp.int32), zeros(batch, room, dtype=wp.int32)
         small.a = zeros(batch, room, room, dtype=wp.mat33d)
         small.row, small.column = zeros(batch, room, dtype=wp.mat33d), zeros(batch, room, dtype=wp.mat33d)
@@ -320,11 +311,11 @@ class LowRank:
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         """Take in the rows of the active environments."""
         rest, small = self.rest, self.small
-        self._launch(forget_contacts, small.strength.shape, [active, small])
+        self._launch(forget_contacts, small.touched.shape, [active, small])
         if rows:
             inputs = [system, contacts, rest, active, self.row_lanes, small]
-            self._launch(measure_rows, (self.batch, self.row_lanes), inputs)
-            self._launch(choose_contacts, small.strength.shape, [rest, active, small])
+            self._launch(mark_contacts, (self.batch, self.row_lanes), inputs)
+            self._launch(place_contacts, small.touched.shape, [rest, active, small])
             self._launch(add_rows, (self.batch, self.row_lanes), inputs)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 

@@ -2,9 +2,9 @@
 
 A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
 (``ipc/substructure.py``), in single precision, and the contacts are added as a low-rank part (``ipc/low_rank.py``): M is exact as long as
-the body is at rest, and what deformation changes is left to PCG. Nodes of other bodies have block-Jacobi. Across a batch the
-application is a product of matrices that every environment shares. On CUDA everything is a launch of fixed size on arrays of fixed
-address, so that it can be part of a graph.
+the body is at rest, and what deformation changes is left to PCG. Nodes of other bodies, and environments with more contacts than there
+is room for, have block-Jacobi. Across a batch the application is a product of matrices that every environment shares. On CUDA
+everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -19,7 +19,7 @@ import warp as wp
 from ipc.contact import Contacts
 from ipc.layout import Layout
 from ipc.linear import BlockJacobi, SystemView
-from ipc.low_rank import LANES, LowRank, Rest, Small, contacts_of, rest_entry, sum_of_parts
+from ipc.low_rank import LANES, LowRank, Rest, Small, fits, rest_entry, sum_of_parts
 from ipc.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.settings import Settings
 from ipc.substructure import Patch, choose_partition, condense
@@ -34,8 +34,8 @@ TILED_FROM = 8
 """Number of environments from which tiles are used; fewer are as many products of matrix and vector."""
 THREADS = 200_000
 """About how many threads a product of matrices and vectors is split into; a GPU needs many to read memory at its full rate."""
-MAX_CONTACTS = 64
-"""Contact nodes an environment that are treated exactly; factoring costs their number cubed."""
+MAX_CONTACTS = 48
+"""Contact nodes that an environment may have; factoring costs their number cubed."""
 
 
 @wp.kernel
@@ -166,14 +166,22 @@ def gather_interface(
     inside: Inside,
     r: wp.array2d(dtype=wp.vec3d),
     y_inside: wp.array3d(dtype=wp.float32),
+    small: Small,
+    jacobi: wp.array2d(dtype=wp.mat33d),
     running: wp.array(dtype=wp.int32),
     # outputs
     x: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.vec3d),
 ):
-    """r_Γ − Σ E_pᵀ r_p."""
+    """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi."""
     env, i = wp.tid()
+    if running[env] == 0:
+        return
     u = rest.unknown[i]
-    if running[env] == 0 or u < 0:
+    if (u < 0 and inside.unknown[i] < 0) or not fits(small, env):
+        z[env, i] = jacobi[env, i] * r[env, i]
+        return
+    if u < 0:
         return
     for c in range(3):
         value = wp.float32(r[env, i][c])
@@ -196,11 +204,11 @@ def scatter_interface(
     """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node."""
     env, i = wp.tid()
     u = rest.unknown[i]
-    if running[env] == 0 or u < 0:
+    if running[env] == 0 or u < 0 or not fits(small, env):
         return
     part = rest.part[i]
     value = wp.vec3(sum_of_parts(y, env, u), sum_of_parts(y, env, u + 1), sum_of_parts(y, env, u + 2))
-    for k in range(contacts_of(small, env)):
+    for k in range(small.count[env]):
         node = small.node[env, k]
         if rest.part[node] == part:
             v = rest.unknown[node]
@@ -219,6 +227,7 @@ def scatter_inside(
     inside: Inside,
     y_inside: wp.array3d(dtype=wp.float32),
     y_back: wp.array3d(dtype=wp.float32),
+    small: Small,
     running: wp.array(dtype=wp.int32),
     # outputs
     z: wp.array2d(dtype=wp.vec3d),
@@ -226,7 +235,7 @@ def scatter_inside(
     """x_p = K_pp⁻¹ r_p − E_p x_Γ."""
     env, i = wp.tid()
     u = inside.unknown[i]
-    if running[env] == 0 or u < 0:
+    if running[env] == 0 or u < 0 or not fits(small, env):
         return
     at = inside.patch_out[i]
     value = wp.vec3d()
@@ -241,7 +250,7 @@ def padded(n: int) -> int:
 
 
 class RestInverse:
-    """K_0⁻¹ of the bonded bodies with the contacts of the moment; block-Jacobi for other nodes (a ``Preconditioner``).
+    """K_0⁻¹ of the bonded bodies with the contacts of the moment; block-Jacobi elsewhere (a ``Preconditioner``).
 
     Args:
         layout: with a bonded body at least.
@@ -249,7 +258,7 @@ class RestInverse:
         batch: number of environments.
         lanes: threads that share the contact rows of an environment.
         device: Warp device.
-        max_contacts: contact nodes an environment that are treated exactly.
+        max_contacts: contact nodes that an environment may have; with more it has block-Jacobi.
         patches: into how many the inside of every body is cut, a power of two; 0 for none; None: as few operations as possible.
 
     Raises:
@@ -297,11 +306,7 @@ class RestInverse:
             Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
-        covered = unknown >= 0
-        for body in bodies:
-            for patch in body.patches:
-                covered[patch.nodes] = True
-        self.others = BlockJacobi(batch, count, lanes, device) if (layout.node_free != 0)[~covered].any() else None
+        self.jacobi = BlockJacobi(batch, count, lanes, device)
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product, with the padding that tiles want."""
@@ -354,24 +359,22 @@ class RestInverse:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the contacts of the active environments (and the matrix of the bodies that are not bonded)."""
-        if self.others is not None:
-            self.others.update(system, contacts, rows, active)
+        """Take in the contacts of the active environments, and the diagonal of their matrix."""
+        self.jacobi.update(system, contacts, rows, active)
         self.low_rank.update(system, contacts, rows, active)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
         """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
         rest, inside, small = self.rest, self.inside, self.low_rank.small
-        if self.others is not None:
-            self.others.apply(r, running, z)
         if self.patched:
             self._launch(gather_inside, r.shape, [inside, r, running], [self.x_inside])
             self.to_interface.compute(running)
-        self._launch(gather_interface, r.shape, [rest, inside, r, self.y_inside, running], [self.x])
+        inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running]
+        self._launch(gather_interface, r.shape, inputs, [self.x, z])
         for product in self.products:
             product.compute(running)
         self.low_rank.find_forces(self.y, running)
         self._launch(scatter_interface, r.shape, [rest, inside, small, self.y, running], [z, self.x_back])
         if self.patched:
             self.from_interface.compute(running)
-            self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, running], [z])
+            self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, small, running], [z])

@@ -29,7 +29,7 @@ class Settings:
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
-            part; ``ipc/rest_inverse.py``), or ``"auto"``: the rest inverse on CUDA where there is a bonded body of moderate size.
+            part; ``ipc/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
