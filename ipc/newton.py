@@ -183,8 +183,7 @@ class Newton:
         """Friction of the environments that rest, or begin, from their contacts as they are."""
         pot, ctl = self.potential, self.control
         with self._stage("lag"):
-            pot.assemble(ctl.decisions.pending)
-            self._note_extremes(ctl.decisions.pending)
+            pot.touch(ctl.decisions.pending)
             ctl.launch(control.choose_lagging)
             pot.collision.lag(ctl.decisions.lagging, ctl.decisions.changed)
             ctl.launch(control.after_lag, self.settings.friction_tolerance)

@@ -68,7 +68,7 @@ class ContactCells:
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
         touched = np.asarray(surface.contact)[part]
         found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
-        broken = ~np.isfinite(found).all(axis=(1, 2))
+        broken = ~np.all(np.isfinite(found), axis=(1, 2))
         if broken.any():
             touched = touched & ~broken[:, None, None]
         found = np.where(touched, np.maximum(found, 0), np.float32(0))
@@ -102,13 +102,14 @@ class Contacts:
     """Up to K contacts of each of B pads; rows that are not ``active`` hold zeros.
 
     ``active`` (B, K); ``centre`` [m], (B, K, 2): indentation-weighted; ``shear`` [m], (B, K, 2): tangential way of the object at the
-    contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then.
+    contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then; ``radius`` [m], (B, K): of a disc of the same area.
     """
 
     active: np.ndarray
     centre: np.ndarray
     shear: np.ndarray
     twist: np.ndarray
+    radius: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -164,11 +165,11 @@ class ContactTracker:
             [_followed(one, before, move) for one in now] for now, before, move in zip(found, self._contacts, motion, strict=True)
         ]
         count = max(1, max(len(one) for one in self._contacts))
-        table = np.zeros((self.batch, count, 6))
+        table = np.zeros((self.batch, count, 7))
         for b, contacts in enumerate(self._contacts):
             for k, c in enumerate(contacts):
-                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist
-        return Contacts(table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5])
+                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist, c.radius
+        return Contacts(table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5], table[..., 6])
 
     def _motion(self, pose: np.ndarray | None) -> list[tuple[float, ...] | None]:
         """D of every environment as (xx, xy, x, yx, yy, y, turn) of the plane z = 0; None where this or the last pose is not known."""

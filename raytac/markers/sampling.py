@@ -16,6 +16,7 @@ def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...
     dx, dy = grid.pitch
     fx = np.clip((xy[..., 0] - grid.x[0]) / dx, 0, len(grid.x) - 1.001)
     fy = np.clip((xy[..., 1] - grid.y[0]) / dy, 0, len(grid.y) - 1.001)
+    fx, fy = np.nan_to_num(fx), np.nan_to_num(fy)  # where an environment failed, any node will do
     column, row = fx.astype(int), fy.astype(int)
     return (np.arange(len(xy))[:, None], row, column), fx - column, fy - row
 
@@ -31,17 +32,15 @@ def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
 
 def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(z [m] (B, M), its gradient along x, y [-] (B, M, 2), whether the object touches the nearest node (B, M)) at points (B, M, 2) [m]."""
+    slopes = []
+    for axis, pitch in enumerate(surface.grid.pitch):
+        half = np.zeros(2)
+        half[axis] = 0.5 * pitch
+        slopes.append((height_at(surface, xy + half) - height_at(surface, xy - half)) / pitch)
     (env, row, column), wx, wy = _corners(surface, xy)
-    dx, dy = surface.grid.pitch
-    h = surface.height
-    a, b = h[env, row, column], h[env, row, column + 1]
-    c, d = h[env, row + 1, column], h[env, row + 1, column + 1]
-    z = (1 - wy) * ((1 - wx) * a + wx * b) + wy * ((1 - wx) * c + wx * d)
-    along_x = ((1 - wy) * (b - a) + wy * (d - c)) / dx
-    along_y = ((1 - wx) * (c - a) + wx * (d - b)) / dy
     contact = np.asarray(surface.contact)
     touched = contact[env, row + (wy > 0.5), column + (wx > 0.5)]
-    return z, np.stack([along_x, along_y], axis=-1), touched
+    return height_at(surface, xy), np.stack(slopes, axis=-1), touched
 
 
 def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
@@ -58,4 +57,4 @@ def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
     c, s = np.cos(angle) - 1.0, np.sin(angle)
     turned = np.stack([c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]], axis=-1)
     way = contacts.shear[rows, nearest] + turned
-    return np.where(contacts.active.any(axis=1)[:, None, None], way, 0.0)
+    return np.where(np.any(contacts.active, axis=1)[:, None, None], way, 0.0)
