@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import tyro
 import warp as wp
+from bench_ipc_scenes import CELLS, D_HAT, DT, FRICTION, GAP, MATERIAL, PRESS, RADIUS, TRAVEL, ball_surface, press_pad
 
 import ipc
 from ipc import linear
@@ -31,10 +32,9 @@ from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 
-CELLS = {300: (8, 10, 2), 1400: (16, 20, 3), 5300: (26, 32, 5), 18000: (40, 48, 8)}
 KINDS = ("block_jacobi", "fsai", "rest_alone", "rest_inverse", "rest_whole")
-RADIUS, GAP, DEPTH = 4e-3, 1.1e-4, 1e-3
-PRESS, STAGED = 20, 3
+STAGED = 3
+"""Steps on CUDA whose stages are timed."""
 FSAI_ROW = 32
 
 
@@ -144,11 +144,10 @@ def time_calls(call: Callable[[], None], device: wp.Device) -> float:
 
 def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict[str, Metric]:
     """One press."""
-    mesh = ipc.domed_pad((20.75e-3, 25.25e-3), 4e-3, (np.inf, np.inf), CELLS[size])
-    base = ipc.vertices_in_box(mesh, (-1, -1, -4e-3), (1, 1, -4e-3))
-    pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, poisson, 1000.0), bonded=base)
-    ball = ipc.KinematicBody("ball", ipc.icosphere(RADIUS, 3), ipc.Pose((0, 0, RADIUS + GAP)))
-    settings = ipc.Settings(dt=0.01, d_hat=1e-4, friction=0.5, preconditioner="block_jacobi")
+    mesh, base = press_pad(CELLS[size])
+    pad = ipc.SoftBody("pad", mesh, replace(MATERIAL, poisson=poisson), bonded=base)
+    ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP)))
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, preconditioner="block_jacobi")
     world = ipc.World([pad, ball], settings, num_envs=envs, device=args.device)
     solver, begin = world._newton, time.perf_counter()
     lanes, on = solver.potential.collision.lanes, world.device
@@ -166,7 +165,7 @@ def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict
         solver.settings = replace(settings, cuda_graph=not staged and k > 0)
         if k == (PRESS if on.is_cuda else 1):
             solver.timers.clear()
-        world.set_target("ball", (0, 0, RADIUS + GAP - DEPTH * (k + 1) / PRESS))
+        world.set_target("ball", (0, 0, RADIUS + GAP - TRAVEL * (k + 1) / PRESS))
         wp.synchronize()
         start, cpu = time.perf_counter(), time.process_time()
         report = world.step()
