@@ -230,7 +230,7 @@ def draw(points: dict[tuple[str, int, str], Point], axis_label: str, path: Path)
     looks = {300: ("#D55E00", "s"), 1400: ("#E69F00", "^"), 5300: ("#009E73", "D"), 18000: ("#0072B2", "o")}
     sizes = [size for size in looks if any(s == size for _, s, _ in points)]
     kinds = [kind for kind in KINDS if any(k == kind for k, _, _ in points)]
-    fills: dict[str, Any] = {"alike": "bottom", "mirrored": "full"}
+    fills: dict[str, Any] = {"alike": ("--", "bottom"), "mirrored": ("-", "full")}
     style: dict[Any, Any] = {
         "font.size": 8,
         "axes.linewidth": 0.6,
@@ -245,7 +245,9 @@ def draw(points: dict[tuple[str, int, str], Point], axis_label: str, path: Path)
             look: dict[str, Any] = {"color": looks[size][0], "marker": looks[size][1], "markersize": 4.5, "linewidth": 0.9}
             for kind in kinds:
                 whole = [(p.ms, p.off) for (k, s, _), p in points.items() if (k, s) == (kind, size) and p.off]
-                axes.plot([p[0] for p in whole], [p[1] for p in whole], fillstyle=fills[kind], **look)
+                axes.plot(
+                    [p[0] for p in whole], [p[1] for p in whole], linestyle=fills[kind][0], fillstyle=fills[kind][1], **look
+                )
             alone = [
                 (p.ms, p.off_tolerance, t) for (k, s, t), p in points.items() if (k, s) == (kinds[-1], size) and p.off_tolerance
             ]
@@ -272,7 +274,9 @@ def draw(points: dict[tuple[str, int, str], Point], axis_label: str, path: Path)
             Line2D([], [], color=looks[s][0], marker=looks[s][1], label=f"{vertices(s):,} vertices", **size_of) for s in sizes
         ]
         grey: dict[str, Any] = {"color": "0.3", "marker": "o", **size_of}
-        handles += [Line2D([], [], label=f"{kind} cells", fillstyle=fills[kind], **grey) for kind in kinds]
+        handles += [
+            Line2D([], [], label=f"{kind} cells", linestyle=fills[kind][0], fillstyle=fills[kind][1], **grey) for kind in kinds
+        ]
         handles.append(Line2D([], [], label="tolerance [m/s] alone", linestyle=":", fillstyle="none", **grey))
         figure.legend(handles=handles, frameon=False, ncols=2, loc="outside upper center")
         figure.savefig(path, dpi=300)
