@@ -14,6 +14,7 @@ import warp as wp
 from ipc import broad, ccd, contact, friction
 from ipc.layout import Layout
 from ipc.reduce import SUM, Reducer
+from ipc.trees import Trees, trees_pay
 
 __all__ = ["Collision"]
 
@@ -30,9 +31,19 @@ class Collision:
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.
         device: Warp device.
+        broad_phase: how pairs are found, as in :class:`ipc.settings.Settings`.
     """
 
-    def __init__(self, layout: Layout, batch: int, d_hat: float, margin: float, deterministic: bool, device: wp.Device) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        batch: int,
+        d_hat: float,
+        margin: float,
+        deterministic: bool,
+        device: wp.Device,
+        broad_phase: str = "auto",
+    ) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
         # Pairs of an environment are shared by so many threads. One alone adds forces up in the order of the lists.
         self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
@@ -69,6 +80,10 @@ class Collision:
         self.pair_mu = wp.array(layout.friction, dtype=wp.float64, device=device)
         self.vert_body = wp.array(layout.vert_body, dtype=wp.int32, device=device)
 
+        self._meshes = len(meshes) > 0
+        by_trees = broad_phase == "bvh" or (broad_phase == "auto" and trees_pay(layout, meshes))
+        self._trees = Trees(layout, meshes, batch, device) if by_trees and meshes else None
+
         # Lists of primitives, six a body pair (three where a body meets itself): see _searches.
         kinds, members, others, lists, starts = [], [], [], [], [0]
         ranges = (layout.vert_start, layout.edge_start, layout.face_start)
@@ -83,7 +98,7 @@ class Collision:
             return len(starts) - 2
 
         self._searches: list[tuple[str, int, int, int, int]] = []
-        for index, a, b in meshes:
+        for index, a, b in meshes if self._trees is None else []:
             va, ea, fa = (add_list(kind, a, b) for kind in range(3))
             if a == b:
                 self._searches += [("pt", va, fa, index, len(members[va])), ("ee", ea, ea, index, len(members[ea]))]
@@ -174,7 +189,7 @@ class Collision:
 
     def refresh(self, x: wp.array, dx: wp.array, active: wp.array) -> None:
         """Make the candidate lists hold for every position on the way from x to x + dx (B, V), or set ``overflow``."""
-        if not self._searches:
+        if not self._meshes:
             return
         self._stale.zero_()
         self._any_stale.zero_()
@@ -192,19 +207,11 @@ class Collision:
         inputs, outputs = [self._low, self._high, self.vert_body, stale], [self._body_low, self._body_high]
         wp.launch(broad.body_boxes, dim=x.shape, inputs=inputs, outputs=outputs, device=device)
         wp.launch(broad.reset_lists, dim=self.batch, inputs=[stale, self._list_count, self.candidates], device=device)
-        inputs = [
-            *(self._low, self._high, self._body_low, self._body_high, self.surface),
-            *(self._prim_kind, self._prim_index, self._prim_other, self._prim_list, self._list_start, stale),
-        ]
-        outputs = [self._list_count, self._members]
-        wp.launch(broad.select_prims, dim=(self.batch, self._prims), inputs=inputs, outputs=outputs, device=device)
-        for kind, first, second, pair, size in self._searches:
-            kernel = broad.find_pt if kind == "pt" else broad.find_ee
-            inputs = [
-                *(self._low, self._high, self.surface, self._members, self._list_start, self._list_count),
-                *(first, second, pair, stale),
-            ]
-            wp.launch(kernel, dim=(self.batch, size), inputs=inputs, outputs=[self.candidates], device=device)
+        boxes = (self._low, self._high, self._body_low, self._body_high)
+        if self._trees is None:
+            self._search_lists(boxes, stale)
+        else:
+            self._trees.find(boxes, self.surface, self.vert_body, stale, self.candidates)
         if self._sort:
             for items, count in ((self.candidates.pt, self.candidates.pt_count), (self.candidates.ee, self.candidates.ee_count)):
                 ordered = self._ordered[items.shape[1]]
@@ -212,6 +219,22 @@ class Collision:
                 wp.launch(broad.rank_candidates, dim=items.shape, inputs=inputs, outputs=outputs, device=device)
                 wp.launch(broad.put_back, dim=items.shape, inputs=[ordered, count, stale], outputs=[items], device=device)
         wp.launch(broad.check_candidates, dim=self.batch, inputs=[self.candidates], outputs=[self.overflow], device=device)
+
+    def _search_lists(self, boxes: tuple[wp.array, ...], stale: wp.array) -> None:
+        """All against all, of the primitives that reach the other body."""
+        inputs = [
+            *(*boxes, self.surface),
+            *(self._prim_kind, self._prim_index, self._prim_other, self._prim_list, self._list_start, stale),
+        ]
+        outputs = [self._list_count, self._members]
+        wp.launch(broad.select_prims, dim=(self.batch, self._prims), inputs=inputs, outputs=outputs, device=self.device)
+        for kind, first, second, pair, size in self._searches:
+            kernel = broad.find_pt if kind == "pt" else broad.find_ee
+            inputs = [
+                *(*boxes[:2], self.surface, self._members, self._list_start, self._list_count),
+                *(first, second, pair, stale),
+            ]
+            wp.launch(kernel, dim=(self.batch, size), inputs=inputs, outputs=[self.candidates], device=self.device)
 
     # --- contact ---------------------------------------------------------------------------------------------------------------
 
@@ -222,7 +245,7 @@ class Collision:
 
     def _narrow(self, kernels: tuple[Any, Any], inputs: list, outputs: list) -> None:
         """Launch the point-triangle and the edge-edge kernel over the candidates."""
-        if self._searches:
+        if self._meshes:
             for kernel in kernels:
                 self._each(kernel, inputs, outputs)
 
@@ -288,7 +311,7 @@ class Collision:
         alpha: wp.array,
     ) -> None:
         """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m]."""
-        if self._searches:
+        if self._meshes:
             for kernel, items in ((ccd.ccd_pt, self.candidates.pt), (ccd.ccd_ee, self.candidates.ee)):
                 inputs = [x, dx, self.surface, self.candidates, slack, floor, active]
                 wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)

@@ -57,7 +57,7 @@ class Potential:
         def numbers(*shape: int) -> wp.array:
             return wp.zeros(shape or batch, dtype=wp.float64, device=device)
 
-        self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device)
+        self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device, settings.broad_phase)
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
         self.tets = ints(layout.tets)

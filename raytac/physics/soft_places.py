@@ -1,0 +1,90 @@
+"""Where a press has the object and the case: poses of a batch from first touch, depth, shear and twist."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from raytac.errors import InputError, SpecError
+from raytac.gel.part import Part
+from raytac.gel.surface import PadGrid
+from raytac.physics.first_touch import first_touch_z, gap_at_touch
+from raytac.physics.load_law import LoadLaw
+from raytac.physics.press_plan import about_z, rotation_matrix
+from raytac.specs.press import PressScene
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["SoftPlaces"]
+
+
+class SoftPlaces:
+    """Places of one scene's object over one pad, for B environments with their own offsets."""
+
+    def __init__(
+        self, scene: PressScene, parts: Sequence[Part], gelpad: GelpadSpec, grid: PadGrid, offsets: np.ndarray, lost: np.ndarray
+    ) -> None:
+        """``offsets`` [m], shape (B, 2); environments that are ``lost``, shape (B,), are put at the pad's middle.
+
+        Raises:
+            SpecError: an object that does not start over the pad; names the scene's file and key.
+        """
+        self._scene, self._parts, self._gelpad, self._grid = scene, parts, gelpad, grid
+        self.rotation = rotation_matrix(scene.object.quaternion)
+        """``pad_from_object`` at zero twist, (3, 3)."""
+        self._touches: dict[tuple[float, float, float], float] = {}
+        start = np.asarray(scene.object.position[:2])
+        self.origin = np.array([self._first(*(np.zeros(2) if lost[b] else start + offsets[b])) for b in range(len(offsets))])
+        """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
+
+    def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
+        poses = np.tile(np.eye(4), (len(height), 1, 1))
+        for b, angle in enumerate(twist):
+            poses[b, :3, :3] = about_z(angle) @ self.rotation
+        poses[:, :3, 3] = self.origin
+        poses[:, :2, 3] += shear
+        poses[:, 2, 3] += height
+        return poses
+
+    def case(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """``world_from_pad`` (B, 4, 4) of a case that moves: the object stays where it is at first touch, as in ``PressRig``."""
+        poses = np.tile(np.eye(4), (len(height), 1, 1))
+        for b, angle in enumerate(twist):
+            turn = about_z(-angle)
+            poses[b, :3, :3] = turn
+            poses[b, :3, 3] = self.origin[b] - turn @ (np.array([*shear[b], height[b]]) + self.origin[b])
+        return poses
+
+    def lift(self, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """How much lower than at the start the pad is first touched after a shear and twist [m], shape (B,)."""
+        return np.array(
+            [
+                at[2] - self._touch(at[0] + way[0], at[1] + way[1], angle)
+                for at, way, angle in zip(self.origin, shear, twist, strict=True)
+            ]
+        )
+
+    def stiffness(self, b: int, twist: float, force: float) -> float:
+        """Force over depth [N/m] that the bonded layer's law expects at ``force`` [N]: a start for a search."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = about_z(twist) @ self.rotation, self.origin[b]
+        law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
+        return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
+
+    def _first(self, x: float, y: float) -> np.ndarray:
+        try:
+            return np.array([x, y, self._touch(x, y, 0.0)])
+        except InputError as error:
+            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
+            raise SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place) from error
+
+    def _touch(self, x: float, y: float, twist: float) -> float:
+        """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
+        key = float(x), float(y), float(twist)
+        if key not in self._touches:
+            pose = np.eye(4)
+            pose[:3, :3] = about_z(twist) @ self.rotation
+            pose[:2, 3] = x, y
+            self._touches[key] = first_touch_z(self._parts, pose, self._gelpad, self._grid)
+        return self._touches[key]
