@@ -14,20 +14,17 @@ from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import CoatTraction
 from raytac.physics.contact_state import ContactState
-from raytac.physics.first_touch import first_touch_z, gap_at_touch
-from raytac.physics.load_law import LoadLaw
 from raytac.physics.press_plan import (
     CLEARANCE,
-    about_z,
     check_trajectory,
     peak_state,
     per_environment,
-    rotation_matrix,
     scene_parts,
 )
 from raytac.physics.soft_bodies import object_body
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_mesh import PadMesh, pad_mesh
+from raytac.physics.soft_places import SoftPlaces
 from raytac.physics.soft_reading import SoftReader, SoftReading
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -113,11 +110,9 @@ class SoftPad:
         self._offsets = per_environment("offsets", offsets, (num_envs, 2))
         self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
         check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
-        self._rotation = rotation_matrix(scene.object.quaternion)
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, self.parts)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
-        self._touches: dict[tuple[float, float, float], float] = {}
         self.solver: SoftContact | None = None
         """Pad and object in the contact solver; None without an object."""
         self._is_free = scene.object.dynamics == "affine"
@@ -125,11 +120,10 @@ class SoftPad:
         self._lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
         if self._depths is not None:
             self._lost = self._lost | ~np.isfinite(self._depths)
-        self._origin = np.zeros((num_envs, 3))
         self._forget()
         if self.parts:
-            self._origin[:] = [self._first_place(b) for b in range(num_envs)]
-            self.solver = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
+            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, self._offsets, self._lost)
+            self.solver = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(), device)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -247,17 +241,13 @@ class SoftPad:
 
     def _step(self) -> None:
         assert self.solver is not None
-        poses = self._poses(self._depth)
-        case = None
-        if self.scene.moves == "case":
-            case = self._case()
-        self._failed |= self.solver.drive(poses, case)
+        self._failed |= self.solver.drive(self._poses(), self._case())
 
     def _settle_depth(self) -> None:
         """Drive until the coat, not the barrier's shell, is at the depth."""
         assert self.solver is not None
         for _ in range(_REFINEMENTS):
-            clearance = self._reader.clearance(self.solver, self._poses(self._depth))
+            clearance = self._reader.clearance(self.solver, self._poses())
             off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
             if np.abs(off).max() < _CLOSE:
                 return
@@ -266,12 +256,7 @@ class SoftPad:
 
     def _release(self, depth: np.ndarray, fraction: float) -> None:
         assert self.solver is not None
-        lift = np.array(
-            [
-                place[2] - self._touch(place[0] + shear[0], place[1] + shear[1], twist)
-                for place, shear, twist in zip(self._origin, self._shear, self._twist, strict=True)
-            ]
-        )
+        lift = self._places.lift(self._shear, self._twist)
         if self._is_free:
             if fraction == 1.0:
                 self.solver.reset()
@@ -286,7 +271,8 @@ class SoftPad:
             return
         self._depth = np.maximum(self._depth, -self.mesh.d_hat)
         if not np.isfinite(self._stiffness).all():
-            self._stiffness = np.array([self._first_stiffness(b) for b in range(self.num_envs)])
+            wanted = np.nan_to_num(self._force)
+            self._stiffness = np.array([self._places.stiffness(b, self._twist[b], wanted[b]) for b in range(self.num_envs)])
         borne = self._normal_force()
         for _ in range(_PATIENCE):
             missing = np.where(np.isfinite(self._force) & ~self._failed, self._force - borne, 0.0)
@@ -307,7 +293,7 @@ class SoftPad:
         assert self.solver is not None and self._weight > 0.0
         self.solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
-            self._failed |= self.solver.drive(self._poses(self._depth))
+            self._failed |= self.solver.drive(self._poses())
             if (self.solver.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
                 return
         self._failed |= self.solver.speed() >= _STILL
@@ -338,7 +324,7 @@ class SoftPad:
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
             )
         failed: np.ndarray = self._failed.copy()
-        reading = self._reader.read(self.solver, self._poses(self._depth), failed)
+        reading = self._reader.read(self.solver, self._poses(), failed)
         self._last = reading
         surface, forces = reading.surface, reading.forces
         assert surface.coat is not None
@@ -347,8 +333,9 @@ class SoftPad:
         torque = (arm[:, :, 0] * forces[:, :, 1] - arm[:, :, 1] * forces[:, :, 0]).sum(axis=1)
         cell = self.grid.pitch[0] * self.grid.pitch[1]
         area = np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
-        depth = np.where(failed, np.nan, self._origin[:, 2] - reading.poses[:, 2, 3])
-        case = self._case() if self.scene.moves == "case" else np.tile(np.eye(4), (batch, 1, 1))
+        depth = np.where(failed, np.nan, self._places.origin[:, 2] - reading.poses[:, 2, 3])
+        case = self._case()
+        case = np.tile(np.eye(4), (batch, 1, 1)) if case is None else case
         case[failed] = np.nan
         return SoftState(
             stage,
@@ -368,53 +355,15 @@ class SoftPad:
 
     # --- places ----------------------------------------------------------------------------------------------------------------
 
-    def _poses(self, depth: np.ndarray) -> np.ndarray:
-        """``pad_from_object`` with the coat ``depth`` [m] (B,) below first touch: the object is higher by the clearance; (B, 4, 4)."""
-        poses = np.tile(np.eye(4), (self.num_envs, 1, 1))
-        for b in range(self.num_envs):
-            poses[b, :3, :3] = about_z(self._twist[b]) @ self._rotation
-        poses[:, :3, 3] = self._origin
-        poses[:, :2, 3] += self._shear
-        poses[:, 2, 3] += self._kept - depth
-        return poses
+    def _poses(self) -> np.ndarray:
+        """``pad_from_object`` as driven: higher than the depth says by the clearance; (B, 4, 4)."""
+        return self._places.poses(self._kept - self._depth, self._shear, self._twist)
 
-    def _case(self) -> np.ndarray:
-        """``world_from_pad`` (B, 4, 4) of a case that moves: the object stays where it is at first touch, as in ``PressRig``."""
-        poses = np.tile(np.eye(4), (self.num_envs, 1, 1))
-        for b in range(self.num_envs):
-            turn = about_z(-self._twist[b])
-            way = np.array([*self._shear[b], self._kept[b] - self._depth[b]])
-            poses[b, :3, :3] = turn
-            poses[b, :3, 3] = self._origin[b] - turn @ (way + self._origin[b])
-        return poses
-
-    def _first_place(self, b: int) -> np.ndarray:
-        """Where the object's origin is at first touch, (3,) [m]; at the pad's middle for an environment that is lost."""
-        x, y = np.zeros(2) if self._lost[b] else np.asarray(self.scene.object.position[:2]) + self._offsets[b]
-        try:
-            return np.array([x, y, self._touch(x, y, 0.0)])
-        except InputError as error:
-            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
-            raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
-
-    def _touch(self, x: float, y: float, twist: float) -> float:
-        """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
-        key = x, y, twist
-        if key not in self._touches:
-            pose = np.eye(4)
-            pose[:3, :3] = about_z(twist) @ self._rotation
-            pose[:2, 3] = x, y
-            self._touches[key] = first_touch_z(self.parts, pose, self.sensor.gelpad, self.grid)
-        return self._touches[key]
-
-    def _first_stiffness(self, b: int) -> float:
-        """Force over depth [N/m] that the layer's law expects where the force is reached: a start for the search."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = about_z(self._twist[b]) @ self._rotation, self._origin[b]
-        gap = gap_at_touch(self.parts, pose, self.grid)
-        law = LoadLaw(gap, self.grid.pitch[0] * self.grid.pitch[1], self.sensor.gelpad)
-        force = float(np.nan_to_num(self._force[b]))
-        return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
+    def _case(self) -> np.ndarray | None:
+        """``world_from_pad`` (B, 4, 4) if the case moves."""
+        if self.scene.moves != "case":
+            return None
+        return self._places.case(self._kept - self._depth, self._shear, self._twist)
 
     def _body(self):
         deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
@@ -427,7 +376,7 @@ class SoftPad:
             "sag": _SAG * self.mesh.d_hat,
         }
         try:
-            return object_body(self.parts, self.scene.object, self._rotation, **settings)
+            return object_body(self.parts, self.scene.object, self._places.rotation, **settings)
         except InputError as error:
             raise SpecError(
                 error.rule, file=self.scene.source, key=error.name, value=error.value, choices=error.choices

@@ -57,8 +57,8 @@ class SoftContact:
         placed = type(body)(**{**{name: getattr(body, name) for name in body.__dataclass_fields__}, "pose": pose})
         try:
             self.world = ipc.World([pad_body(mesh, gelpad), placed], settings, num_envs=len(starts), device=device)
-            if len(starts) > 1 and not isinstance(body, ipc.AffineBody):
-                self._teleport(starts)
+            if len(starts) > 1:
+                self._spread(starts)
         except ipc.OverlapError as error:
             raise RaytacError(f"the object overlaps the pad where it starts, 1 mm above the first touch: {error}") from error
         self._start = self.world.save()
@@ -119,8 +119,14 @@ class SoftContact:
         at = self.world.positions(OBJECT)[:, self.world.surface(OBJECT)[0]] - self._world_from_pad[:, None, :3, 3]
         return at @ self._world_from_pad[:, :3, :3], self._object_faces
 
-    def _teleport(self, starts: np.ndarray) -> None:
-        self.world.teleport(OBJECT, starts[:, :3, 3], _quaternions(starts))
+    def _spread(self, starts: np.ndarray) -> None:
+        """Put the object of each environment at its own start; all have the same attitude."""
+        if not isinstance(self.body, ipc.AffineBody):
+            self.world.teleport(OBJECT, starts[:, :3, 3], _quaternions(starts))
+            return
+        state, free = self.world.save(), len(self.mesh.tets.vertices)
+        state.y[:, free:] += (starts[:, :3, 3] - starts[0, :3, 3])[:, None]
+        self.world.restore(state)
 
 
 def _quaternions(poses: np.ndarray) -> np.ndarray:

@@ -211,6 +211,26 @@ def test_a_resting_weight_presses_with_its_weight():
     assert not pad.surface(states[2]).contact.any()
 
 
+def test_free_objects_lie_where_their_offsets_put_them():
+    offsets = np.array([[0.0, 0.0], [3e-3, 1e-3]])
+    pad = soft(press(indent(force=0.3), dynamics="affine"), num_envs=2, offsets=offsets)
+    state = pad.peak(pad.run())
+    assert not state.failed.any() and state.normal_force == pytest.approx([0.3, 0.3], rel=0.01)
+    assert np.abs(pad.surface(state).contact_centre - offsets).max() < 0.4e-3  # the second rolls a little down the dome
+
+
+@pytest.mark.slow
+def test_a_soft_object_gives_way():
+    """A ball as soft as the gel shares the depth with it; needs pytetwild, whose mesh is kept in the user's cache."""
+    pytest.importorskip("pytetwild")
+    hard, squash = (soft(press(indent(0.5e-3), dynamics=d, youngs_modulus=m)) for d, m in (("kinematic", 1e6), ("soft", 2e5)))
+    one, two = hard.peak(hard.run()), squash.peak(squash.run())
+    assert not two.failed[0] and 0.1 * one.normal_force[0] < two.normal_force[0] < 0.8 * one.normal_force[0]
+    assert squash.surface(two).indentation.max() < 0.8 * hard.surface(one).indentation.max()
+    under = squash.object_height(squash.surface(two))
+    assert under is not None and np.abs((under - squash.surface(two).height)[squash.surface(two).contact]).max() < 3e-5
+
+
 def test_force_against_depth_is_the_bonded_layers():
     """Without friction, small strain: Dimitriadis' law of a sphere on a bonded layer, which LoadLaw is held to, within 5 %."""
     fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
