@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -66,6 +66,8 @@ class Args(CommonOptions):
     """μ of the press."""
     spread: float = 0.0
     """Share by which environments of the press differ in depth, drawn at random; 0: all do the same. In [0, 1)."""
+    stages: bool = False
+    """On CUDA, go through each scene once more, kernel by kernel: a step that is one recorded graph does not tell its stages apart."""
     limit_s: float = 120.0
     """A measurement stops after the step in which this time is up [s]; its steps so far count."""
 
@@ -146,9 +148,9 @@ def run(world_of: Iterator[tuple[ipc.World, str]], num_envs: int, device: str, l
     )
 
 
-def press_scene(size: int, envs: int, args: Args) -> Iterator[tuple[ipc.World, str]]:
+def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Down for ``PRESS`` steps, then at rest."""
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction)
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, cuda_graph=cuda_graph)
     world = press_world(CELLS[size], settings, envs, args.device)
     share = 1 - args.spread * np.random.default_rng(args.seed).random(envs)
     for step in range(PRESS + HOLD):
@@ -158,14 +160,19 @@ def press_scene(size: int, envs: int, args: Args) -> Iterator[tuple[ipc.World, s
         yield world, "press" if step < PRESS else "hold"
 
 
-def peg_scene(envs: int, args: Args) -> Iterator[tuple[ipc.World, str]]:
+def peg_scene(envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Close the grip, then lower the peg into the hole."""
-    world = peg_world(envs, args.device)
+    world = peg_world(envs, args.device, cuda_graph)
     for phase in peg_drive(world):
         yield world, phase
 
 
-def common_metrics(key: str, run: Run, timed: tuple[str, ...], envs: int) -> dict[str, Metric]:
+def stages_apart(done: Run, again: Callable[[], Run], args: Args) -> dict[str, float]:
+    """Seconds a step in each stage: of this run, or, where it was a recorded graph and ``--stages`` asks, of one without."""
+    return again().stages if done.world.device.is_cuda and args.stages else done.stages
+
+
+def common_metrics(key: str, run: Run, timed: tuple[str, ...], envs: int, stages: dict[str, float]) -> dict[str, Metric]:
     """What both scenes tell: times over the phases ``timed``, without the first step."""
     chosen = np.isin(run.phases[1:], timed)
     newton = np.array([report.newton.max() for report in run.reports])
@@ -185,7 +192,7 @@ def common_metrics(key: str, run: Run, timed: tuple[str, ...], envs: int) -> dic
         f"{key}.converged": int(all(report.converged.all() for report in run.reports)),
         f"{key}.not_converged_env_steps": int(sum((~report.converged).sum() for report in run.reports)),
         f"{key}.min_gap_um": 1e6 * float(min(report.min_gap.min() for report in run.reports)),
-        **{f"{key}.stage_ms.{name}": 1e3 * seconds for name, seconds in run.stages.items()},
+        **{f"{key}.stage_ms.{name}": 1e3 * seconds for name, seconds in stages.items()},
     }
 
 
@@ -209,7 +216,10 @@ def measure_press(size: int, envs: int, args: Args) -> dict[str, Metric]:
     done = run(press_scene(size, envs, args), envs, args.device, args.limit_s)
     key = f"{done.world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
     hold = done.seconds[np.isin(done.phases[1:], ("hold",))]
-    metrics = common_metrics(key, done, ("press",), envs) | {
+    stages = stages_apart(
+        done, lambda: run(press_scene(size, envs, args, cuda_graph=False), envs, args.device, args.limit_s), args
+    )
+    metrics = common_metrics(key, done, ("press",), envs, stages) | {
         f"{key}.vertices": len(done.world.positions("pad")[0]),
         f"{key}.force_n": float(done.world.wrench("ball").force[:, 2].max()),
     }
@@ -227,7 +237,8 @@ def measure_peg(envs: int, args: Args) -> dict[str, Metric]:
     key = f"{world.device.alias.split(':')[0]}.peg{vertices // 2}" + (f"x{envs}" if envs > 1 else "")
     A, p = world.affine_pose("peg")
     slip = p[:, 2] - world.frame("left")[1][:, 2]
-    metrics = common_metrics(key, done, ("close", "lower"), envs) | {
+    stages = stages_apart(done, lambda: run(peg_scene(envs, args, cuda_graph=False), envs, args.device, args.limit_s), args)
+    metrics = common_metrics(key, done, ("close", "lower"), envs, stages) | {
         f"{key}.vertices": vertices,
         f"{key}.grip_n": float(world.wrench("right").force[:, 0].max()),
         f"{key}.hole_force_n": float(np.linalg.norm(world.wrench("hole").force, axis=1).max()),

@@ -4,18 +4,20 @@
     python experiments/bench_ipc_accuracy.py --out runs/bench_ipc_accuracy --device cuda
 
 The press of ``bench_ipc.py`` for each mesh and velocity tolerance; at the end of the way down the outer surface is compared with that of
-the ``--reference`` mesh at ``--reference-tolerance``, on a common grid of 0.1 mm: under the contact (as far out as the reference carries
-load) and around it (twice as far). The sphere, d̂ and κ are the same in all of them, so neither its facets nor the stand-off count as
-error. The reference is kept in DIR/references by content. docs/performance.md says what came out.
+the ``--reference`` mesh (mirrored cells) at ``--reference-tolerance`` and a linear tolerance of 1e-4, on a common grid of 0.1 mm: under
+the contact (as far out as the reference carries load) and around it (twice as far). The sphere, d̂ and κ are the same in all of them, so
+neither its facets nor the stand-off count as error. ``alike`` cells are those of ``ipc.domed_pad``, all cut the same way; ``mirrored``
+ones those of raytac's soft pad. The reference is kept in DIR/references by content. docs/performance.md says what came out.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,8 @@ from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.report.machine import machine
 
+KINDS = ("alike", "mirrored")
+"""How cells are cut: the benchmark's way, and raytac's."""
 PITCH = 1e-4
 """Of the grid on which surfaces are compared [m]."""
 
@@ -57,6 +61,8 @@ class Args(CommonOptions):
 
     sizes: str = "300,1400,5300,18000"
     """About how many vertices, joined by commas; the reference's own shows what the tolerance alone does."""
+    cells: str = "alike,mirrored"
+    """How cells are cut into tetrahedra, joined by commas."""
     tolerances: str = "1e-2,1e-3,1e-4,1e-5"
     """Velocity tolerances [m/s], joined by commas."""
     reference: int = 18000
@@ -117,10 +123,9 @@ def outer_surface(world: ipc.World) -> tuple[NDArray[np.int64], NDArray[np.int64
     return vertices[top].astype(np.int64), number[faces[top[faces].all(axis=1)]].astype(np.int64)
 
 
-def press(cells: tuple[int, int, int], tolerance: float, device: str) -> Press:
+def press(cells: tuple[int, int, int], mirrored: bool, settings: ipc.Settings, device: str) -> Press:
     """Down and hold, timed."""
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=tolerance)
-    world = press_world(cells, settings, 1, device)
+    world = press_world(cells, settings, 1, device, mirrored)
     vertices, triangles = outer_surface(world)
     seconds, busy, newton, converged = [], [], [], True
     points, radius, force = np.zeros(0), 0.0, 0.0
@@ -156,8 +161,8 @@ def press(cells: tuple[int, int, int], tolerance: float, device: str) -> Press:
 
 def reference_press(size: int, tolerance: float, device: str, folder: Path) -> Press:
     """The fine solution, computed unless ``folder`` holds one of the same mesh, sphere, drive and settings."""
-    mesh, base = press_pad(CELLS[size])
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=tolerance)
+    mesh, base = press_pad(CELLS[size], mirrored=True)
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=tolerance, linear_tolerance=1e-4)
     digest = hashlib.sha256(repr((asdict(settings), asdict(MATERIAL), RADIUS, GAP, PRESS, HOLD)).encode())
     ball = ball_surface()
     drive = np.array([ball_height(step) for step in range(PRESS + HOLD)])
@@ -169,7 +174,7 @@ def reference_press(size: int, tolerance: float, device: str, folder: Path) -> P
         with np.load(path) as held:
             return Press(**{name: held[name] if held[name].ndim else held[name].item() for name in held.files})
     print(f"reference: {len(mesh.vertices)} vertices at {tolerance:g} m/s, kept as {path}", flush=True)
-    done = press(CELLS[size], tolerance, device)
+    done = press(CELLS[size], True, settings, device)
     folder.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial.npz")
     np.savez(partial, **asdict(done))
@@ -200,8 +205,9 @@ class Point:
     """What a tolerance on a mesh costs and brings: time of a step [ms], RMS height error under the contact [µm].
 
     Attributes:
-        off: against the reference; None for the reference's own mesh.
-        off_tolerance: against the same mesh at the least tolerance; None at that one.
+        ms: median press step [ms].
+        off: against the reference [µm]; None for the reference's own mesh.
+        off_tolerance: against the same mesh at the least tolerance [µm]; None at that one.
     """
 
     ms: float
@@ -209,8 +215,8 @@ class Point:
     off_tolerance: float | None
 
 
-def draw(points: dict[tuple[int, str], Point], axis_label: str, path: Path) -> None:
-    """Height error against time of a step: all of it (filled) and what the tolerance does of it (open).
+def draw(points: dict[tuple[str, int, str], Point], axis_label: str, path: Path) -> None:
+    """Height error against time of a step: all of it by kind of cells, and what the tolerance does of it on the last kind.
 
     Colours of Okabe and Ito, told apart by marker too.
     """
@@ -222,7 +228,9 @@ def draw(points: dict[tuple[int, str], Point], axis_label: str, path: Path) -> N
     from matplotlib.ticker import LogLocator, NullLocator
 
     looks = {300: ("#D55E00", "s"), 1400: ("#E69F00", "^"), 5300: ("#009E73", "D"), 18000: ("#0072B2", "o")}
-    sizes = [size for size in looks if any(s == size for s, _ in points)]
+    sizes = [size for size in looks if any(s == size for _, s, _ in points)]
+    kinds = [kind for kind in KINDS if any(k == kind for k, _, _ in points)]
+    fills: dict[str, Any] = {"alike": ("--", "bottom"), "mirrored": ("-", "full")}
     style: dict[Any, Any] = {
         "font.size": 8,
         "axes.linewidth": 0.6,
@@ -232,22 +240,25 @@ def draw(points: dict[tuple[int, str], Point], axis_label: str, path: Path) -> N
         "ytick.labelsize": 7,
     }
     with plt.rc_context(style):
-        figure, axes = plt.subplots(figsize=(3.5, 3.2), layout="constrained")
+        figure, axes = plt.subplots(figsize=(3.5, 3.3), layout="constrained")
         for size in sizes:
-            colour, marker = looks[size]
-            chosen = [(tolerance, point) for (s, tolerance), point in points.items() if s == size]
-            look: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 4, "linewidth": 0.9}
-            whole = [(p.ms, p.off) for _, p in chosen if p.off]
-            axes.plot([p[0] for p in whole], [p[1] for p in whole], **look)
-            alone = [(p.ms, p.off_tolerance, tolerance) for tolerance, p in chosen if p.off_tolerance]
-            axes.plot([p[0] for p in alone], [p[1] for p in alone], linestyle=":", markerfacecolor="white", **look)
+            look: dict[str, Any] = {"color": looks[size][0], "marker": looks[size][1], "markersize": 4.5, "linewidth": 0.9}
+            for kind in kinds:
+                whole = [(p.ms, p.off) for (k, s, _), p in points.items() if (k, s) == (kind, size) and p.off]
+                axes.plot(
+                    [p[0] for p in whole], [p[1] for p in whole], linestyle=fills[kind][0], fillstyle=fills[kind][1], **look
+                )
+            alone = [
+                (p.ms, p.off_tolerance, t) for (k, s, t), p in points.items() if (k, s) == (kinds[-1], size) and p.off_tolerance
+            ]
+            axes.plot([p[0] for p in alone], [p[1] for p in alone], linestyle=":", fillstyle="none", **look)
             names: list[str] = []
             for (ms, off, tolerance), after in zip(alone, [*alone[1:], None], strict=True):
                 names.append(f"$10^{{{round(np.log10(float(tolerance)))}}}$")
                 if after is not None and max(ms / after[0], after[0] / ms) < 1.3 and max(off / after[1], after[1] / off) < 1.6:
                     continue  # too close for two labels
                 place = {"xytext": (4, -1) if len(names) == 1 else (-5, 6), "textcoords": "offset points"}
-                axes.annotate(", ".join(names), (ms, off), fontsize=6, color=colour, **place)
+                axes.annotate(", ".join(names), (ms, off), fontsize=6, color=looks[size][0], **place)
                 names = []
         axes.set(xscale="log", yscale="log", xlabel=axis_label, ylabel="height error under the contact, RMS [µm]")
         for axis in (axes.xaxis, axes.yaxis):
@@ -258,15 +269,15 @@ def draw(points: dict[tuple[int, str], Point], axis_label: str, path: Path) -> N
         axes.grid(True, linewidth=0.3, color="0.88")
         axes.set_axisbelow(True)
         axes.margins(x=0.12, y=0.08)
-        look = {"markersize": 4, "linewidth": 0.9}
+        size_of: dict[str, Any] = {"markersize": 4.5, "linewidth": 0.9}
         handles = [
-            Line2D([], [], color=looks[s][0], marker=looks[s][1], label=f"{vertices(s):,} vertices", **look) for s in sizes
+            Line2D([], [], color=looks[s][0], marker=looks[s][1], label=f"{vertices(s):,} vertices", **size_of) for s in sizes
         ]
-        grey: dict[str, Any] = {"color": "0.3", "marker": "o", **look}
+        grey: dict[str, Any] = {"color": "0.3", "marker": "o", **size_of}
         handles += [
-            Line2D([], [], label="mesh and tolerance", **grey),
-            Line2D([], [], label="tolerance [m/s] alone", linestyle=":", markerfacecolor="white", **grey),
+            Line2D([], [], label=f"{kind} cells", linestyle=fills[kind][0], fillstyle=fills[kind][1], **grey) for kind in kinds
         ]
+        handles.append(Line2D([], [], label="tolerance [m/s] alone", linestyle=":", fillstyle="none", **grey))
         figure.legend(handles=handles, frameon=False, ncols=2, loc="outside upper center")
         figure.savefig(path, dpi=300)
         plt.close(figure)
@@ -280,7 +291,7 @@ def vertices(size: int) -> int:
 def main(args: Args) -> int:
     begin = time.perf_counter()
     sizes = parse_numbers(args.sizes, "sizes", tuple(CELLS))
-    tolerances = parse_names(args.tolerances, "tolerances")
+    tolerances, kinds = parse_names(args.tolerances, "tolerances"), parse_names(args.cells, "cells", KINDS)
     for tolerance in tolerances:
         try:
             good = 0 < float(tolerance) < np.inf
@@ -304,21 +315,25 @@ def main(args: Args) -> int:
         "reference.converged": int(truth.converged),
     }
     device = "cuda" if args.device == "cuda" or (args.device == "auto" and wp.is_cuda_available()) else "cpu"
-    points: dict[tuple[int, str], Point] = {}
-    for size in sizes:
-        wanted = [t for t in tolerances if size != args.reference or float(t) > args.reference_tolerance]
-        found = {tolerance: press(CELLS[size], float(tolerance), args.device) for tolerance in wanted}
+    points: dict[tuple[str, int, str], Point] = {}
+    for size, kind in itertools.product(sizes, kinds):
+        own = size == args.reference and kind == "mirrored"
+        wanted = [t for t in tolerances if not own or float(t) > args.reference_tolerance]
+        settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION)
+        found = {
+            t: press(CELLS[size], kind == "mirrored", replace(settings, velocity_tolerance=float(t)), args.device) for t in wanted
+        }
         least = min(found, key=float, default="")
         for tolerance, run in found.items():
-            key = f"{device}.{size}.{tolerance}"
+            key = f"{device}.{size}.{tolerance}" if kind == "alike" else f"{device}.{kind}.{size}.{tolerance}"
             off = errors(run, truth)
             alone = None
-            if size == args.reference:
+            if own:
                 alone = float(off["rms_um.contact"])
             elif tolerance != least:
                 alone = float(errors(run, found[least])["rms_um.contact"])
             ms = run.ms if device == "cuda" else run.processor_ms
-            points[size, tolerance] = Point(ms, None if size == args.reference else float(off["rms_um.contact"]), alone)
+            points[kind, size, tolerance] = Point(ms, None if own else float(off["rms_um.contact"]), alone)
             metrics |= {f"{key}.{name}": value for name, value in off.items()}
             metrics |= {
                 f"{key}.force_n": run.force,
@@ -331,7 +346,7 @@ def main(args: Args) -> int:
             if alone is not None:
                 metrics[f"{key}.tolerance_rms_um.contact"] = alone
             print(
-                f"{key:18} {ms:9.2f} ms  newton {run.newton:5.2f}  contact {off['rms_um.contact']:8.3f} µm (max "
+                f"{key:24} {ms:9.2f} ms  newton {run.newton:5.2f}  contact {off['rms_um.contact']:8.3f} µm (max "
                 f"{off['max_um.contact']:8.3f})  around {off['rms_um.around']:8.3f} µm (max {off['max_um.around']:8.3f})  "
                 f"tolerance alone {alone or 0:7.3f} µm  force {100 * float(off['force_error']):+7.2f} %, "
                 f"held {100 * float(off['force_held_error']):+7.2f} %",

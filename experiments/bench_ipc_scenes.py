@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ipc
+from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.specs.sensor import GelpadSpec
 
 __all__ = [
     "CELLS",
@@ -45,9 +47,21 @@ PRESS, HOLD, DT, D_HAT, FRICTION = 20, 5, 0.01, 1e-4, 0.5
 """Steps down, steps at rest, time step [s], d̂ [m] and μ."""
 
 
-def press_pad(cells: tuple[int, int, int]) -> tuple[ipc.TetMesh, NDArray[np.int64]]:
-    """The flat pad and its bonded vertices: those of the base."""
-    mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells)
+def press_pad(cells: tuple[int, int, int], mirrored: bool = False) -> tuple[ipc.TetMesh, NDArray[np.int64]]:
+    """The flat pad and its bonded vertices: those of the base.
+
+    Args:
+        cells: in x, y and z; with ``mirrored`` those in x and y are even, and y follows from x.
+        mirrored: every cell is cut into the mirror image of its neighbour's tetrahedra, as in raytac's soft pad, which locks less.
+    """
+    if mirrored:
+        level = PadLevel(SIZE[0] / cells[0], cells[2], 1.0, 1.0, D_HAT)
+        flat = (math.inf, math.inf)
+        mesh = pad_mesh(
+            GelpadSpec(SIZE, THICKNESS, flat, MATERIAL.young, MATERIAL.poisson, MATERIAL.density, FRICTION), level
+        ).tets
+    else:
+        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells)
     return mesh, ipc.vertices_in_box(mesh, (-1, -1, -THICKNESS), (1, 1, -THICKNESS))
 
 
@@ -61,9 +75,11 @@ def ball_height(step: int) -> float:
     return RADIUS + GAP - TRAVEL * min(step + 1, PRESS) / PRESS
 
 
-def press_world(cells: tuple[int, int, int], settings: ipc.Settings, num_envs: int, device: str) -> ipc.World:
+def press_world(
+    cells: tuple[int, int, int], settings: ipc.Settings, num_envs: int, device: str, mirrored: bool = False
+) -> ipc.World:
     """The pad and, above it, the sphere."""
-    mesh, base = press_pad(cells)
+    mesh, base = press_pad(cells, mirrored)
     pad = ipc.SoftBody("pad", mesh, MATERIAL, bonded=base)
     ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP)))
     return ipc.World([pad, ball], settings, num_envs=num_envs, device=device)
@@ -115,14 +131,16 @@ def _pad_poses() -> tuple[ipc.Pose, ipc.Pose]:
     return ipc.Pose((-half, 0.0, 0.0), (r, 0.0, r, 0.0)), ipc.Pose((half, 0.0, 0.0), (r, 0.0, -r, 0.0))
 
 
-def peg_world(num_envs: int, device: str) -> ipc.World:
+def peg_world(num_envs: int, device: str, cuda_graph: bool = True) -> ipc.World:
     """Two pads of 140 vertices, a free peg between them and, below it, a block with a hole that is off the peg's axis.
 
     As in the peg scene of Taccel (two pads of 139 vertices and an affine peg; h = 20 ms, d̂ = 0.1 mm, tolerance 1e-3 m/s; at most 20
     Newton and 40 PCG iterations, where here every step converges); meshes and motion are ours. ε_v is the velocity tolerance: friction
     that is resolved finer than the rest is stiff for nothing.
     """
-    settings = ipc.Settings(dt=PEG_DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=1e-3, friction_velocity=1e-3)
+    settings = ipc.Settings(
+        dt=PEG_DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=1e-3, friction_velocity=1e-3, cuda_graph=cuda_graph
+    )
     mesh = ipc.domed_pad(PEG_PAD, PEG_THICKNESS, (math.inf, math.inf), PEG_CELLS)
     base = ipc.vertices_in_box(mesh, (-1, -1, -PEG_THICKNESS), (1, 1, -PEG_THICKNESS))
     left, right = _pad_poses()

@@ -12,13 +12,15 @@ import ipc
 Floats = NDArray[np.floating]
 
 
-def ring_plan(radii: Sequence[float] | Floats, counts: Sequence[int]) -> tuple[Floats, NDArray[np.int64]]:
-    """A disc of triangles: a centre and rings of ``counts`` points at ``radii`` [m], every other ring turned by half a point.
+def ring_plan(radii: Sequence[float] | Floats, counts: Sequence[int], straight: int = 0) -> tuple[Floats, NDArray[np.int64]]:
+    """A disc of triangles: a centre and rings of ``counts`` points at ``radii`` [m].
+
+    Ring ``straight`` has a point on the x axis, and every other ring from there is turned by half a point.
 
     Returns:
         Points (n, 2), the centre first and then ring by ring, and triangles (T, 3), counter-clockwise.
     """
-    turns = [0.5 * (k % 2) for k in range(len(counts))]
+    turns = [0.5 * ((k - straight) % 2) for k in range(len(counts))]
     points = [np.zeros((1, 2))]
     for radius, count, turn in zip(radii, counts, turns, strict=True):
         angle = 2 * np.pi * (np.arange(count) + turn) / count
@@ -69,7 +71,9 @@ def growing(start: float, cell: float, growth: float, reach: float) -> Floats:
     return start + np.array(line[1:]) * ((reach - start) / line[-1])
 
 
-def round_block(fine: Floats, counts: Sequence[int], depth: Floats, growth: float, reach: float) -> tuple[ipc.TetMesh, NDArray]:
+def round_block(
+    fine: Floats, counts: Sequence[int], depth: Floats, growth: float, reach: float, straight: int = 0
+) -> tuple[ipc.TetMesh, NDArray]:
     """A cylinder of radius and height ``reach`` [m] with its upper side at z = 0, and its vertices on the side and below.
 
     Args:
@@ -78,11 +82,12 @@ def round_block(fine: Floats, counts: Sequence[int], depth: Floats, growth: floa
         depth: depths of the layers that are given [m], from 0; further ones grow from the last.
         growth: ratio of one cell to the one before it.
         reach: [m].
+        straight: see :func:`ring_plan`.
     """
     radii = np.concatenate([fine, growing(fine[-1], fine[-1] - fine[-2], growth, reach)])
     steps = np.diff(radii, prepend=0.0)[len(fine) :]
     outer = [min(counts[-1], max(24, round(2 * np.pi * r / h))) for r, h in zip(radii[len(fine) :], steps, strict=True)]
-    xy, triangles = ring_plan(radii, [*counts, *outer])
+    xy, triangles = ring_plan(radii, [*counts, *outer], straight)
     z = np.concatenate([depth, growing(depth[-1], depth[-1] - depth[-2], growth, reach)])
     mesh = extruded(xy, triangles, -z[::-1])
     v = mesh.vertices
@@ -108,7 +113,7 @@ def rim_block(contact: float, cells: int, growth: float, reach: float) -> tuple[
     inner = contact * (1 - squares[-2::-1])
     counts = [max(6, round(around * r / contact)) for r in inner] + [around] * len(squares_out)
     fine = np.concatenate([inner, contact * (1 + squares_out)]) * equal_area(around)
-    return round_block(fine, counts, contact * squares[squares < 1.3], growth, reach)
+    return round_block(fine, counts, contact * squares[squares < 1.3], growth, reach, cells - 1)
 
 
 def equal_area(corners: int) -> float:
@@ -120,7 +125,7 @@ def flat_tool(contact: float, cells: int) -> ipc.TriMesh:
     """A disc facing down with the rim of :func:`rim_block`."""
     around = round(2 * np.pi * cells)
     share = np.arange(1, 2 * cells + 1) / (2 * cells)
-    xy, triangles = ring_plan(contact * equal_area(around) * share, [max(6, round(around * s)) for s in share])
+    xy, triangles = ring_plan(contact * equal_area(around) * share, [max(6, round(around * s)) for s in share], 2 * cells - 1)
     return ipc.TriMesh(np.column_stack([xy, np.zeros(len(xy))]).astype(np.float64), triangles[:, ::-1])
 
 

@@ -138,10 +138,32 @@ def vertices_in_box(mesh: TetMesh, low: ArrayLike, high: ArrayLike, tolerance: f
     return np.flatnonzero(inside)
 
 
-def vertices_near(mesh: TetMesh, points: ArrayLike, distance: float) -> NDArray[np.int64]:
-    """Vertices of ``mesh`` within ``distance`` [m] of any of ``points`` [m], shape (P, 3)."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+def vertices_near(mesh: TetMesh, what: TriMesh | ArrayLike, distance: float) -> NDArray[np.int64]:
+    """Vertices of ``mesh`` within ``distance`` [m] of a surface, or of any of the points ``what`` [m], shape (P, 3)."""
+    if not distance >= 0:
+        raise IpcError(f"distance = {distance}: it cannot be negative")
+    if isinstance(what, TriMesh):
+        corners = what.vertices[what.faces]
+    else:
+        corners = np.repeat(np.asarray(what, dtype=np.float64).reshape(-1, 1, 3), 3, axis=1)
     near = np.zeros(len(mesh.vertices), bool)
-    for chunk in np.array_split(points, max(1, len(points) // 256)):
-        near |= (((mesh.vertices[:, None] - chunk[None]) ** 2).sum(-1) <= distance**2).any(axis=1)
+    for a, b, c in corners:
+        near |= _squared_distance(mesh.vertices, a, b, c) <= distance**2
     return np.flatnonzero(near)
+
+
+def _squared_distance(points: NDArray[np.float64], *corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared distances of points (V, 3) to one triangle: of its plane where the foot lies inside, else the least of its edges."""
+    squared = np.full(len(points), np.inf)
+    for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
+        edge, rel = end - start, points - start
+        along = np.clip(rel @ edge / max(edge @ edge, 1e-300), 0.0, 1.0)
+        squared = np.minimum(squared, ((rel - along[:, None] * edge) ** 2).sum(axis=1))
+    u, v, rel = corners[1] - corners[0], corners[2] - corners[0], points - corners[0]
+    normal = np.cross(u, v)
+    size = normal @ normal
+    if size == 0:
+        return squared
+    s, t = np.cross(rel, v) @ normal / size, np.cross(u, rel) @ normal / size
+    inside = (s >= 0) & (t >= 0) & (s + t <= 1)
+    return np.where(inside, (rel @ normal) ** 2 / size, squared)

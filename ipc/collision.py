@@ -18,7 +18,7 @@ from ipc.trees import Trees, trees_pay
 
 __all__ = ["Collision"]
 
-_GROW = 1.5
+_GROW = 2
 
 
 class Collision:
@@ -124,12 +124,12 @@ class Collision:
         self._stale = wp.zeros(batch, dtype=wp.int32, device=device)
         self.candidates = contact.Candidates()
         self.candidates.pt_count, self.candidates.ee_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
-        self._size_candidates(256, 256)
+        self._size_candidates(512, 1024)
         self.contacts = contact.Contacts()
         self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self.lagged, self._old = friction.Lagged(), friction.Lagged()
         self.lagged.count, self._old.count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
-        self._size_contacts(128, 256)
+        self._size_contacts(256, 768)
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
         self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
         self._change = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
@@ -166,7 +166,7 @@ class Collision:
                 setattr(lagged, name, new)
 
     def grow(self) -> None:
-        """Make room for what did not fit, and for half as much again; the lists are made anew at the next look."""
+        """Make room for what did not fit, and for as much again; the lists are made anew at the next look."""
         counts = (self.candidates.pt_count, self.candidates.ee_count, self.contacts.count, self.contacts.row_count)
         rooms = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
         most = [int(c.numpy().max()) for c in counts]

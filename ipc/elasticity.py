@@ -6,9 +6,13 @@ With F = Σ_a x_a ∇w_aᵀ and J = det F:
 ``stable_log`` (code 1)  Ψ = μ/2 (I_C − 3) + λ/2 (J − a)² − μ/2 ln(I_C + 1), a = 1 + 3μ/(4λ)      (Smith et al. 2018, eq. 14)
 ``orthogonal`` (code 2)  Ψ = μ ‖F Fᵀ − 1‖²                                                        (Lan et al. 2022, eq. 6)
 
-For the first two, P = m F + c cof F with m = μ or μ (1 − 1/(I_C + 1)) and c = λ (J − 1) − μ or λ (J − a). The second derivative is
+To the first two comes, below J = J₀ = 0.2, the barrier −λ (J − J₀)² ln(J/J₀), of the form of the contact barrier: without it a collapsed
+element costs little, Newton's method runs against det F = 0 as against a wall, and nothing moves any more. Above J₀ it is zero.
 
-    δP = m δF + k F (F : δF) + λ cof F (cof F : δF) + c δ(cof F),        k = 0 or 2μ/(I_C + 1)²,
+For the first two, P = m F + c cof F with m = μ or μ (1 − 1/(I_C + 1)) and c = λ (J − 1) − μ or λ (J − a), plus the barrier's slope. The
+second derivative is
+
+    δP = m δF + k F (F : δF) + l cof F (cof F : δF) + c δ(cof F),        k = 0 or 2μ/(I_C + 1)², l = λ plus the barrier's curvature,
 
 and every term but the last is positive semi-definite. The blocks need no 9×9 matrix: with g_a = ∇w_a, the last term couples corners
 a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-definite, ``geometric_factor`` shrinks c toward 0 until it is;
@@ -37,6 +41,39 @@ def cofactor(F: wp.mat33d) -> wp.mat33d:
     return wp.matrix_from_cols(wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1))
 
 
+INVERSION = wp.constant(wp.float64(0.2))
+"""J₀: an element squeezed to less than this share of its volume meets the barrier."""
+
+
+@wp.func
+def squeeze(det: wp.float64) -> wp.float64:
+    """The barrier over λ, −(J − J₀)² ln(J/J₀) below J₀ [-]."""
+    if det >= INVERSION:
+        return wp.float64(0.0)
+    if det <= wp.float64(0.0):
+        return wp.float64(1.0e30)
+    q = det - INVERSION
+    return -q * q * wp.log(det / INVERSION)
+
+
+@wp.func
+def squeeze_first(det: wp.float64) -> wp.float64:
+    """Its slope [-]."""
+    if det >= INVERSION or det <= wp.float64(0.0):
+        return wp.float64(0.0)
+    q = det - INVERSION
+    return -q * (wp.float64(2.0) * wp.log(det / INVERSION) + q / det)
+
+
+@wp.func
+def squeeze_second(det: wp.float64) -> wp.float64:
+    """Its curvature [-], never negative."""
+    if det >= INVERSION or det <= wp.float64(0.0):
+        return wp.float64(0.0)
+    q = (det - INVERSION) / det
+    return -wp.float64(2.0) * wp.log(det / INVERSION) - wp.float64(4.0) * q + q * q
+
+
 @wp.func
 def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
     """Ψ(F) [J/m³]."""
@@ -48,18 +85,20 @@ def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64
         return mu * wp.ddot(C, C)
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
-        return half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
-    return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + half * lam * (J - one) * (J - one)
+        kept = half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
+        return kept + lam * squeeze(J)
+    return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + half * lam * (J - one) * (J - one) + lam * squeeze(J)
 
 
 @wp.func
 def stress_factors(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.vec3d:
     """(m, c, k) of the module's docstring [Pa]."""
     one = wp.float64(1.0)
+    pressure = lam * (J - one + squeeze_first(J))
     if model == 1:
         q = one / (wp.ddot(F, F) + one)
-        return wp.vec3d(mu * (one - q), lam * (J - one) - wp.float64(0.75) * mu, wp.float64(2.0) * mu * q * q)
-    return wp.vec3d(mu, lam * (J - one) - mu, wp.float64(0.0))
+        return wp.vec3d(mu * (one - q), pressure - wp.float64(0.75) * mu, wp.float64(2.0) * mu * q * q)
+    return wp.vec3d(mu, pressure - mu, wp.float64(0.0))
 
 
 @wp.func
@@ -117,15 +156,17 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
     ic = wp.ddot(G, F0 + F1)
     # det(F0 + G) − det F0, term by term
     J = wp.ddot(cofactor(F0), G) + wp.ddot(F0, cofactor(G)) + wp.determinant(G)
-    both = wp.determinant(F0) + wp.determinant(F1)
+    J0, J1 = wp.determinant(F0), wp.determinant(F1)
+    both = J0 + J1
+    barrier = lam * (squeeze(J1) - squeeze(J0))
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
         z = ic / (wp.ddot(F0, F0) + one)
         log1p = wp.log(one + z)
         if wp.abs(z) < wp.float64(1.0e-3):
             log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
-        return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a)
-    return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0))
+        return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a) + barrier
+    return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0)) + barrier
 
 
 @wp.func
@@ -166,7 +207,7 @@ def element_state(
     J = wp.determinant(F)
     f = stress_factors(F, J, model[e], mu[e], lam[e])
     if project[env] != 0 and model[e] != 2:
-        f[1] = geometric_factor(F, f[0], f[2], lam[e], f[1])
+        f[1] = geometric_factor(F, f[0], f[2], lam[e] * (wp.float64(1.0) + squeeze_second(J)), f[1])
     el_F[env, e] = F
     el_P[env, e] = volume[e] * first_piola(F, J, model[e], mu[e], lam[e])
     el_mck[env, e] = f
@@ -238,10 +279,11 @@ def block_hessian(
             H += (wp.float64(4.0) * mu[e] * volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
         else:
             C = cofactor(F)
+            stiff = lam[e] * (wp.float64(1.0) + squeeze_second(wp.determinant(F)))
             H += volume[e] * (
                 (f[0] * wp.dot(ga, gb)) * one
                 + f[2] * wp.outer(ba, bb)
-                + lam[e] * wp.outer(C * ga, C * gb)
+                + stiff * wp.outer(C * ga, C * gb)
                 - f[1] * wp.skew(F * wp.cross(ga, gb))
             )
     blocks[env, upper[u, 1]] = H

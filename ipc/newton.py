@@ -27,9 +27,9 @@ from ipc import control, dynamics
 from ipc.control import Control
 from ipc.errors import SolverError
 from ipc.layout import Layout
-from ipc.linear import BlockJacobi, Preconditioner
 from ipc.pcg import Pcg
 from ipc.potential import Potential
+from ipc.preconditioner import make_preconditioner
 from ipc.reduce import MIN
 from ipc.settings import Settings
 
@@ -51,7 +51,7 @@ class Newton:
         self.control = Control(self.batch, potential.project, potential.collision.overflow, self.device)
         nodes, lanes = len(layout.node_rest), potential.collision.lanes
         self.pcg = Pcg(self.batch, nodes, lanes, self.device)
-        self.preconditioner: Preconditioner = BlockJacobi(self.batch, nodes, lanes, self.device)
+        self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._graphs: dict[str, Any] = {}
@@ -183,8 +183,7 @@ class Newton:
         """Friction of the environments that rest, or begin, from their contacts as they are."""
         pot, ctl = self.potential, self.control
         with self._stage("lag"):
-            pot.assemble(ctl.decisions.pending)
-            self._note_extremes(ctl.decisions.pending)
+            pot.touch(ctl.decisions.pending)
             ctl.launch(control.choose_lagging)
             pot.collision.lag(ctl.decisions.lagging, ctl.decisions.changed)
             ctl.launch(control.after_lag, self.settings.friction_tolerance)

@@ -1,8 +1,7 @@
 """Preconditioned conjugate gradients for a batch of systems, all at once, each with its own step lengths and its own end.
 
 On CUDA an iteration is six launches that can be recorded: sums are taken by blocks of threads, and every thread adds the few shares of
-its environment itself instead of waiting for a launch that does. Warp's own conjugate gradients take 10 ms for one dot product of
-9,450 numbers on a CPU; there one thread an environment does everything.
+its environment itself instead of waiting for a launch that does. Small systems, and all on a CPU, go to :mod:`ipc.pcg_block`.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -16,6 +15,7 @@ import warp as wp
 
 from ipc.contact import Contacts
 from ipc.linear import BlockJacobi, Preconditioner, SystemView, add_row, block_row, multiply_blocks, multiply_rows
+from ipc.pcg_block import THREADS, Scalars, solve_in_one_block
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 
 __all__ = ["Pcg"]
@@ -24,16 +24,8 @@ wp.set_module_options({"enable_backward": False})
 
 ROUNDS = 4
 """Iterations between two looks at whether any environment still runs."""
-
-
-@wp.struct
-class Scalars:
-    """Per environment: r·z (of even and odd iterations), ‖r‖² at the start, iterations, and the negative-curvature flag."""
-
-    rz: wp.array2d(dtype=wp.float64)
-    rr0: wp.array(dtype=wp.float64)
-    iterations: wp.array(dtype=wp.int32)
-    negative: wp.array(dtype=wp.int32)
+ONE_BLOCK_NODES = 3000
+"""Nodes up to which a system is left to one block of threads."""
 
 
 @wp.kernel
@@ -183,61 +175,6 @@ def multiply_in_order(
         curvature[env] = product_in_order(system, contacts, env, p, Ap)
 
 
-@wp.kernel
-def solve_in_one_thread(
-    system: SystemView,
-    contacts: Contacts,
-    inverse: wp.array2d(dtype=wp.mat33d),
-    tolerance: wp.float64,
-    max_iterations: wp.int32,
-    active: wp.array(dtype=wp.int32),
-    p: wp.array2d(dtype=wp.vec3d),
-    Ap: wp.array2d(dtype=wp.vec3d),
-    # outputs
-    r: wp.array2d(dtype=wp.vec3d),
-    x: wp.array2d(dtype=wp.vec3d),
-    s: Scalars,
-):
-    """All iterations of one environment, one after the other: what a CPU does anyway, without a launch for every vector operation."""
-    env = wp.tid()
-    if active[env] == 0:
-        return
-    zero = wp.float64(0.0)
-    n = r.shape[1]
-    s.iterations[env] = 0
-    s.negative[env] = 0
-    rr0 = wp.float64(0.0)
-    rz = wp.float64(0.0)
-    for i in range(n):
-        z = inverse[env, i] * r[env, i]
-        p[env, i] = z
-        rr0 += wp.length_sq(r[env, i])
-        rz += wp.dot(r[env, i], z)
-    if rr0 == zero:
-        return
-    for it in range(max_iterations):
-        curvature = product_in_order(system, contacts, env, p, Ap)
-        if not (curvature > zero):
-            s.negative[env] = 1
-            return
-        alpha = rz / curvature
-        rr = wp.float64(0.0)
-        new = wp.float64(0.0)
-        for i in range(n):
-            x[env, i] = x[env, i] + alpha * p[env, i]
-            left = r[env, i] - alpha * Ap[env, i]
-            r[env, i] = left
-            rr += wp.length_sq(left)
-            new += wp.dot(left, inverse[env, i] * left)
-        s.iterations[env] = it + 1
-        if not (rr > tolerance * tolerance * rr0):
-            return
-        beta = new / rz
-        rz = new
-        for i in range(n):
-            p[env, i] = inverse[env, i] * r[env, i] + beta * p[env, i]
-
-
 class Pcg:
     """Preconditioned conjugate gradients (Hestenes, Stiefel 1952).
 
@@ -250,6 +187,7 @@ class Pcg:
 
     def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
         self.batch, self.nodes, self.lanes, self.device = batch, nodes, lanes, device
+        self.one_block = nodes <= ONE_BLOCK_NODES or not device.is_cuda
         self._p, self._Ap, self._z = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(3))
         self._by_blocks, self._rr, self._rz = (
             wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
@@ -286,6 +224,15 @@ class Pcg:
             active: mask (B,).
         """
         s, run, device, dim = self.scalars, self._running, self.device, residual.shape
+        if isinstance(preconditioner, BlockJacobi) and self.one_block:
+            threads = THREADS if device.is_cuda else 1
+            inputs = [
+                *(system, contacts, preconditioner.inverse, tolerance, max_iterations, threads, min(self.lanes, threads), active),
+                *(self._p, self._Ap),
+            ]
+            size, outputs = (self.batch, threads), [residual, x, s]
+            wp.launch(solve_in_one_block, dim=size, inputs=inputs, outputs=outputs, device=device, block_dim=THREADS)
+            return
         if not device.is_cuda:
             self._solve_on_cpu(system, contacts, preconditioner, residual, x, tolerance, max_iterations, active)
             return
@@ -331,10 +278,6 @@ class Pcg:
         active: wp.array,
     ) -> None:
         s, device = self.scalars, self.device
-        if isinstance(preconditioner, BlockJacobi):
-            inputs = [system, contacts, preconditioner.inverse, tolerance, max_iterations, active, self._p, self._Ap]
-            wp.launch(solve_in_one_thread, dim=self.batch, inputs=inputs, outputs=[residual, x, s], device=device)
-            return
         # The arrays of a CPU are NumPy's as well: views, no copies.
         running, mask = self._running.numpy(), active.numpy() != 0
         r, solution, z, p, Ap = (a.numpy() for a in (residual, x, self._z, self._p, self._Ap))

@@ -191,14 +191,18 @@ class Potential:
         outputs = [self.el_F, self.el_P, self.el_mck, self.el_J, self.el_energy]
         self.launch(elasticity.element_state, self.el_J.shape, inputs, outputs)
 
+    def touch(self, active: wp.array) -> None:
+        """Contacts, their forces and rows at x."""
+        self.collision.assemble(
+            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
+        )
+
     def assemble(self, active: wp.array) -> None:
         """Forces, contacts and energies at y; ``gradient`` holds bonded nodes too, ``residual`` is minus it on the unknowns."""
         self.elements(active)
         inputs = [self.corner_start, self.corner, self.grads, self.el_P, active]
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
-        self.collision.assemble(
-            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
-        )
+        self.touch(active)
         inputs = [
             *(self.y, self.local_target, self.local_start, self.row_start, self.col, self.inertia, self.drag, self.inertia_scale),
             *(self.vert_gradient, self.R, self.node_body, self.node_free, *self.followers, active),

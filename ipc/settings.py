@@ -28,10 +28,12 @@ class Settings:
         friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
+        preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
+            part; ``ipc/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
         broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
-            (bounding volume hierarchies), or ``"auto"`` (by the number of edges, for each pair of bodies). The pairs are the same.
+            (bounding volume hierarchies), or ``"auto"`` (by the number of bodies and edges). The pairs are the same.
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
             ``World.timers``.
         deterministic: on CUDA, add contact forces and rows in a fixed order, one thread an environment: the same call gives the same
@@ -51,6 +53,7 @@ class Settings:
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-2
     max_linear: int = 2000
+    preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
     motion_fraction: float = 0.8
     broad_phase: Literal["auto", "lists", "bvh"] = "auto"
@@ -76,5 +79,7 @@ class Settings:
             raise IpcError(f"integrator = {self.integrator!r}: choose 'euler' or 'bdf2'")
         if self.broad_phase not in ("auto", "lists", "bvh"):
             raise IpcError(f"broad_phase = {self.broad_phase!r}: choose 'auto', 'lists' or 'bvh'")
+        if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):
+            raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'block_jacobi' or 'rest_inverse'")
         if not 0 < self.motion_fraction < 1:
             raise IpcError(f"motion_fraction = {self.motion_fraction}: it must lie between 0 and 1")

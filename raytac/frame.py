@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from raytac.gel.surface import GelSurface, summary
 
+if TYPE_CHECKING:
+    from raytac.markers import MarkerFrame
+
 __all__ = ["OUTPUTS", "TactileFrame"]
 
-OUTPUTS = ("rgb", "layers", "normals", "depth", "height")
+OUTPUTS = ("rgb", "layers", "normals", "depth", "height", "wrench", "traction")
 """Names that ``TactileSensor(outputs=…)`` and ``raytac press --outputs`` accept."""
 
 
@@ -39,14 +43,24 @@ class TactileFrame:
     uncovered: np.ndarray | None = None
     """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact; None
     for other modes, and where the table does not tell its coverage."""
+    markers: MarkerFrame | None = None
+    """Where the markers have gone, in metres and pixels; None unless the sensor was given a marker model."""
+    wrench: np.ndarray | None = None
+    """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
+    traction: np.ndarray | None = None
+    """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
+    Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model)."""
+    contact_area: np.ndarray | None = None
+    """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
     force: np.ndarray | None = None
     """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
     force_law_area: np.ndarray | None = None
-    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. None as for ``force``."""
+    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. None as for
+    ``force``, and for a simulated pad, which follows no such law."""
     failed: np.ndarray | None = None
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
-    """Wall time of ``physics``, ``surface`` and ``optics`` for the whole batch [ms]."""
+    """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 
     def __repr__(self) -> str:
         return summary(self)

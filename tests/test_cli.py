@@ -77,7 +77,7 @@ def test_help_names_the_choices(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["press", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for words in ("{fast,reference,path}", "{rgb,layers,normals,depth,height}", "256 if not given"):
+    for words in ("{fast,reference,path}", "{rgb,layers,normals,depth,height,wrench,traction}", "256 if not given"):
         assert words in told
 
 

@@ -6,10 +6,14 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.compare import CompareSettings, run_comparison
 from raytac.report.compare_report import write_comparison
+from raytac.sensor import PADS
 
 __all__ = ["CompareArgs"]
 
@@ -34,6 +38,8 @@ class CompareArgs(CommonOptions):
     """Timed frames a figure; fewer, at least three, for modes slower than 10 s together."""
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
+    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Also press into the simulated pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
 
@@ -65,5 +71,6 @@ class CompareArgs(CommonOptions):
             reference_spp=self.spp,
             frames=self.frames,
             batch=self.batch,
+            pad=self.pad,
         )
         return chosen.quickened() if self.quick else chosen

@@ -12,8 +12,9 @@ import tyro
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import CommonOptions, parse_outputs, parse_resolution
+from raytac.markers import MARKER_MODELS
 from raytac.report.press import run_press
-from raytac.sensor import INTEGRATORS, OPTICS, TactileSensor, sensor_outputs
+from raytac.sensor import INTEGRATORS, OPTICS, PADS, PHYSICS, TactileSensor, sensor_outputs
 from raytac.specs import load_press
 
 __all__ = ["PressArgs"]
@@ -23,22 +24,29 @@ __all__ = ["PressArgs"]
 class PressArgs(CommonOptions):
     """Press an object into the gel and write image, layers, height and a preview to a folder.
 
-    Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, preview.png and
-    metrics.json. An error or Ctrl-C leaves the folder as it was; a press that is done replaces an earlier one there as a whole.
+    Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, traction.npy, markers.npz,
+    preview.png and metrics.json. An error or Ctrl-C leaves the folder as it was; a press that is done replaces an earlier one there as
+    a whole.
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Name of a shipped press scene, such as coin, or path of a scene file."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
-    physics: str = "rigid"
-    """How the gel deforms: rigid."""
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
+    scene says if not given, else rigid."""
+    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """ipc: how finely the pad is cut; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given) or phong."""
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
     shadow: bool | None = None
     """taxim: cast shadows; where the table has them if not given."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
+    """How the sensor's markers move: fots, surface (needs physics ipc), superposition or force_field; the sensor must have markers, as
+    gelsight_mini_7x9 has. Writes markers.npz, and images show the dots. None if not given."""
     integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
     """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
     spp: int | None = None
@@ -46,7 +54,8 @@ class PressArgs(CommonOptions):
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
     outputs: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = None
-    """What to compute: one or several of rgb, layers (raytrace only), normals, depth and height, joined by commas; all if not given."""
+    """What to compute: one or several of rgb, layers (raytrace only), normals, depth, height, wrench and traction, joined by commas; all
+    if not given."""
 
     def run(self) -> int:
         start = time.perf_counter()
@@ -56,9 +65,12 @@ class PressArgs(CommonOptions):
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
+        scene = load_press(self.scene)
+        physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
         sensor = TactileSensor(
             self.sensor,
-            physics=self.physics,
+            physics=physics,
+            pad=self.pad or scene.pad if physics == "ipc" else self.pad,
             optics=self.optics,
             outputs=computed,
             resolution=parse_resolution(self.resolution) if self.resolution is not None else None,
@@ -66,17 +78,19 @@ class PressArgs(CommonOptions):
             spp=self.spp,
             device=self.device,
             seed=self.seed,
+            markers=self.markers,
             optics_options=self._optics_options(),
         )
-        scene = load_press(self.scene)
-        out = (
-            self.out
-            if self.out is not None
-            else Path("runs") / "press" / (scene.name + ("" if self.optics == "raytrace" else f"-{self.optics}"))
-        )
+        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)
         for path in run_press(sensor, scene, out, outputs=outputs, start=start):
             print(path)
         return 0
+
+    def _folder(self, scene: str, physics: str) -> str:
+        """Name of the folder: presses that differ in physics or optics do not replace each other."""
+        return "-".join(
+            [scene, *([physics] if physics != "rigid" else []), *([self.optics] if self.optics != "raytrace" else [])]
+        )
 
     def _optics_options(self) -> dict[str, Any]:
         table = {name: value for name, value in (("calibration", self.calibration), ("shadow", self.shadow)) if value is not None}

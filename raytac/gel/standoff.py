@@ -23,8 +23,8 @@ _SLACK = 1.0 / 64.0
 """Further allowance, as a share of the cell."""
 _FADING, _OPEN = 4.0, 12.0
 """Gaps, in units of d̂, from which on their closing fades, and of which nothing is closed."""
-_TOUCHING = 0.3
-"""Gap, in units of d̂, up to which a place counts as touching: 0.02 of it are left."""
+_TOUCHING = 0.5
+"""Gap, in units of d̂, up to which a place counts as touching: a tenth of d̂ is left of it."""
 _CUT = 0.5e-3
 """Height above the object's lowest point [m] up to which its underside counts in that mean; beyond the object it counts as so high."""
 
@@ -86,6 +86,8 @@ class StandOff:
         borne = sandwich(self._hat_y, np.maximum(pressure, 0.0).reshape(shape), self._hat_x.T)
         shift = np.zeros(len(upwards))
         there = np.isfinite(underside)
+        if not (there.any() and borne.any()):
+            return ContactFit(float("nan"), shift)
         gap = np.where(there, underside, 0.0) - self.heights(self._surface.rise(places, upwards))
         near = there & (borne > 0.0) & (gap < self._reach + _SAG * self._bulge(underside, there))
         weight = np.where(near, borne, 0.0)

@@ -47,9 +47,9 @@ def probe_sensor(sensor: SensorSpec) -> SensorSpec:
 class ProbeData:
     """Frames of many presses under the probes: N frames under load, P probes.
 
-    ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth``, ``contact``: samples
-    (N, ny, nx); ``contacts``: (active, centre, shear, twist) as in ``Contacts``, (N, K, …); ``force``: (penetration (N, P), wall (N, P, 2),
-    way (N, P, 2)) that the force field reads.
+    ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth`` [m], (N, ny, nx), and
+    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: (active, centre, shear, twist, radius) as in ``Contacts``, (N, K, …);
+    ``force``: (penetration (N, P), wall (N, P, 2), way (N, P, 2)) that the force field reads.
     """
 
     cells: ContactCells
@@ -57,8 +57,8 @@ class ProbeData:
     truth: np.ndarray
     loads: np.ndarray
     depth: np.ndarray
-    contact: np.ndarray
-    contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    boxes: np.ndarray
+    contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     force: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     @classmethod
@@ -84,9 +84,7 @@ class ProbeData:
                 penetration = np.where(touched, np.maximum(rest[..., 2] - height, 0), 0)
                 wall = slope / np.sqrt(1 + (slope**2).sum(axis=-1, keepdims=True))
                 way = object_way(contacts, rest[..., :2])
-                rows.append(
-                    (truth[0], frame.load, samples.depth[0], samples.contact[0], contacts, penetration[0], wall[0], way[0])
-                )
+                rows.append((truth[0], frame.load, samples.depth[0], samples.boxes[0], contacts, penetration[0], wall[0], way[0]))
         most = max(row[4].active.shape[1] for row in rows)
 
         def padded(name: str) -> np.ndarray:
@@ -99,8 +97,8 @@ class ProbeData:
             truth=np.stack([row[0] for row in rows]),
             loads=np.array([row[1] for row in rows]),
             depth=np.stack([row[2] for row in rows]),
-            contact=np.stack([row[3] for row in rows]),
-            contacts=(padded("active"), padded("centre"), padded("shear"), padded("twist")),
+            boxes=np.stack([row[3] for row in rows]),
+            contacts=(padded("active"), padded("centre"), padded("shear"), padded("twist"), padded("radius")),
             force=(np.stack([r[5] for r in rows]), np.stack([r[6] for r in rows]), np.stack([r[7] for r in rows])),
         )
 
@@ -128,11 +126,12 @@ def pattern_search(
     return point, best
 
 
-def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
+def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto") -> MarkerMotionSpec:
     """Constants that make FOTS and the force field closest to surface tracking: least mean distance, each kind of load weighing alike.
 
     FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation kept. A cap is no
-    more than the largest motion in the data: beyond it nobody knows.
+    more than the largest motion in the data: beyond it nobody knows. With ``published``, one λ_s and λ_t hold for contacts of all sizes;
+    else they are those of the mean contact in the data, and scale.
     """
     from raytac.optics.marker_motion import FotsConstants, FotsKernel
 
@@ -141,7 +140,7 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     def error(constants: FotsConstants, rows: np.ndarray) -> float:
         markers = np.broadcast_to(data.markers, (len(rows), *data.markers.shape))
         contacts = tuple(part[rows] for part in data.contacts)
-        moved = kernel.displacement(markers, data.depth[rows], data.contact[rows], contacts, constants)  # type: ignore[arg-type]
+        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], contacts, constants)  # type: ignore[arg-type]
         return float(np.linalg.norm(moved - data.truth[rows], axis=-1).mean())
 
     def rows_of(load: str) -> np.ndarray:
@@ -149,7 +148,8 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
 
     shear_most = float(np.linalg.norm(data.contacts[2], axis=-1).max())
     twist_most = float(np.abs(data.contacts[3]).max())
-    found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6))
+    radius = 0.0 if published else float(data.contacts[4][data.contacts[0]].mean())
+    found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6), radius)
     starts = (found.dilate_gain, found.dilate_lambda)
 
     def dilation(x: np.ndarray) -> FotsConstants:
@@ -182,6 +182,7 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
         shear_max=found.shear_max,
         twist_lambda=found.twist_lambda,
         twist_max=found.twist_max,
+        contact_radius=found.contact_radius,
         field_gain=gain,
         field_shear=stiffness,
         field_friction=friction,

@@ -11,7 +11,7 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.components import find_runs, join_runs
 
-__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "chosen_envs"]
+__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "chosen_envs", "contact_boxes"]
 
 CELL = 0.4e-3
 """Largest cell over which a contact is averaged [m], unless the pad's grid is coarser; narrower gaps do not part two contacts."""
@@ -68,9 +68,8 @@ class ContactCells:
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
         touched = np.asarray(surface.contact)[part]
         found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
-        broken = ~np.isfinite(found).all(axis=(1, 2))
-        if broken.any():
-            touched = touched & ~broken[:, None, None]
+        if not math.isfinite(found.sum()):
+            touched = touched & np.all(np.isfinite(found), axis=(1, 2))[:, None, None]
         found = np.where(touched, np.maximum(found, 0), np.float32(0))
         ny, nx = r1 - r0, c1 - c0
         # Whole cells, also at the pad's far edges.
@@ -96,19 +95,36 @@ class ContactSamples:
     contact: np.ndarray
     box: tuple[int, int, int, int]
 
+    @property
+    def boxes(self) -> np.ndarray:
+        """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
+        if len(self.contact) > 1:
+            return contact_boxes(self.contact)
+        r0, r1, c0, c1 = self.box
+        return np.array([[c0, c1, r0, r1]], dtype=np.uint32)
+
+
+def contact_boxes(contact: np.ndarray) -> np.ndarray:
+    """As ``ContactSamples.boxes``, of masks (B, ny, nx)."""
+    columns, rows = np.any(contact, axis=1), np.any(contact, axis=2)
+    edges = [columns.argmax(axis=1), columns.shape[1] - columns[:, ::-1].argmax(axis=1)]
+    edges += [rows.argmax(axis=1), rows.shape[1] - rows[:, ::-1].argmax(axis=1)]
+    return np.where(np.any(rows, axis=1)[:, None], np.stack(edges, axis=1), 0).astype(np.uint32)
+
 
 @dataclass(frozen=True)
 class Contacts:
     """Up to K contacts of each of B pads; rows that are not ``active`` hold zeros.
 
     ``active`` (B, K); ``centre`` [m], (B, K, 2): indentation-weighted; ``shear`` [m], (B, K, 2): tangential way of the object at the
-    contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then.
+    contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then; ``radius`` [m], (B, K): of a disc of the same area.
     """
 
     active: np.ndarray
     centre: np.ndarray
     shear: np.ndarray
     twist: np.ndarray
+    radius: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -164,11 +180,11 @@ class ContactTracker:
             [_followed(one, before, move) for one in now] for now, before, move in zip(found, self._contacts, motion, strict=True)
         ]
         count = max(1, max(len(one) for one in self._contacts))
-        table = np.zeros((self.batch, count, 6))
+        table = np.zeros((self.batch, count, 7))
         for b, contacts in enumerate(self._contacts):
             for k, c in enumerate(contacts):
-                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist
-        return Contacts(table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5])
+                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist, c.radius
+        return Contacts(table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5], table[..., 6])
 
     def _motion(self, pose: np.ndarray | None) -> list[tuple[float, ...] | None]:
         """D of every environment as (xx, xy, x, yx, yy, y, turn) of the plane z = 0; None where this or the last pose is not known."""

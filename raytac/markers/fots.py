@@ -48,6 +48,7 @@ class FotsMarkers:
             motion.shear_max,
             motion.twist_lambda,
             motion.twist_max,
+            motion.contact_radius,
         )
 
     def displacement(
@@ -55,5 +56,5 @@ class FotsMarkers:
     ) -> np.ndarray:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert samples is not None and contacts is not None
-        motion = contacts.active, contacts.centre, contacts.shear, contacts.twist
-        return self._kernel.displacement(rest[..., :2], samples.depth, samples.contact, motion, self.constants)
+        motion = contacts.active, contacts.centre, contacts.shear, contacts.twist, contacts.radius
+        return self._kernel.displacement(rest[..., :2], samples.depth, samples.boxes, motion, self.constants)

@@ -14,8 +14,9 @@ def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...
     """Indices (env, row, column) of the cells' first nodes and the place in the cell along x and y, each (B, M); clipped to the pad."""
     grid = surface.grid
     dx, dy = grid.pitch
-    fx = np.clip((xy[..., 0] - grid.x[0]) / dx, 0, len(grid.x) - 1.001)
-    fy = np.clip((xy[..., 1] - grid.y[0]) / dy, 0, len(grid.y) - 1.001)
+    # fmin and fmax pass over NaN: where an environment failed, any node will do.
+    fx = np.fmax(np.fmin((xy[..., 0] - grid.x[0]) / dx, len(grid.x) - 1.001), 0.0)
+    fy = np.fmax(np.fmin((xy[..., 1] - grid.y[0]) / dy, len(grid.y) - 1.001), 0.0)
     column, row = fx.astype(int), fy.astype(int)
     return (np.arange(len(xy))[:, None], row, column), fx - column, fy - row
 
@@ -23,25 +24,25 @@ def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...
 def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
     """z of the surface at points (B, M, 2) [m], bilinear, shape (B, M)."""
     (env, row, column), wx, wy = _corners(surface, xy)
-    height = surface.height
-    top = (1 - wx) * height[env, row, column] + wx * height[env, row, column + 1]
-    bottom = (1 - wx) * height[env, row + 1, column] + wx * height[env, row + 1, column + 1]
-    return (1 - wy) * top + wy * bottom
+    # One flat index and four takes: half the time of four look-ups by three indices.
+    _, ny, nx = surface.height.shape
+    node, height = (env * ny + row) * nx + column, np.ascontiguousarray(surface.height).reshape(-1)
+    a, b, c, d = (height.take(node + offset) for offset in (0, 1, nx, nx + 1))
+    top, bottom = a + wx * (b - a), c + wx * (d - c)
+    return top + wy * (bottom - top)
 
 
 def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(z [m] (B, M), its gradient along x, y [-] (B, M, 2), whether the object touches the nearest node (B, M)) at points (B, M, 2) [m]."""
+    slopes = []
+    for axis, pitch in enumerate(surface.grid.pitch):
+        half = np.zeros(2)
+        half[axis] = 0.5 * pitch
+        slopes.append((height_at(surface, xy + half) - height_at(surface, xy - half)) / pitch)
     (env, row, column), wx, wy = _corners(surface, xy)
-    dx, dy = surface.grid.pitch
-    h = surface.height
-    a, b = h[env, row, column], h[env, row, column + 1]
-    c, d = h[env, row + 1, column], h[env, row + 1, column + 1]
-    z = (1 - wy) * ((1 - wx) * a + wx * b) + wy * ((1 - wx) * c + wx * d)
-    along_x = ((1 - wy) * (b - a) + wy * (d - c)) / dx
-    along_y = ((1 - wx) * (c - a) + wx * (d - b)) / dy
     contact = np.asarray(surface.contact)
     touched = contact[env, row + (wy > 0.5), column + (wx > 0.5)]
-    return z, np.stack([along_x, along_y], axis=-1), touched
+    return height_at(surface, xy), np.stack(slopes, axis=-1), touched
 
 
 def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
@@ -58,4 +59,4 @@ def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
     c, s = np.cos(angle) - 1.0, np.sin(angle)
     turned = np.stack([c * out[..., 0] - s * out[..., 1], s * out[..., 0] + c * out[..., 1]], axis=-1)
     way = contacts.shear[rows, nearest] + turned
-    return np.where(contacts.active.any(axis=1)[:, None, None], way, 0.0)
+    return np.where(np.any(contacts.active, axis=1)[:, None, None], way, 0.0)

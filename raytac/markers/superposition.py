@@ -1,6 +1,6 @@
 """Superposition: the pad's linear response to the loads that hold the contact where the object has put it.
 
-Taxim (Si and Yuan, RA-L 2022, section III-D) adds up displacement fields of unit loads, from a finite-element model, with the weights that
+Taxim (Si and Yuan, RA-L 2022) adds up displacement fields of unit loads, from a finite-element model, with the weights that
 give the contact its known displacement. Here the fields are those of the soft pad's own tetrahedra at rest (``raytac.markers.compliance``).
 With C the compliance of the coat's vertices and A those in contact:
 

@@ -122,10 +122,17 @@ class MarkerTracker:
         if not self._perturber.settings.moves_pattern:
             if not hasattr(self, "pattern"):
                 self.pattern = MarkerPattern.of(self.sensor, self._resolution)
+                self._grid_rest = self._height_at_rest()
             return
         for b in envs:
             self._shift[b], self._turn[b] = self._perturber.placement(b)
         self.pattern = MarkerPattern.of(self.sensor, self._resolution, shift=self._shift, turn=self._turn)
+        self._grid_rest = self._height_at_rest()
+
+    def _height_at_rest(self) -> np.ndarray:
+        """z of the grid's rest surface at the pattern [m], (1 or B, M), as ``height_at`` finds it."""
+        xy = self.pattern.rest[..., :2]
+        return height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Start environments (a mask (B,), a list, or None for all) anew: no history of contact, a new placement of the pattern.
@@ -136,6 +143,17 @@ class MarkerTracker:
         which = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
+
+    def at_rest(self) -> MarkerFrame:
+        """Markers of one untouched pad (B = 1), placed as in environment 0; changes no history and draws nothing."""
+        rest, pixel = self.pattern.rest[:1], self.pattern.pixel[:1]
+        nothing = np.zeros(pixel.shape)
+        return MarkerFrame(nothing, nothing, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
+
+    def follow(self, surface: GelSurface) -> None:
+        """Take note of a surface of the motion whose markers nobody asks for; as ``update``, for models that need the history."""
+        if self._cells is not None:
+            self._contacts.update(surface, self._cells.sample(surface))
 
     def update(self, surface: GelSurface) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
@@ -156,13 +174,13 @@ class MarkerTracker:
         else:
             # Differences of heights first, so that a marker at rest has moved by exactly nothing.
             xy = rest[..., :2] + moved
-            still = GelSurface.at_rest(self.grid)
-            before = height_at(still, rest[..., :2].reshape(1, -1, 2)).reshape(rest.shape[:2])
-            z = rest[..., 2] + height_at(surface, xy) - before
+            z = rest[..., 2] + height_at(surface, xy) - self._grid_rest
             position = np.concatenate([xy, z[..., None]], axis=-1)
-        return self._frame(rest, position)
+        # One NaN makes the sum one; the sum is several times cheaper than asking every node.
+        failed = ~np.isfinite(surface.height.reshape(self.num_envs, -1).sum(axis=1))
+        return self._frame(rest, position, failed)
 
-    def _frame(self, rest: np.ndarray, position: np.ndarray) -> MarkerFrame:
+    def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray) -> MarkerFrame:
         pixel = np.broadcast_to(self.pattern.pixel, (*rest.shape[:2], 2))
         displacement = position[..., :2] - rest[..., :2]
         displacement_px = self.pattern.camera.project(position) - pixel
@@ -171,8 +189,9 @@ class MarkerTracker:
             displacement_px = displacement_px + noise
             displacement = displacement + noise * np.asarray(self.sensor.camera.pitch_at(self.pattern.camera.resolution))
         visible = self._perturber.visible(self.pattern.count)
-        if not visible.all():
-            displacement, displacement_px = (np.where(visible[..., None], d, np.nan) for d in (displacement, displacement_px))
+        kept = visible & ~failed[:, None]
+        if not kept.all():
+            displacement, displacement_px = (np.where(kept[..., None], d, np.nan) for d in (displacement, displacement_px))
         return MarkerFrame(displacement, displacement_px, rest, pixel, position, visible)
 
 

@@ -1,15 +1,19 @@
 """FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
 
-Zhao, Qian, Duan and Luo, FOTS, RA-L 2024, section III-B, in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
-contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c, G_c being the place at rest of the skin
-under the contact's centre, which is that centre less the drag:
+Zhao, Qian, Duan and Luo, FOTS, RA-L 2024 (arXiv 2404.19217), in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
+contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
 
-    dilate   Δd_d = g Σ_i a Δh_i (M − C_i) exp(−λ_d ‖M − C_i‖²)
-    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                     e_c = exp(−λ_s ‖M − G_c‖²)
-    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)   e_c = exp(−λ_t ‖M − G_c‖²)
+    dilate   Δd_d = g Σ_i a Δh_i (M' − C_i) exp(−λ_d ‖M' − C_i‖²)    M' = M + Δd_s + Δd_t
+    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                        e_c = exp(−λ_s ‖M − G_c‖²)
+    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)      e_c = exp(−λ_t ‖M − G_c‖²)
 
-w_c = e_c / max(1, Σ e_c): the published factor for one contact, and no more than one motion in all where contacts are close. a is the area
-of a sample and g the gain [1/m³] that the published sum over pixels hides in its unit of length.
+With a contact radius R_0 > 0, λ_s and λ_t of a contact of radius R_c are those given times (R_0 / R_c)²: a wide contact drags its
+surroundings along farther than a narrow one. R_0 = 0 is the published form, one λ for all.
+
+Both sides of a difference are taken on the same skin: G_c is where the skin under the contact's centre was at rest, that centre less the
+drag; the dilation, whose contact points are where they are now, sees the marker as it was dragged. w_c = e_c / max(1, Σ e_c): the
+published factor for one contact, and no more than one motion in all where contacts are close. a is the area of a sample and g the gain
+[1/m³] that the published sum over pixels hides in its unit of length.
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ __all__ = ["FotsConstants", "FotsKernel"]
 _NEGLIGIBLE = 16.0
 """A Gaussian's exponent beyond which it is left out: e⁻¹⁶ is what float32 cannot add to 1."""
 _ROW = 8
-"""Floats a contact: active, G_x, G_y, Δs_x, Δs_y, Δθ and two unused, so that two packet gathers bring one."""
+"""Floats a contact: active, G_x, G_y, Δs_x, Δs_y, Δθ, radius and one unused, so that two packet gathers bring one."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class FotsConstants:
     shear_max: float
     twist_lambda: float
     twist_max: float
+    contact_radius: float = 0.0
 
 
 class FotsKernel:
@@ -64,8 +69,8 @@ class FotsKernel:
         self,
         markers: np.ndarray,
         depth: np.ndarray,
-        contact: np.ndarray,
-        contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        boxes: np.ndarray,
+        contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         constants: FotsConstants,
     ) -> np.ndarray:
         """Displacement [m] of markers at rest, shape (B, M, 2), float32.
@@ -73,21 +78,21 @@ class FotsKernel:
         Args:
             markers: x, y at rest [m], (B, M, 2).
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
-            contact: (B, ny, nx) bool; bounds the sums.
-            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad]).
+            boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
+            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad], radius (B, K) [m]).
             constants: of the pad.
         """
         mi = self.mi
         batch, count = markers.shape[:2]
         k = 1 << (contacts[0].shape[1] - 1).bit_length()
         table = np.zeros((batch, k, _ROW), dtype=np.float32)
-        active, centre, shear, twist = contacts
+        active, centre, shear, twist, radius = contacts
         filled = table[:, : active.shape[1]]
-        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5] = active, centre, shear, twist
+        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5], filled[..., 6] = active, centre, shear, twist, radius
         inputs = (
             self._on_device(markers),
             mi.Float(np.ascontiguousarray(depth, dtype=np.float32).ravel()),
-            mi.UInt32(_boxes(contact).ravel()),
+            mi.UInt32(np.ascontiguousarray(boxes, dtype=np.uint32).ravel()),
             mi.Float(table.ravel()),
             self._constants(constants),
         )
@@ -107,7 +112,7 @@ class FotsKernel:
     def _constants(self, constants: FotsConstants) -> Any:
         if self._numbers is None or self._numbers[0] != constants:
             c = constants
-            values = [c.dilate_gain, c.dilate_lambda, c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max]
+            values = [c.dilate_gain, c.dilate_lambda, c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max, c.contact_radius]
             self._numbers = constants, self.mi.Float(np.array(values, dtype=np.float32))
         return self._numbers[1]
 
@@ -116,10 +121,10 @@ class FotsKernel:
         i = dr.arange(mi.UInt32, batch * count)
         env = i // count
         place = dr.gather(mi.Point2f, xy, i)
-        gain, ld, ls, smax, lt, tmax = (dr.gather(mi.Float, constants, n) for n in range(6))
-        dilate = self._dilate(env, place, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
-        moved = dilate + _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax))
-        return dr.ravel(moved)
+        gain, ld, ls, smax, lt, tmax, radius = (dr.gather(mi.Float, constants, n) for n in range(7))
+        drag = _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax, radius))
+        dilate = self._dilate(env, place + drag, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
+        return dr.ravel(dilate + drag)
 
     def _dilate(self, env: Any, place: Any, depth: Any, boxes: Any, ld: Any) -> Any:
         """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker."""
@@ -151,9 +156,9 @@ class FotsKernel:
         return mi.Vector2f(sx, sy)
 
 
-def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple[Any, Any, Any, Any]) -> Any:
+def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple[Any, ...]) -> Any:
     """Shear and twist of all contacts of a marker's pad."""
-    ls, smax, lt, tmax = constants
+    ls, smax, lt, tmax, radius = constants
 
     def more(n: Any, *sums: Any) -> Any:
         return n < k
@@ -164,7 +169,8 @@ def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple
         way = mi.Vector2f(a.w, b.x)
         way *= dr.minimum(1, smax / dr.maximum(dr.norm(way), 1e-12))
         out = place - (mi.Point2f(a.y, a.z) - way)
-        r2 = dr.squared_norm(out)
+        ratio = radius / dr.maximum(b.z, 1e-5)
+        r2 = dr.squared_norm(out) * dr.select(radius > 0, ratio * ratio, 1)
         ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
         angle = dr.clip(b.y, -tmax, tmax)
         s = dr.sin(angle)
@@ -176,14 +182,3 @@ def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple
     start = (mi.UInt32(0), mi.Float(0), mi.Vector2f(0), mi.Float(0), mi.Vector2f(0))
     _, es, shear, et, twist = dr.while_loop(start, more, add, label="drag")
     return shear / dr.maximum(1, es) + twist / dr.maximum(1, et)
-
-
-def _boxes(contact: np.ndarray) -> np.ndarray:
-    """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
-    columns, rows = contact.any(axis=1), contact.any(axis=2)
-    box = np.zeros((len(contact), 4), dtype=np.uint32)
-    for first, along in ((0, columns), (2, rows)):
-        box[:, first] = along.argmax(axis=1)
-        box[:, first + 1] = along.shape[1] - along[:, ::-1].argmax(axis=1)
-    box[~rows.any(axis=1)] = 0
-    return box

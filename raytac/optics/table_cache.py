@@ -16,7 +16,9 @@ from raytac.io.code_digest import code_digest
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.calib_folder import load_calibration, save_calibration
 from raytac.optics.table import PolyTable
-from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor import MarkerSpec, SensorSpec
+
+NO_MARKERS = MarkerSpec(0, 0, (0.0, 0.0), (0.0, 0.0), 0.0, 0.0)
 
 __all__ = ["cache_root", "cached", "keep", "table_folder", "table_key"]
 
@@ -29,15 +31,20 @@ def cache_root() -> Path:
 
 
 def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
-    """Digest of sensor and lights (not of where their files lie), settings, and the code that bakes; the device is not in it."""
-    plain = replace(sensor, source=None, lights=replace(sensor.lights, source=None))
+    """Digest of sensor and lights (not of where their files lie), settings, and the code that bakes; the device is not in it.
+
+    Nor are the markers: a table is baked on a plain coat, and sensors that differ in their dots alone share it.
+    """
+    plain = replace(
+        sensor, source=None, name="", lights=replace(sensor.lights, source=None), marker_motion=None, markers=NO_MARKERS
+    )
     basis = plain, settings, seed, resolution, code_digest("raytac.optics.bake")
     return hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
 
 
 def table_folder(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> Path:
     """Where the table of ``table_key`` is kept."""
-    return cache_root() / "tables" / f"{sensor.name}-{table_key(sensor, settings, seed, resolution)}"
+    return cache_root() / "tables" / table_key(sensor, settings, seed, resolution)
 
 
 def cached(folder: Path) -> PolyTable | None:

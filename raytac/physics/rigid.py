@@ -12,6 +12,7 @@ from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
+from raytac.gel.traction import foundation_traction
 from raytac.physics.contact_state import ContactState
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
@@ -128,6 +129,32 @@ class RigidPad:
     def surface(self, state: ContactState) -> GelSurface:
         """Gel surface at a state."""
         return self.surface_from_pose(state.pad_from_object)
+
+    def wrench(self, state: ContactState) -> np.ndarray:
+        """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6).
+
+        The force acts at the contact's centre, at the height of the gel there; the twist torque is added.
+        """
+        surface = self.surface(state)
+        force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
+        at = np.zeros((len(force), 3))
+        for b, (x, y) in enumerate(np.nan_to_num(surface.contact_centre)):
+            node = np.abs(self.grid.y - y).argmin(), np.abs(self.grid.x - x).argmin()
+            at[b] = x, y, surface.height[b][node]
+        torque = np.cross(at, force)
+        torque[:, 2] += state.twist_torque
+        return np.concatenate([force, torque], axis=1)
+
+    def traction(self, state: ContactState) -> np.ndarray:
+        """Traction of the object on the pad [Pa], pad frame, shape (B, Ny, Nx, 3): a share of the contact's force (see the function)."""
+        force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
+        return foundation_traction(self.surface(state), force, state.twist_torque)
+
+    def object_height(self, surface: GelSurface) -> np.ndarray | None:
+        """Underside of the object at the surface's poses [m], shape (B, Ny, Nx), inf where it is not; None without an object."""
+        if surface.pad_from_object is None:
+            return None
+        return object_height(self.parts, surface.pad_from_object, self.grid.x, self.grid.y)
 
     def surface_from_pose(self, pad_from_object: np.ndarray) -> GelSurface:
         """Gel surface with the object at given poses (B, 4, 4), for a loop in which another simulation moves it.

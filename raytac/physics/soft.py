@@ -9,8 +9,10 @@ import numpy as np
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.coat_mesh import DeformedCoat
+from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
+from raytac.gel.traction import CoatTraction
 from raytac.physics.contact_state import ContactState
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
@@ -42,6 +44,8 @@ _CLOSE = 1e-6
 """A depth is reached within this [m]."""
 _TIGHT = 5e-4
 """A force is reached within this share."""
+_SAG = 0.1
+"""How far the object's facets may lie inside it, in units of d̂."""
 _PATIENCE, _REFINEMENTS = 120, 4
 _STILL = 2e-5
 """Speed below which a free object lies still [m/s]."""
@@ -111,18 +115,21 @@ class SoftPad:
         check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
         self._rotation = rotation_matrix(scene.object.quaternion)
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, self.parts)
+        self._traction: CoatTraction | None = None
+        self._last: SoftReading | None = None
         self._touches: dict[tuple[float, float, float], float] = {}
-        self._contact: SoftContact | None = None
+        self.solver: SoftContact | None = None
+        """Pad and object in the contact solver; None without an object."""
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
-        self._lost: np.ndarray = ~np.isfinite(self._offsets).all(axis=1)
+        self._lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
         if self._depths is not None:
-            self._lost |= ~np.isfinite(self._depths)
+            self._lost = self._lost | ~np.isfinite(self._depths)
         self._origin = np.zeros((num_envs, 3))
         self._forget()
         if self.parts:
             self._origin[:] = [self._first_place(b) for b in range(num_envs)]
-            self._contact = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
+            self.solver = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(self._depth), device)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -153,15 +160,37 @@ class SoftPad:
 
     def surface(self, state: ContactState) -> GelSurface:
         """Gel surface at a state of this pad."""
-        if not isinstance(state, SoftState) or state.reading is None:
-            raise InputError("state", value=type(state).__name__, rule="must be a state that this pad's run() gave")
-        return state.reading.surface
+        return self._reading(state).surface
+
+    def wrench(self, state: ContactState) -> np.ndarray:
+        """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
+        surface, forces = self.surface(state), self._reading(state).forces
+        assert surface.coat is not None
+        torque = np.cross(surface.coat.positions, forces).sum(axis=1)
+        return np.concatenate([forces.sum(axis=1), torque], axis=1)
+
+    def traction(self, state: ContactState) -> np.ndarray:
+        """Traction of the object on the pad [Pa], pad frame, shape (B, Ny, Nx, 3), at the place of the coat at rest."""
+        if self._traction is None:
+            self._traction = CoatTraction(self.mesh.coat, self.grid)
+        return self._traction(self._reading(state).forces)
+
+    def object_height(self, surface: GelSurface) -> np.ndarray | None:
+        """Underside of the object at the surface's poses [m], shape (B, Ny, Nx), inf where it is not; None without an object.
+
+        A soft object is shown as it was when the last state was read.
+        """
+        if surface.pad_from_object is None:
+            return None
+        if self.scene.object.dynamics == "soft" and self._last is not None:
+            return self._last.underside
+        return object_height(self.parts, surface.pad_from_object, self.grid.x, self.grid.y)
 
     def reset(self) -> None:
         """Forget all history: the pad at rest, the object above it."""
         self._forget()
-        if self._contact is not None:
-            self._contact.reset()
+        if self.solver is not None:
+            self.solver.reset()
 
     # --- driving ---------------------------------------------------------------------------------------------------------------
 
@@ -174,7 +203,7 @@ class SoftPad:
         self._kept = np.full(batch, 0.6 * self.mesh.d_hat)
         """Clearance that the object is held higher by [m]."""
         self._stiffness = np.full(batch, np.nan)
-        self._failed = self._lost.copy()
+        self._failed: np.ndarray = self._lost.copy()
 
     def _advance(
         self, stage: StageSpec, fraction: float, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, force: np.ndarray
@@ -182,8 +211,10 @@ class SoftPad:
         """From where the stage began (``depth`` …) to ``fraction`` of it."""
         if stage.kind == "shear":
             self._go(self._depth, shear + fraction * (np.asarray(stage.shear) - shear), self._twist)
+            self._step()
         elif stage.kind == "twist":
             self._go(self._depth, self._shear, twist + fraction * (stage.twist - twist))
+            self._step()
         elif stage.kind == "release":
             self._force[:] = np.nan
             self._release(depth, fraction)
@@ -215,18 +246,18 @@ class SoftPad:
                 begun = depth = self._depth
 
     def _step(self) -> None:
-        assert self._contact is not None
+        assert self.solver is not None
         poses = self._poses(self._depth)
         case = None
         if self.scene.moves == "case":
             case = self._case()
-        self._failed |= self._contact.drive(poses, case)
+        self._failed |= self.solver.drive(poses, case)
 
     def _settle_depth(self) -> None:
         """Drive until the coat, not the barrier's shell, is at the depth."""
-        assert self._contact is not None
+        assert self.solver is not None
         for _ in range(_REFINEMENTS):
-            clearance = self._reader.clearance(self._contact, self._poses(self._depth))
+            clearance = self._reader.clearance(self.solver, self._poses(self._depth))
             off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
             if np.abs(off).max() < _CLOSE:
                 return
@@ -234,7 +265,7 @@ class SoftPad:
             self._step()
 
     def _release(self, depth: np.ndarray, fraction: float) -> None:
-        assert self._contact is not None
+        assert self.solver is not None
         lift = np.array(
             [
                 place[2] - self._touch(place[0] + shear[0], place[1] + shear[1], twist)
@@ -243,7 +274,7 @@ class SoftPad:
         )
         if self._is_free:
             if fraction == 1.0:
-                self._contact.reset()
+                self.solver.reset()
                 self._depth = lift - CLEARANCE
             return
         self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
@@ -273,34 +304,42 @@ class SoftPad:
 
     def _lie(self) -> None:
         """Let a free object come to rest under its weight."""
-        assert self._contact is not None and self._weight > 0.0
-        self._contact.weigh(float(self._force[0]) / self._weight)
+        assert self.solver is not None and self._weight > 0.0
+        self.solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
-            self._failed |= self._contact.drive(self._poses(self._depth))
-            if (self._contact.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
+            self._failed |= self.solver.drive(self._poses(self._depth))
+            if (self.solver.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
                 return
-        self._failed |= self._contact.speed() >= _STILL
+        self._failed |= self.solver.speed() >= _STILL
 
     # --- reading ---------------------------------------------------------------------------------------------------------------
 
+    def _reading(self, state: ContactState) -> SoftReading:
+        if not isinstance(state, SoftState) or state.reading is None:
+            raise InputError("state", value=type(state).__name__, rule="must be a state that this pad's run() gave")
+        return state.reading
+
     def _normal_force(self) -> np.ndarray:
-        assert self._contact is not None
-        return -self._contact.forces()[:, :, 2].sum(axis=1)
+        assert self.solver is not None
+        return -self.solver.forces()[:, :, 2].sum(axis=1)
 
     def _state(self, stage: int, kind: str, fraction: float) -> SoftState:
         batch = self.num_envs
-        if self._contact is None:
+        if self.solver is None:
             poses, zero = np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
             rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
             coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
             surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
-            reading = SoftReading(surface, np.zeros_like(coat.positions), np.full(batch, np.nan), poses)
+            reading = SoftReading(
+                surface, np.zeros_like(coat.positions), np.full(batch, np.nan), poses, np.full(rest.shape, np.inf)
+            )
             failed = np.zeros(batch, bool)
             return SoftState(
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
             )
-        failed = self._failed.copy()
-        reading = self._reader.read(self._contact, self._poses(self._depth), failed)
+        failed: np.ndarray = self._failed.copy()
+        reading = self._reader.read(self.solver, self._poses(self._depth), failed)
+        self._last = reading
         surface, forces = reading.surface, reading.forces
         assert surface.coat is not None
         total = forces.sum(axis=1)
@@ -381,10 +420,14 @@ class SoftPad:
         deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
         if self._depths is not None:
             deepest = max(deepest, float(np.nanmax(self._depths, initial=0.0)))
-        edge = 0.75 * float(np.diff(self.mesh.coat.lines_x).mean())
-        reach = deepest + float(np.ptp(self.grid.rest)) + CLEARANCE
+        settings = {
+            "weight": self._weight,
+            "edge_length": 0.75 * float(np.diff(self.mesh.coat.lines_x).mean()),
+            "lowest": deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
+            "sag": _SAG * self.mesh.d_hat,
+        }
         try:
-            return object_body(self.parts, self.scene.object, self._rotation, weight=self._weight, edge_length=edge, lowest=reach)
+            return object_body(self.parts, self.scene.object, self._rotation, **settings)
         except InputError as error:
             raise SpecError(
                 error.rule, file=self.scene.source, key=error.name, value=error.value, choices=error.choices

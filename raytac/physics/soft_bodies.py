@@ -9,7 +9,7 @@ import numpy as np
 import ipc
 from raytac.errors import InputError
 from raytac.gel.part import Part
-from raytac.physics.part_surface import object_surface
+from raytac.physics.part_surface import SAG, object_surface
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec
@@ -36,6 +36,7 @@ def object_body(
     weight: float = 0.0,
     edge_length: float = 1e-3,
     lowest: float = 0.0,
+    sag: float = SAG,
 ) -> ipc.KinematicBody | ipc.AffineBody | ipc.SoftBody:
     """The object of a press scene as a body of the solver, in the object's frame.
 
@@ -49,12 +50,13 @@ def object_body(
         rotation: ``pad_from_object``, (3, 3): tells which side is down.
         weight: [N], of an affine body.
         edge_length: of a soft body's tetrahedra [m].
+        sag: how far facets may lie inside a curved part [m].
         lowest: height above the object's lowest point [m] beyond which a kinematic body's triangles are left out; 0 keeps all.
 
     Raises:
         InputError: an unknown kind of body, or a surface that it cannot be made from.
     """
-    surface = object_surface(parts)
+    surface = object_surface(parts, sag)
     height = surface.vertices @ rotation[2]
     if spec.dynamics == "kinematic":
         if lowest > 0.0:

@@ -37,6 +37,8 @@ class SoftReading:
     """Mean distance that the barrier kept [m], shape (B,); NaN out of contact."""
     poses: np.ndarray
     """``pad_from_object`` (B, 4, 4), lowered by the clearance."""
+    underside: np.ndarray
+    """Underside of the object there over the grid [m], shape (B, Ny, Nx), where it is below the pad's highest point; else inf."""
 
 
 class SoftReader:
@@ -67,7 +69,7 @@ class SoftReader:
         clearance = np.full(batch, np.nan)
         height = np.empty((batch, *self.grid.shape), np.float32)
         touched = np.zeros(height.shape, bool)
-        centre = np.full((batch, 2), np.nan)
+        centre, undersides = np.full((batch, 2), np.nan), np.full(height.shape, np.inf)
         for b in range(batch):
             if failed[b]:
                 coat[b] = forces[b] = poses[b] = height[b] = np.nan
@@ -80,13 +82,13 @@ class SoftReader:
             clearance[b] = fit.clearance
             poses[b, 2, 3] -= fit.clearance
             load = np.maximum(-forces[b, :, 2], 0.0)
-            under = self._underside(contact, poses[b], fit.clearance, b)
+            under = undersides[b] = self._underside(contact, poses[b], fit.clearance, b)
             borne = sandwich(self._hat_y, load.reshape(self.mesh.coat.shape), self._hat_x.T)
             height[b], touched[b] = self._stand_off.close(height[b], under, borne)
             centre[b] = load @ coat[b, :, :2] / load.sum()
         deformed = DeformedCoat(self.mesh.coat, coat)
         surface = GelSurface(self.grid, height, touched, centre, poses, deformed)
-        return SoftReading(surface, forces, clearance, poses)
+        return SoftReading(surface, forces, clearance, poses, undersides)
 
     def _fit(
         self, contact: SoftContact, coat: np.ndarray, forces: np.ndarray, pose: np.ndarray, b: int

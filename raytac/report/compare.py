@@ -28,12 +28,13 @@ from raytac.report.image_error import METRICS, SSIM_BORDER, has_flip, image_erro
 from raytac.report.image_error import mae as mean_absolute
 from raytac.report.machine import machine
 from raytac.report.modes import Mode, Setting, comparison_modes
+from raytac.report.physics_error import PhysicsError, physics_errors
 from raytac.report.references import References
 from raytac.report.row_store import Row, RowStore, Value, row_key
 from raytac.report.surfaces import press_peaks
 from raytac.report.timing import moving, timed_within
 from raytac.report.tracers import Tracers
-from raytac.sensor import LARGEST_SIDE
+from raytac.sensor import LARGEST_SIDE, PADS
 from raytac.specs import load_press, load_sensor, validate_press
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ class CompareSettings:
     """Longest time for one timing [s], as far as three frames allow."""
     quick: bool = False
     """Fewer modes."""
+    pad: str | None = None
+    """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
 
     def quickened(self) -> CompareSettings:
         """The first scene at 80 x 60 pixels with few samples, frames and modes."""
@@ -99,6 +102,8 @@ class CompareSettings:
         ):
             if value < lowest:
                 raise InputError(name, value=value, rule=f"must be at least {lowest}")
+        if self.pad is not None and self.pad not in PADS:
+            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         if not self.budget_s > 0:
             raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
         if not 0 <= self.seed < 2**32:
@@ -145,6 +150,8 @@ class Comparison:
     """Rows measured in this run; the others were kept from an earlier one."""
     facts: dict[str, Metric]
     """Machine and versions."""
+    physics: tuple[PhysicsError, ...] = ()
+    """Rigid pad against the simulated one, if that was asked for."""
 
 
 def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] | None = None) -> Comparison:
@@ -173,7 +180,9 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
             run.measure_all(size, modes, bar)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
-    return Comparison(settings, device, tuple(run.rows), run.images, tuple(run.left_out), run.measured, facts | known)
+    return Comparison(
+        settings, device, tuple(run.rows), run.images, tuple(run.left_out), run.measured, facts | known, tuple(run.physics)
+    )
 
 
 class _Run:
@@ -188,6 +197,7 @@ class _Run:
         self.rows: list[Row] = []
         self.images: dict[tuple[str, str], np.ndarray] = {}
         self.left_out: list[LeftOut] = []
+        self.physics: list[PhysicsError] = []
         self.measured = 0
         self._digests: dict[tuple[str, ...], str] = {}
 
@@ -201,6 +211,9 @@ class _Run:
             bar.set_postfix_str(f"{name} {scene}: reference")
             scenes.append(_Scene(scene, surface, references, tracers, size))
             self.images[scene, name] = scenes[-1].truth
+        if settings.pad is not None:
+            bar.set_postfix_str(f"{name}: simulated pad")
+            self.physics += physics_errors(tracers, settings.scenes, size, settings.pad, surfaces)
         seen: set[str] = set()
         for mode in modes:
             done = len(self.rows)

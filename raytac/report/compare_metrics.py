@@ -12,6 +12,7 @@ from raytac.io.metrics import Metric
 from raytac.report.compare import REGIONS, Comparison
 from raytac.report.equal_error import cost_at, spp_for_error
 from raytac.report.image_error import METRICS
+from raytac.report.physics_error import physics_metrics
 from raytac.report.row_store import Row
 
 __all__ = ["EqualError", "Summary", "compare_metrics", "equal_errors", "resolutions", "select", "summaries"]
@@ -169,6 +170,7 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         "rows": len(rows),
         "rows_measured_in_this_run": comparison.measured,
         **comparison.facts,
+        **physics_metrics(comparison.physics),
     }
     for summary in summaries(rows):
         key = _key(summary.family, summary.device, summary.resolution, summary.spp)

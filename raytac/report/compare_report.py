@@ -102,6 +102,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
         equal=equal_errors(rows),
         families=FAMILIES,
         left_out=comparison.left_out,
+        physics=comparison.physics,
         sheets=[{"scene": scene, "resolution": size.replace("x", " × "), "png": _embedded(path)} for scene, size, path in sheets],
         groups=[
             {

@@ -23,6 +23,10 @@ __all__ = ["FILES", "MotionReport", "calibrate_markers", "error_table", "motion_
 
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Every file that a calibration writes."""
+TESTED = ("fots", "superposition", "force_field")
+"""Models that are compared with surface tracking."""
+PUBLISHED = "fots_published"
+"""FOTS with one λ for contacts of all sizes, fitted to the same presses."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,11 @@ def calibrate_markers(
     motion = fit_motion(data, device=device)
     fitted = replace(sensor, marker_motion=motion)
     grid = fit[0].surface.grid
-    errors, times = model_errors(fitted, held_out, grid, device=device)
+    errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
+    as_published = replace(sensor, marker_motion=fit_motion(data, published=True, device=device))
+    published, _ = model_errors(as_published, held_out, grid, models=("fots",), device=device)
+    errors += [replace(row, model=PUBLISHED) for row in published]
+    times[PUBLISHED] = times["fots"]
     fit_errors, _ = model_errors(fitted, fit, grid, models=("fots",), device=device)
     markers = probe_sensor(sensor).markers
     report = MotionReport(motion, errors, fit_errors, times, markers.rows * markers.columns, held_out)
@@ -134,7 +142,7 @@ def motion_metrics(report: MotionReport) -> dict[str, Metric]:
     """Constants and errors as flat keys."""
     metrics: dict[str, Metric] = {"command": "calibrate-markers", "markers.probes": report.probes}
     motion = report.motion
-    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
+    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max", "contact_radius"):
         metrics[f"fots.{name}"] = getattr(motion, name)
     for name in ("field_gain", "field_shear", "field_friction"):
         metrics[name.replace("_", ".", 1)] = getattr(motion, name)

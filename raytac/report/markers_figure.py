@@ -31,8 +31,20 @@ _STYLE: dict[Any, Any] = {
     "ytick.major.width": 0.6,
     "legend.fontsize": 7,
 }
-_LABELS = {"surface": "surface tracking", "fots": "FOTS", "superposition": "superposition", "force_field": "force field"}
-_COLOURS = {"surface": "#1b1b1b", "fots": "#0072b2", "superposition": "#009e73", "force_field": "#d55e00"}
+_LABELS = {
+    "surface": "surface tracking",
+    "fots": "FOTS",
+    "fots_published": "FOTS, one λ",
+    "superposition": "superposition",
+    "force_field": "force field",
+}
+_COLOURS = {
+    "surface": "#1b1b1b",
+    "fots": "#0072b2",
+    "fots_published": "#56b4e9",
+    "superposition": "#009e73",
+    "force_field": "#d55e00",
+}
 _LONGEST = 1.6
 """Length of the longest arrow in a plot, in spacings of the markers."""
 
@@ -120,7 +132,7 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
                 _outline(axes, tracker, press[-1])
                 if truth is None:
                     truth = markers.displacement[0]
-                    axes.set_title(f"{load}, {press[0].press.kind}: {_LABELS[model]}, × {magnified:g}", fontsize=7)
+                    axes.set_title(f"{load}: {_LABELS[model]}, × {magnified:g}", fontsize=7)
                 else:
                     off = 1e6 * np.linalg.norm(markers.displacement[0] - truth, axis=1).mean()
                     axes.set_title(f"{_LABELS[model]}, off by {off:.0f} µm", fontsize=7)
@@ -145,7 +157,7 @@ def write_errors(path: Path, report: MotionReport) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    models = [name for name in MARKER_MODELS if name != "surface"]
+    models = [name for name in _LABELS if name in {row.model for row in report.errors}]
     loads = list(dict.fromkeys(row.load for row in report.errors))
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(figsize=(3.5, 2.4), layout="constrained")

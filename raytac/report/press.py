@@ -1,4 +1,4 @@
-"""Run one press and write its folder: rgb.png, frame.exr, height.npy, preview.png, metrics.json."""
+"""Run one press and write its folder: rgb.png, frame.exr, height.npy, traction.npy, markers.npz, preview.png, metrics.json."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from raytac.specs import PressScene, validate_press
 
 __all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "run_press"]
 
-FILES = ("rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json")
+FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "preview.png", "metrics.json")
 """Every file that a press may write; those of an earlier press that a new one does not write are removed."""
 
 
@@ -51,6 +51,11 @@ def run_press(
             write_exr(folder / "frame.exr", channels, exr_header(sensor, scene, frame))
         if "height" in outputs:
             np.save(folder / "height.npy", frame.surface.height[0].astype(np.float32))
+        if "traction" in outputs and frame.traction is not None:
+            np.save(folder / "traction.npy", frame.traction[0])
+        if frame.markers is not None:
+            names = ("displacement", "displacement_px", "rest", "rest_px", "position")
+            np.savez(folder / "markers.npz", **{name: getattr(frame.markers, name)[0] for name in names})
         _write_preview(folder / "preview.png", sensor, scene, frame, rest, outputs)
         metrics = press_metrics(sensor, scene, frame, rest) | {"time.setup_ms": setup_ms}
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
@@ -128,6 +133,23 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
     if frame.force is not None:
         for axis, value in zip("xyz", frame.force[0], strict=True):
             metrics[f"contact.force_{axis}_n"] = float(value)
+    if frame.wrench is not None:
+        for axis, value in zip("xyz", frame.wrench[0, 3:], strict=True):
+            metrics[f"contact.torque_{axis}_nmm"] = 1e3 * float(value)
+    if frame.traction is not None:
+        metrics["contact.max_pressure_kpa"] = -1e-3 * float(frame.traction[0, ..., 2].min())
+        metrics["contact.max_shear_kpa"] = 1e-3 * float(np.hypot(*np.moveaxis(frame.traction[0, ..., :2], -1, 0)).max())
+    if frame.markers is not None:
+        moved = np.linalg.norm(frame.markers.displacement[0], axis=-1)
+        moved_px = np.linalg.norm(frame.markers.displacement_px[0], axis=-1)
+        metrics |= {
+            "markers.model": sensor.markers or "",
+            "markers.count": len(moved),
+            "markers.mean_mm": 1e3 * float(np.nanmean(moved)),
+            "markers.max_mm": 1e3 * float(np.nanmax(moved)),
+            "markers.mean_px": float(np.nanmean(moved_px)),
+            "markers.max_px": float(np.nanmax(moved_px)),
+        }
     if frame.rgb is not None and rest.rgb is not None:
         change = np.abs(frame.rgb[0].astype(float) - rest.rgb[0])
         metrics["image.change_from_rest_mean_u8"] = float(change.mean())
@@ -163,6 +185,9 @@ def _write_preview(
         rgb=frame.rgb[0] if frame.rgb is not None and "rgb" in outputs else None,
         rest_rgb=rest.rgb[0] if rest.rgb is not None else None,
         normals=frame.normals[0] if frame.normals is not None else None,
+        markers=frame.markers,
+        resolution=sensor.resolution,
+        traction=frame.traction[0] if frame.traction is not None and "traction" in outputs else None,
         section=(float(surface.contact_centre[0, 0]), float(surface.contact_centre[0, 1])),
     )
     write_preview(path, data, sensor.spec)

@@ -10,11 +10,14 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import MaxNLocator
 
 from raytac.gel.surface import PadGrid
+from raytac.markers import MarkerFrame
+from raytac.report.markers_figure import draw_arrows
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
 __all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
@@ -68,6 +71,12 @@ class PreviewData:
     """Image of the untouched pad, shape (H, W, 3), uint8."""
     normals: np.ndarray | None = None
     """Unit normals, pad frame, n_z < 0, shape (H, W, 3)."""
+    markers: MarkerFrame | None = None
+    """Markers of environment 0, in pixels of ``resolution``."""
+    resolution: tuple[int, int] | None = None
+    """(width, height) of the image [px]."""
+    traction: np.ndarray | None = None
+    """Force of the object on the pad per area, pad frame [Pa], shape (Ny, Nx, 3)."""
     section: tuple[float, float] | None = None
     """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
 
@@ -99,6 +108,10 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
         panels.append(lambda axes: _normals_panel(axes, data))
     if data.rgb is not None and data.rest_rgb is not None:
         panels.append(lambda axes: _difference_panel(axes, data))
+    if data.markers is not None:
+        panels.append(lambda axes: _marker_panel(axes, data))
+    if data.traction is not None:
+        panels += [lambda axes: _pressure_panel(axes, data), lambda axes: _shear_panel(axes, data)]
     with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
         return _lay_out(panels, data)
 
@@ -118,7 +131,7 @@ def _lay_out(panels: list[Callable[[Axes], None]], data: PreviewData) -> Figure:
         x, y = margin + column * (wide + between), total - heading - (row + 1) * (above + high) - row * below
         axes = figure.add_axes((x / width, y / total, wide / width, high / total))
         draw(axes)
-        axes.set_title(f"({'abcdef'[index]}) {axes.get_title(loc='left')}", loc="left")
+        axes.set_title(f"({'abcdefghi'[index]}) {axes.get_title(loc='left')}", loc="left")
     return figure
 
 
@@ -170,10 +183,47 @@ def _indentation_panel(axes: Axes, data: PreviewData) -> None:
     extent = _grid_extent_mm(data.grid)
     shown = axes.imshow(indentation, extent=extent, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
     axes.axhline(_section_point(data)[1], color="white", linewidth=0.6, linestyle=(0, (4, 3)))
+    _colour_bar(axes, shown)
+
+
+def _colour_bar(axes: Axes, shown: AxesImage) -> None:
     bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.025, 0.0, 0.035, 1.0)))
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     bar.locator = MaxNLocator(nbins=4, steps=[1, 2, 5, 10])
     bar.update_ticks()
+
+
+def _marker_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.markers is not None and data.resolution is not None
+    magnified = draw_arrows(axes, data.markers, data.resolution)
+    longest = float(np.nanmax(np.linalg.norm(data.markers.displacement_px[0], axis=-1)))
+    axes.set_title(f"markers × {magnified:g}, longest {longest:.1f} px", loc="left")
+
+
+def _pressure_panel(axes: Axes, data: PreviewData) -> None:
+    assert data.traction is not None
+    _map_axes(axes, data, "normal traction [kPa]")
+    pressure = -1e-3 * data.traction[..., 2]
+    extent = _grid_extent_mm(data.grid)
+    _colour_bar(axes, axes.imshow(pressure, extent=extent, cmap="magma", vmin=0.0, vmax=max(float(pressure.max()), 1e-3)))
+
+
+def _shear_panel(axes: Axes, data: PreviewData) -> None:
+    """Size of the shear traction, and its direction at some places where it is not small."""
+    assert data.traction is not None
+    _map_axes(axes, data, "shear traction [kPa]")
+    shear = 1e-3 * data.traction[..., :2]
+    size = np.hypot(shear[..., 0], shear[..., 1])
+    largest = max(float(size.max()), 1e-3)
+    _colour_bar(axes, axes.imshow(size, extent=_grid_extent_mm(data.grid), cmap="magma", vmin=0.0, vmax=largest))
+    step = max(len(data.grid.y) // 24, 1)
+    nodes = np.meshgrid(np.arange(step // 2, len(data.grid.y), step), np.arange(step // 2, len(data.grid.x), step), indexing="ij")
+    rows, columns = (n[size[tuple(nodes)] > 0.1 * largest] for n in nodes)
+    across, along = shear[rows, columns].T
+    x, y = 1e3 * data.grid.x[columns], 1e3 * data.grid.y[rows]
+    # One arrow's length is the distance to the next arrow where the shear is largest; +y is down in the panel.
+    spacing = 1e3 * step * data.grid.pitch[0]
+    axes.quiver(x, y, across, along, color="#56b4e9", angles="xy", scale_units="xy", scale=largest / spacing, width=0.006)
 
 
 def _image_panel(axes: Axes, data: PreviewData) -> None:

@@ -28,6 +28,8 @@ class MarkerMotionSpec:
     """λ_t of FOTS: how fast the rotation falls off around the contact centre [1/m²]."""
     twist_max: float
     """Δθ_max of FOTS: the most that markers follow a twist [rad]."""
+    contact_radius: float
+    """Radius of the contact that λ_s and λ_t hold for [m]; they scale with 1 / radius² for others. 0: they hold for all, as published."""
     field_gain: float
     """Scale of the normalised force field: marker displacement by penetration along a wall's normal [-]."""
     field_shear: float
@@ -49,6 +51,7 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
         "shear_max_mm": Number("(0, 10]"),
         "twist_lambda_per_mm2": Number("(0, 100]"),
         "twist_max_deg": Number("(0, 180]"),
+        "contact_radius_mm": Number("[0, 50]", default=0.0),
     },
     "force_field": {
         "gain": Number("[0, 100]"),
@@ -84,6 +87,7 @@ def marker_motion_text(motion: MarkerMotionSpec) -> str:
             "shear_max_mm": (motion.shear_max * 1e3, "cap of the shear that markers follow"),
             "twist_lambda_per_mm2": (motion.twist_lambda * 1e-6, "lambda_t"),
             "twist_max_deg": (motion.twist_max * degrees, "cap of the twist that markers follow"),
+            "contact_radius_mm": (motion.contact_radius * 1e3, "radius that lambda_s and lambda_t hold for; 0: as published"),
         },
         "force_field": {
             "gain": (motion.field_gain, "displacement by penetration along a wall's normal"),

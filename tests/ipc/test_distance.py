@@ -138,3 +138,25 @@ def test_ccd_never_passes_and_rarely_stops_early(rng: np.random.Generator) -> No
             hit, _ = check(*x[i], *(x[i] + alpha[i] * d[i]))
             assert not hit
     assert stopped > 50
+
+
+def test_ccd_stops_what_ipctk_stops(rng: np.random.Generator) -> None:
+    """The same stencils as ipctk's additive CCD with the same slack, no earlier than it, and before the impact it finds without slack."""
+    x = rng.standard_normal((300, 4, 3))
+    d = 3 * rng.standard_normal((300, 4, 3))
+    out = wp.zeros((300, 2), dtype=wp.float64, device="cpu")
+    arrays = [wp.array(a, dtype=wp.vec3d, device="cpu") for a in (x, d)]
+    wp.launch(advance, dim=300, inputs=[*arrays, 0.1], outputs=[out], device="cpu")
+    slack, exact = ipctk.AdditiveCCD(10_000, 0.9), ipctk.AdditiveCCD(10_000, 0.999)
+    stopped = 0
+    for kind in (0, 1):
+        for i, alpha in enumerate(out.numpy()[:, kind]):
+            ways = x[i], x[i] + d[i]
+            (hit, early), (_, late) = (
+                (oracle.edge_edge_ccd if kind else oracle.point_triangle_ccd)(*ways[0], *ways[1]) for oracle in (slack, exact)
+            )
+            assert hit == (alpha < 1)
+            if hit:
+                stopped += 1
+                assert early <= alpha <= late * (1 + 1e-9)
+    assert stopped > 50

@@ -77,14 +77,20 @@ def test_block_slides_with_the_right_acceleration(kind: str) -> None:
     assert wrench[0] == pytest.approx(0.49 * weight, rel=1e-3)
 
 
-def test_collision_keeps_momentum_and_energy_never_rises() -> None:
-    """Two soft cubes meet off-centre, without gravity: momentum drifts by less than 1e-8 of what is exchanged."""
+def collide(velocity_tolerance: float, linear_tolerance: float) -> tuple[float, float]:
+    """Two soft cubes meet off-centre, with friction, without gravity.
+
+    Returns:
+        Largest drift of momentum as a share of that of the moving cube, and largest rise of energy in a step as a share of its own.
+    """
     a, b = unit_cell(2, 0.02), unit_cell(2, 0.02)
     bodies = [
         ipc.SoftBody("a", a, ipc.Material(1e5, 0.4)),
         ipc.SoftBody("b", ipc.TetMesh(b.vertices + np.array([0.023, 0.006, 0.004]), b.tets), ipc.Material(2e5, 0.4)),
     ]
-    settings = ipc.Settings(dt=2e-3, d_hat=1e-3, friction=0.3, velocity_tolerance=1e-11, linear_tolerance=1e-8)
+    settings = ipc.Settings(
+        dt=2e-3, d_hat=1e-3, friction=0.3, velocity_tolerance=velocity_tolerance, linear_tolerance=linear_tolerance
+    )
     world = ipc.World(bodies, settings, device="cpu")
     world.set_velocity("a", (1.0, 0.0, 0.0))
     mass = 0.02**3 * 1000
@@ -95,16 +101,26 @@ def test_collision_keeps_momentum_and_energy_never_rises() -> None:
     def momentum() -> np.ndarray:
         return np.sum([w @ world.velocities(n)[0] for w, n in zip(lumped, "ab", strict=True)], axis=0)
 
-    start, energies, touched = momentum(), [0.5 * mass], False
+    start, energies, drifts, strained = momentum(), [0.5 * mass], [], 0.0
     for _ in range(15):
         report = world.step()
         assert report.converged[0]
-        touched |= bool(report.pairs[0])
         energies.append(float(report.elastic[0] + report.kinetic[0] + report.barrier[0]))
-        drift = np.abs(momentum() - start).max() / mass
-        assert drift < 1e-8, f"momentum drifted by {drift:.3g} of that of the moving cube"
-    assert touched and np.abs(world.velocities("b")[0].mean(axis=0)[0]) > 0.1
-    assert (np.diff(energies) <= 1e-9 * energies[0]).all(), f"energy rose by {np.diff(energies).max():.3g} J"
+        drifts.append(np.abs(momentum() - start).max() / mass)
+        strained = max(strained, float(report.elastic[0]))
+    # It was a collision: energy went into strain, half the momentum and some of it sideways, by friction and off-centre, to the other cube.
+    along, aside, _ = world.velocities("b")[0].mean(axis=0)
+    assert strained > 0.01 * energies[0] and along > 0.4 and aside > 0.02
+    return max(drifts), float(np.diff(energies).max()) / energies[0]
+
+
+def test_collision_keeps_momentum_and_energy_never_rises() -> None:
+    """To rounding where the solver is; where it is told to be coarse both are seen to fail, so the measure does measure."""
+    drift, rise = collide(1e-11, 1e-8)
+    assert drift < 1e-8, f"momentum drifted by {drift:.3g} of that of the moving cube"
+    assert rise <= 1e-12, f"energy rose by {rise:.3g} of itself"
+    drift, rise = collide(1e-2, 0.1)
+    assert drift > 1e-5 and rise > 1e-7
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("bdf2", 2)])

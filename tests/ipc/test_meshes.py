@@ -78,3 +78,19 @@ def test_tetwild_itself(tmp_path: Path) -> None:
     pytest.importorskip("pytetwild")
     mesh = tetrahedralize(ipc.icosphere(1.0, 2), 0.4, cache=tmp_path)
     assert tet_volumes(mesh.vertices, mesh.tets).sum() == pytest.approx(4 / 3 * np.pi, rel=0.05)
+
+
+def test_vertices_near_a_surface_are_those_at_that_distance(rng: np.random.Generator) -> None:
+    """Against a dense sampling of the surface, which can only be farther away."""
+    line = np.linspace(-2.0, 2.0, 9)
+    mesh, ball = ipc.box_mesh(line, line, line), ipc.icosphere(1.0, 1)
+    near = ipc.vertices_near(mesh, ball, 0.5)
+    w = rng.dirichlet([1, 1, 1], (len(ball.faces), 400))
+    samples = np.einsum("fsk,fki->fsi", w, ball.vertices[ball.faces]).reshape(-1, 3)
+    sampled = np.sqrt(((mesh.vertices[:, None] - samples[None]) ** 2).sum(-1).min(axis=1))
+    assert 0 < len(near) < len(mesh.vertices)
+    assert (sampled[near] < 0.5 + 0.03).all()
+    rest = np.setdiff1d(np.arange(len(mesh.vertices)), near)
+    assert (sampled[rest] > 0.5).all()
+    points = mesh.vertices[[0, 40]]
+    assert ipc.vertices_near(mesh, points, 1e-9).tolist() == [0, 40]

@@ -1,4 +1,4 @@
-"""Bodies at rest against closed forms: a cantilever, a pressed block, a pad under gravity."""
+"""Bodies at rest against closed forms: a cantilever, Hertz's ball, a flat punch, a pressed block; and the balance of forces."""
 
 from __future__ import annotations
 
@@ -6,29 +6,95 @@ import numpy as np
 import pytest
 
 import ipc
-from tests.ipc.conftest import unit_cell
+from experiments.contact_meshes import equal_area, rim_block
+from experiments.contact_oracles import punch_force
+from experiments.ipc_validation import (
+    CONTACT,
+    SOLID,
+    cantilever_error,
+    growth,
+    hertz_error,
+    press_punch,
+    press_sphere,
+    punch_error,
+    richardson,
+)
+from experiments.nodal_press import nodal_press
+from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
 
 
 def test_cantilever_converges_to_the_beam() -> None:
     """Under its own weight; linear tetrahedra are too stiff, by less and less, with an order that rises towards two (Timoshenko's beam)."""
-    length, height, young, density, g = 0.1, 0.02, 1e6, 1000.0, 0.05
-    tips = []
-    for cells in (1, 2, 4):
-        x, y = np.linspace(0, length, 5 * cells + 1), np.linspace(0, height, cells + 1)
-        mesh = ipc.box_mesh(x, y, y, mirrored=cells > 1)
-        bonded = ipc.vertices_in_box(mesh, (0, -1, -1), (0, 1, 1))
-        body = ipc.SoftBody("beam", mesh, ipc.Material(young, 0.0, density), bonded=bonded)
-        settings = ipc.Settings(dt=1e3, gravity=(0, 0, -g), velocity_tolerance=1e-12, linear_tolerance=1e-8)
-        world = ipc.World([body], settings, device="cpu")
-        assert world.step().converged[0]
-        end = np.isclose(mesh.vertices[:, 0], length)
-        tips.append(-(world.positions("beam")[0, end, 2] - mesh.vertices[end, 2]).mean())
-    load = density * g * height**2
-    exact = load * length**4 / (8 * young * height**4 / 12) + load * length**2 / (2 * 5 / 6 * young / 2 * height**2)
-    errors = 1 - np.array(tips) / exact
+    errors = -np.array([cantilever_error(cells) for cells in (2, 4, 8)])
     orders = np.log2(errors[:-1] / errors[1:])
-    assert (errors > 0).all() and errors[-1] < 0.2, f"errors {errors}"
-    assert orders[1] > orders[0] and orders[1] > 1.2, f"orders {orders}"
+    assert (errors > 0).all() and errors[-1] < 0.06, f"errors {errors}"
+    assert orders[1] > orders[0] and 1.7 < orders[1] < 2.1, f"orders {orders}"
+
+
+@pytest.mark.slow
+def test_cantilever_is_of_second_order() -> None:
+    errors = [-cantilever_error(cells) for cells in (8, 16)]
+    assert errors[1] < 0.02 and np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.1), f"errors {errors}"
+
+
+def test_hertz_force_is_met() -> None:
+    """A ball pressed into a half-space: within 5 % at five cells to the contact radius; the stand-off counts as depth."""
+    assert abs(hertz_error(press_sphere(5, reach=7.0))) < 0.05
+
+
+def test_press_errs_by_its_mesh_alone() -> None:
+    """A punch on a mesh of three cells to the radius: linear elasticity with exact contact at the vertices has the same force to 1 %."""
+    cells, reach = 3, 6.0
+    mesh, held = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
+    rim = CONTACT * equal_area(round(2 * np.pi * cells))
+    under = np.isclose(mesh.vertices[:, 2], 0) & (np.hypot(*mesh.vertices[:, :2].T) < 1.001 * rim)
+    pressed = press_punch(cells, reach=reach)
+    nodal = nodal_press(mesh, held, SOLID, np.where(under, -pressed.depth, np.inf))
+    assert pressed.force == pytest.approx(nodal, rel=0.01)
+    assert 0.08 < nodal / float(punch_force(SOLID, CONTACT, pressed.depth)) - 1 < 0.16
+
+
+@pytest.mark.slow
+def test_presses_converge_to_the_closed_forms() -> None:
+    """Hertz within 2 % on the finest of three meshes, the flat punch within 5 %; both head for the closed form."""
+    cells = (4, 6, 9)
+    hertz = [hertz_error(press_sphere(n)) for n in cells]
+    punch = [punch_error(press_punch(n)) for n in cells]
+    for name, errors, most, lowest in (("hertz", hertz, 0.02, 1.7), ("punch", punch, 0.05, 1.2)):
+        order, limit = richardson(errors, 1.5)
+        assert abs(errors[-1]) < most, f"{name}: errors {errors}"
+        assert lowest < order < 2.4 and abs(limit) < 0.01, f"{name}: order {order}, limit {limit}"
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_forces_balance_to_the_residual(friction: float) -> None:
+    """Force on the ball + pull on the case + inertia of the pad is what Newton's method left, to rounding; torques likewise.
+
+    With friction a torque is left over: the two sides of a pair are a stand-off apart, so f on one and −f on the other are a couple.
+    """
+    mesh = small_pad()
+    ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((0.0, 0.0, 4.12e-3)))
+    for tolerance, relative in ((1e-5, 1e-4), (1e-9, 1e-8)):
+        settings = ipc.Settings(d_hat=1e-4, friction=friction, velocity_tolerance=tolerance, linear_tolerance=1e-4)
+        world = ipc.World([bonded_pad(mesh), ball], settings, device="cpu")
+        corners = mesh.vertices[mesh.tets]
+        quarter = 1000 * np.linalg.det(corners[:, 1:] - corners[:, :1]) / 24
+        mass = np.bincount(mesh.tets.ravel(), weights=np.repeat(quarter, 4))[:, None]
+        for k in range(6):
+            before = world.velocities("pad")[0]
+            world.set_target("ball", (3e-5 * k, 0.0, 4.12e-3 - 1e-4 * (k + 1)))
+            assert world.step().converged[0]
+        inertia = mass * (world.velocities("pad")[0] - before) / settings.dt
+        on_ball, on_case = world.wrench("ball"), world.wrench("pad")
+        size, left = np.linalg.norm(on_ball.force[0]), on_ball.force[0] + on_case.force[0] + inertia.sum(axis=0)
+        assert size > 0.5 and np.abs(inertia).sum() > 1e-5 * size
+        residual = world._potential.residual.numpy()[0].sum(axis=0)
+        assert left == pytest.approx(-residual, abs=float(1e-13 * size))
+        assert np.abs(left).max() < relative * size
+        couple = on_ball.torque[0] + np.cross(world.frame("ball")[1][0], on_ball.force[0]) + on_case.torque[0]
+        couple += np.cross(world.positions("pad")[0], inertia).sum(axis=0)
+        tangential = np.linalg.norm(on_ball.force[0, :2])
+        assert np.abs(couple).max() < relative * size * 4e-3 + (2 * world.d_hat * tangential if friction else 0.0)
 
 
 def test_pressed_block_has_a_uniform_pressure() -> None:

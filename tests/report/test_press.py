@@ -34,7 +34,7 @@ def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: Pr
     mode = Shader(sensor_spec, SIZE)
     sensor = sensor_with(sensor_spec, mode)
     written = run_press(sensor, scene, tmp_path / "out", outputs=OUTPUTS)
-    names = {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    names = {"rgb.png", "frame.exr", "height.npy", "traction.npy", "preview.png", "metrics.json"}
     assert {path.name for path in written} == names == {path.name for path in (tmp_path / "out").iterdir()}
     assert mode.rendered == 2  # the untouched pad and the press
 
@@ -56,6 +56,10 @@ def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: Pr
     metrics = read_metrics(tmp_path / "out" / "metrics.json")
     assert metrics["contact.max_indentation_mm"] == pytest.approx(1e3 * float((sensor.grid.rest - height).max()), rel=1e-5)
     assert float(metrics["contact.force_z_n"]) < 0.0
+    traction = np.load(tmp_path / "out" / "traction.npy")
+    assert traction.shape == (*sensor.grid.shape, 3) and metrics["contact.max_pressure_kpa"] == pytest.approx(
+        -1e-3 * traction[..., 2].min()
+    )
     assert float(metrics["contact.surface_area_mm2"]) > 0.0 and float(metrics["contact.force_law_area_mm2"]) > 0.0
     assert metrics["image.pixel_x_mm"] == pytest.approx(0.0634 * 320 / 64) == metrics["image.pixel_y_mm"]
     assert {"time.physics_ms", "time.surface_ms", "time.optics_ms", "wall_s", "device"} <= set(metrics)
@@ -67,6 +71,7 @@ def test_everything_asked_for_is_written_once(sensor_spec: SensorSpec, scene: Pr
         (("rgb",), {"rgb.png", "frame.exr"}, {"R", "G", "B"}),
         (("depth",), {"frame.exr"}, {"Z"}),
         (("height",), {"height.npy"}, set()),
+        (("wrench", "traction"), {"traction.npy"}, set()),
     ],
 )
 def test_only_what_was_asked_for_is_written(

@@ -1,0 +1,327 @@
+"""The hard cases: what is thrown, dropped, pressed and twisted, and what each must come to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import ipc
+from experiments.hard_run import D_HAT, MAX_NEWTON, G, Setup, Worst, carries, mass, run, world_of
+from experiments.hard_shapes import (
+    SIZE,
+    about,
+    as_surface,
+    bar,
+    crack,
+    cube,
+    dented_ball,
+    fork,
+    hole,
+    moved,
+    pyramid,
+    sheet,
+    wedge,
+)
+from ipc.layout import rotation_matrix
+
+SOFT = ipc.Material(2e4, 0.4)
+"""As soft for its size as a metre of 1 MPa: its own weight compresses a cube by 1 %."""
+
+
+def drop(mesh: ipc.TetMesh, surface: ipc.TriMesh, setup: Setup, **settings: Any) -> ipc.World:
+    """A soft body over an obstacle at rest."""
+    return world_of([ipc.SoftBody("soft", mesh, SOFT), ipc.KinematicBody("obstacle", surface)], setup, **settings)
+
+
+def sharp(mesh: ipc.TetMesh, surface: ipc.TriMesh, setup: Setup) -> Worst:
+    """A sharp body is thrown at a sharp one, at 1 m/s."""
+    world = drop(moved(mesh, (0, 0, 1e-3)), surface, setup)
+    world.set_velocity("soft", (0.0, 0.0, -1.0))
+    return run(world, 30)
+
+
+def nested(mesh: ipc.TetMesh, surface: ipc.TriMesh, setup: Setup) -> Worst:
+    """A sharp body falls into what has its shape, and lies there."""
+    worst = run(drop(moved(mesh, (0, 0, 3e-3)), surface, setup), 60)
+    return carries(worst, "obstacle", G * mass(mesh))
+
+
+def sliding(mesh: ipc.TetMesh, setup: Setup, steps: int = 16) -> Worst:
+    """A body slides 5 cm down a slope that is cut into triangles."""
+    angle = 0.5
+    start = moved(mesh, (-0.025, 0, 2e-4))
+    world = drop(start, sheet(10), setup, gravity=(G * math.sin(angle), 0.0, -G * math.cos(angle)))
+    ways: list[float] = []
+    worst = run(world, steps, lambda k: ways.append(float(world.positions("soft")[0, :, 0].mean())))
+    ways.append(float(world.positions("soft")[0, :, 0].mean()))
+    worst.expect(ways[-1] - ways[0] > 0.02, f"slid {ways[-1] - ways[0]:.3g} m only")
+    if mesh is CUBE:
+        dt, half = world.settings.dt, steps // 2
+        speeds = np.diff(ways) / dt
+        found = (speeds[-1] - speeds[half]) / ((steps - 1 - half) * dt)
+        expected = G * (math.sin(angle) - 0.1 * math.cos(angle))
+        worst.expect(abs(found / expected - 1) < 0.05, f"slid at {found:.3g} m/s², not {expected:.3g}: it was caught")
+    return worst
+
+
+CUBE = cube()
+
+
+def cliff(setup: Setup) -> Worst:
+    """A cube whose middle is beyond an edge: it tips over."""
+    worst = run(drop(moved(CUBE, (0.012, 0, 1e-3)), as_surface(moved(CUBE, (0, 0, -SIZE))), setup), 25)
+    assert worst.world is not None
+    return worst.expect(worst.world.positions("soft")[0, :, 2].min() < -SIZE / 4, "the cube did not tip over the edge")
+
+
+def parallel_edges(setup: Setup) -> Worst:
+    """The edge of a wedge on that of another, parallel to rounding, nearly so and exactly."""
+    total = Worst()
+    for angle in (0.0, 1e-12, 1e-8, 1e-4):
+        upper = moved(wedge(False), (0.3 * SIZE, 0.0, 2e-4), about((0, 0, 1), angle))
+        worst = run(drop(upper, as_surface(wedge(True)), setup), 12)
+        total.min_gap, total.min_det = min(total.min_gap, worst.min_gap), min(total.min_det, worst.min_det)
+        total.max_newton, total.unconverged = max(total.max_newton, worst.max_newton), total.unconverged + worst.unconverged
+        total.steps, total.touched, total.finite = (
+            total.steps + worst.steps,
+            total.touched + worst.touched,
+            total.finite & worst.finite,
+        )
+        total.notes += [f"{note} at {angle} rad" for note in worst.notes]
+        total.world = worst.world
+    return total
+
+
+def two_cubes(
+    setup: Setup,
+    lower: ipc.Material,
+    upper: ipc.Material,
+    size: float = SIZE,
+    offset: float = 0.0,
+    steps: int = 30,
+    rests: bool = True,
+    **settings: Any,
+) -> Worst:
+    """A cube on a cube on a plane; where it ``rests``, the plane carries both."""
+    meshes = moved(CUBE, (0, 0, 2e-4)), moved(cube(size), (offset, 0, SIZE + 4e-4))
+    bodies: list[ipc.Body] = [ipc.SoftBody(n, m, k) for n, m, k in zip(("lower", "upper"), meshes, (lower, upper), strict=True)]
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, friction=0.3, **settings)
+    worst = run(world, steps)
+    if rests:
+        weight = G * sum(mass(m, k.density) for m, k in zip(meshes, (lower, upper), strict=True))
+        carries(worst, "floor", weight)
+    return worst
+
+
+def mass_ratio(setup: Setup) -> Worst:
+    """80 kg on 8 g: the small cube must hold it, 2 % shorter."""
+    stiff = ipc.Material(1e8, 0.4), ipc.Material(1e8, 0.4, 1e4)
+    worst = two_cubes(setup, *stiff, size=10 * SIZE, steps=40)
+    assert worst.world is not None
+    z = worst.world.positions("lower")[0, :, 2]
+    shorter, expected = 1 - (z.max() - z.min()) / SIZE, 80 * G / SIZE**2 / 1e8
+    return worst.expect(0.5 < shorter / expected < 1.2, f"shortened by {shorter:.3g} where stress over E is {expected:.3g}")
+
+
+def crush(setup: Setup) -> Worst:
+    """The same weight on a cube that cannot hold it: a stress of twice Young's modulus."""
+    worst = two_cubes(setup, ipc.Material(1e6, 0.4), ipc.Material(1e6, 0.4, 1e4), size=10 * SIZE, steps=60, rests=False)
+    assert worst.world is not None
+    z = worst.world.positions("lower")[0, :, 2]
+    return worst.expect(z.max() - z.min() < 0.5 * SIZE, "was not crushed")
+
+
+def step_size(setup: Setup, dt: float, steps: int) -> Worst:
+    """A cube falls with a corner first on a bonded slab, at any time step."""
+    turn = about((1, -1, 0), math.atan(2**0.5))
+    corner = moved(moved(cube(0.5 * SIZE, 2), (0, 0, -0.25 * SIZE)), (0, 0, 0), turn)
+    falling = moved(corner, (0.1e-3, 0.2e-3, 1e-3 - corner.vertices[:, 2].min()))
+    slab = moved(bar(2 * SIZE, 0.5 * SIZE, 2 * SIZE, (6, 6, 2)), (0, 0, -0.25 * SIZE))
+    base = ipc.vertices_in_box(slab, (-1, -1, -0.5 * SIZE), (1, 1, -0.5 * SIZE))
+    bodies: list[ipc.Body] = [ipc.SoftBody("falling", falling, SOFT), ipc.SoftBody("slab", slab, SOFT, bonded=base)]
+    worst = run(world_of(bodies, setup, dt=dt, friction=0.3), steps)
+    # Backward Euler damps the rest of the fall away where the step is long: then it lies still.
+    return carries(worst, "slab", G * (mass(falling) + mass(slab))) if dt >= 0.1 else worst
+
+
+def fast_impact(setup: Setup) -> Worst:
+    """A soft cube at 50 m/s meets a slab of a centimetre: in one step it would fly half a metre."""
+    slab = moved(bar(3 * SIZE, 0.5 * SIZE, 3 * SIZE, (6, 6, 2)), (0, 0, -0.25 * SIZE))
+    base = ipc.vertices_in_box(slab, (-1, -1, -0.5 * SIZE), (1, 1, -0.5 * SIZE))
+    material = ipc.Material(1e5, 0.4)
+    bodies: list[ipc.Body] = [
+        ipc.SoftBody("bullet", moved(cube(0.5 * SIZE, 2), (0, 0, 0.02)), material),
+        ipc.SoftBody("slab", slab, material, bonded=base),
+    ]
+    world = world_of(bodies, setup)
+    world.set_velocity("bullet", (0.0, 0.0, -50.0))
+    lowest = [math.inf]
+
+    def note(_: int) -> None:
+        lowest[0] = min(lowest[0], float(world.positions("bullet")[0, :, 2].min()))
+
+    worst = run(world, 12, note)
+    note(0)
+    return worst.expect(lowest[0] > -0.5 * SIZE, f"went through: {lowest[0]:.3g} m")
+
+
+def squeeze(setup: Setup) -> Worst:
+    """A soft cube between two plates, down to half its height and back: it must come back to its shape."""
+    mesh = cube(cells=3)
+    plate, gap = ipc.box_surface((0.06, 0.06, 0.004)), 2e-4
+    bodies: list[ipc.Body] = [
+        ipc.SoftBody("soft", mesh, ipc.Material(1e5, 0.4)),
+        ipc.KinematicBody("low", plate, ipc.Pose((0, 0, -0.002 - gap))),
+        ipc.KinematicBody("high", plate, ipc.Pose((0, 0, SIZE + 0.002 + gap))),
+    ]
+    world = world_of(bodies, setup, gravity=(0, 0, 0), friction=0.5)
+    heights: list[float] = []
+
+    def move(k: int) -> None:
+        way = max(min(k + 1, 24 - k), 0) / 12
+        world.set_target("high", (0, 0, SIZE + 0.002 + gap - 0.5 * SIZE * way))
+        heights.append(float(np.ptp(world.positions("soft")[0, :, 2])))
+
+    worst = run(world, 40, move)
+    worst.expect(min(heights) < 0.53 * SIZE, f"was squeezed to {min(heights) / SIZE:.3g} of its height only")
+    now = world.positions("soft")[0]
+    edges = [np.linalg.norm(x[mesh.tets][:, 1:] - x[mesh.tets][:, :1], axis=-1) for x in (now, mesh.vertices)]
+    error = float(np.abs(edges[0] / edges[1] - 1).max())
+    return worst.expect(error < 0.01, f"did not recover its shape: {error:.3g}")
+
+
+def folded(setup: Setup) -> Worst:
+    """A slotted block pressed until its two arms meet: self-contact."""
+    mesh = fork()
+    bonded = ipc.vertices_in_box(mesh, (-1, -1, 0), (1, 1, 0))
+    jaw = ipc.box_surface((0.004, 0.02, 0.006))
+    bodies: list[ipc.Body] = [
+        ipc.SoftBody("fork", mesh, ipc.Material(1e5, 0.4), bonded=bonded, self_contact=True),
+        ipc.KinematicBody("left", jaw, ipc.Pose((-0.0125, 0, 0.017))),
+        ipc.KinematicBody("right", jaw, ipc.Pose((0.0125, 0, 0.017))),
+    ]
+    world = world_of(bodies, setup, dt=0.02, gravity=(0, 0, 0), friction=0.2)
+
+    def move(k: int) -> None:
+        way = 0.0036 * (k + 1) / 15
+        world.set_target("left", (-0.0125 + way, 0, 0.017))
+        world.set_target("right", (0.0125 - way, 0, 0.017))
+
+    worst = run(world, 15, move)
+    return worst.expect(("fork", "fork") in world.contacts().bodies, "the arms never met")
+
+
+def blocked(setup: Setup) -> Worst:
+    """A ball driven through the pad into the bonded base: it stops, and the report says how much was left."""
+    mesh = ipc.domed_pad((12e-3, 12e-3), 3e-3, (math.inf, math.inf), (4, 4, 2))
+    pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45), bonded=ipc.vertices_in_box(mesh, (-1, -1, -3e-3), (1, 1, -3e-3)))
+    ball = ipc.KinematicBody("ball", ipc.icosphere(3e-3, 2), ipc.Pose((0, 0, 3.1e-3 + D_HAT)))
+    world = world_of([pad, ball], setup, gravity=(0, 0, 0))
+    worst = run(world, 16, lambda k: world.set_target("ball", (0, 0, max(-3e-3, 3.1e-3 - 0.5e-3 * (k + 1)))))
+    lowest = float(world.positions("ball")[0, :, 2].min())
+    worst.expect(0 < worst.blocked <= 1, "was not blocked")
+    return worst.expect(-3e-3 < lowest < -2e-3, f"stopped at {lowest:.3g} m, where the base is at -0.003 m")
+
+
+def twisted(setup: Setup, mesh: ipc.TetMesh, turns: float, length: float) -> Worst:
+    """Both ends of a bar or mat turned against each other, a sixteenth of a turn a step."""
+    ends = [np.flatnonzero(np.isclose(mesh.vertices[:, 0], side * length / 2)) for side in (-1, 1)]
+    material = ipc.Material(1e5, 0.4, mass_damping=20.0)
+    body = ipc.SoftBody("twisted", mesh, material, bonded=ends[0], grips={"far": ends[1]}, self_contact=True)
+    world = world_of([body], setup, dt=0.02, gravity=(0, 0, 0), velocity_tolerance=1e-3)
+
+    def turn(k: int) -> None:
+        for name, side in (("twisted", -0.5), ("twisted.far", 0.5)):
+            world.set_target(name, rotation=about((1, 0, 0), side * (k + 1) * math.pi / 8))
+
+    worst = run(world, round(16 * turns), turn)
+    return worst.expect(worst.blocked == 0, f"a share of {worst.blocked:.3g} of a turn was not followed")
+
+
+def beam_twist(setup: Setup) -> Worst:
+    """A beam of 4 × 4 × 20 mm."""
+    cells, turns = ((20, 3, 3), 4) if setup.large else ((10, 2, 2), 3)
+    return twisted(setup, bar(4e-3, 4e-3, 20e-3, cells), turns, 20e-3)
+
+
+def mat_twist(setup: Setup) -> Worst:
+    """A mat of 20 × 20 × 1 mm, which rolls itself up."""
+    cells, turns = ((18, 18, 1), 3) if setup.large else ((10, 10, 1), 2)
+    return twisted(setup, bar(20e-3, 1e-3, 20e-3, cells), turns, 20e-3)
+
+
+def random_presses(setup: Setup, count: int, seed: int = 0) -> Worst:
+    """Presses, shears and twists of convex and concave objects, anywhere on a coarse pad, many at once."""
+    rng = np.random.default_rng(seed)
+    mesh = ipc.domed_pad((12e-3, 12e-3), 4e-3, (math.inf, math.inf), (5, 5, 2))
+    pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45), bonded=ipc.vertices_in_box(mesh, (-1, -1, -4e-3), (1, 1, -4e-3)))
+    shapes = {
+        "ball": ipc.icosphere(3e-3, 2),
+        "box": ipc.box_surface((4e-3, 3e-3, 2e-3)),
+        "spike": as_surface(moved(pyramid(False, 5e-3), (0, 0, -2.5e-3))),
+        "dent": dented_ball(3e-3),
+    }
+    worst = Worst()
+    for name, shape in shapes.items():
+        envs = count // len(shapes)
+        if envs == 0:
+            continue
+        axis, angle = rng.standard_normal((envs, 3)), rng.uniform(0, math.pi, envs)
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        turn = np.concatenate([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * axis], axis=1)
+        low = (rotation_matrix(turn) @ shape.vertices.T)[:, 2].min(axis=1)
+        start = np.column_stack([rng.uniform(-3e-3, 3e-3, (envs, 2)), 0.15e-3 - low])
+        tool = ipc.KinematicBody("tool", shape, ipc.Pose((0.0, 0.0, 0.02)))
+        settings = ipc.Settings(
+            dt=0.02, d_hat=1e-4, friction=0.5, max_newton=MAX_NEWTON, friction_relags=1, velocity_tolerance=1e-3
+        )
+        world = ipc.World([pad, tool], settings, num_envs=envs, device=setup.device)
+        world.teleport("tool", start, turn)
+        depth, side, twist = rng.uniform(0.2e-3, 1.5e-3, envs), rng.uniform(-1e-3, 1e-3, (envs, 2)), rng.uniform(-0.5, 0.5, envs)
+        for k in range(1, 10):
+            down, after = min(k / 5, 1.0), max(k - 5, 0) / 4
+            half = 0.5 * after * twist
+            w, x, y, z = turn.T
+            c, s = np.cos(half), np.sin(half)
+            turned = np.column_stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+            world.set_target("tool", start + np.column_stack([after * side, -depth * down]), turned)
+            report = world.step()
+            worst.add(world, report)
+        worst.expect((report.pairs > 0).all(), f"{name}: {int((report.pairs == 0).sum())} of {envs} did not touch")
+        print(
+            f"  random_presses: {name} x {envs}, gap {worst.min_gap:.3g} m, det F {worst.min_det:.3g}, newton {worst.max_newton}"
+        )
+    return worst
+
+
+CASES: dict[str, Callable[[Setup], Worst]] = {
+    "spike_on_spike": lambda a: sharp(pyramid(False), as_surface(pyramid(True)), a),
+    "wedge_on_wedge": lambda a: sharp(wedge(False), as_surface(moved(wedge(True), (0, 0, 0), about((0, 0, 1), math.pi / 2))), a),
+    "spike_on_wedge": lambda a: sharp(pyramid(False), as_surface(wedge(True)), a),
+    "parallel_edges": parallel_edges,
+    "spike_in_hole": lambda a: nested(pyramid(False), hole(), a),
+    "spike_in_crack": lambda a: nested(pyramid(False), crack(), a),
+    "wedge_in_crack": lambda a: nested(wedge(False), crack(), a),
+    "sliding_spike": lambda a: sliding(pyramid(False), a),
+    "sliding_wedge": lambda a: sliding(wedge(False), a),
+    "internal_edges": lambda a: sliding(CUBE, a),
+    "cliff": cliff,
+    "vertex_alignment": lambda a: two_cubes(a, SOFT, SOFT),
+    "edge_alignment": lambda a: two_cubes(a, SOFT, SOFT, offset=SIZE, rests=False),
+    "mass_ratio_1e4": mass_ratio,
+    "crush": crush,
+    "stiffness_ratio_1e4": lambda a: two_cubes(a, SOFT, ipc.Material(2e8, 0.4), kappa=1e6),
+    "dt_1ms": lambda a: step_size(a, 1e-3, 60),
+    "dt_10ms": lambda a: step_size(a, 1e-2, 30),
+    "dt_100ms": lambda a: step_size(a, 0.1, 20),
+    "dt_1s": lambda a: step_size(a, 1.0, 10),
+    "fast_impact": fast_impact,
+    "squeeze_and_release": squeeze,
+    "self_contact": folded,
+    "blocked_drive": blocked,
+    "beam_twist": beam_twist,
+    "mat_twist": mat_twist,
+}

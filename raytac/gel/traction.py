@@ -1,0 +1,114 @@
+"""Traction on the coat: force per area over the pad's grid, of a simulated pad and of one that only knows its total."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.coat_mesh import CoatMesh
+from raytac.gel.surface import GelSurface, PadGrid
+
+__all__ = ["CoatTraction", "cell_areas", "foundation_traction"]
+
+
+def cell_areas(grid: PadGrid) -> np.ndarray:
+    """Area that each node stands for [m²], shape (Ny, Nx): a cell, half of one at the edges, a quarter in the corners."""
+    along = [np.full(n, pitch) for n, pitch in zip(reversed(grid.shape), grid.pitch, strict=True)]
+    for line in along:
+        line[[0, -1]] *= 0.5
+    return np.outer(along[1], along[0])
+
+
+class CoatTraction:
+    """Traction of forces on a coat's vertices, over a grid, linear on each of the coat's triangles.
+
+    Contact with facets loads neighbouring vertices unevenly, those in the middle of eight triangles more than those of four, by about
+    15 % against their areas. One pass takes each vertex's traction to its triangles (the mean of their corners) and back (the mean by
+    area); it keeps the sum and costs one cell of sharpness. Then a vertex's traction is its force over the integral of its hat
+    function on the grid, so that the sum of traction × ``cell_areas`` is the total force exactly. It is per area of the coat at rest
+    and at the place that the coat has at rest (the first Piola-Kirchhoff traction): it moves with the material.
+    """
+
+    def __init__(self, mesh: CoatMesh, grid: PadGrid) -> None:
+        self._corner, self._weight = _in_triangles(mesh, grid)
+        share = self._weight * cell_areas(grid).ravel()[:, None]
+        self._area = np.bincount(self._corner.ravel(), share.ravel(), len(mesh.rest))
+        if not (self._area > 0.0).all():
+            rule = (
+                f"must be finer than the coat's cells: {int((self._area <= 0.0).sum())} of its vertices have no node around them"
+            )
+            raise InputError("pitch", value=grid.pitch, rule=rule)
+        self._shape = grid.shape
+        self._faces = mesh.faces
+        corners = mesh.rest[mesh.faces]
+        face_area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self._third = face_area[:, None, None] / 3.0
+        self._lumped = np.bincount(mesh.faces.ravel(), np.repeat(face_area / 3.0, 3), len(mesh.rest))[:, None]
+
+    def __call__(self, forces: np.ndarray) -> np.ndarray:
+        """Traction [Pa], shape (B, Ny, Nx, 3), float32, of forces [N], shape (B, V, 3)."""
+        at_vertices = np.stack([self._evened(f) for f in forces]) / self._area[:, None]
+        spread = sum(at_vertices[:, self._corner[:, k]] * self._weight[:, k, None] for k in range(3))
+        return np.asarray(spread, np.float32).reshape(len(forces), *self._shape, 3)
+
+    def _evened(self, forces: np.ndarray) -> np.ndarray:
+        """Forces (V, 3) after the pass over the triangles; their sum is the same."""
+        at_faces = (forces / self._lumped)[self._faces].mean(axis=1, keepdims=True) * self._third
+        out = np.zeros_like(forces)
+        np.add.at(out, self._faces, np.broadcast_to(at_faces, (len(self._faces), 3, 3)))
+        return out
+
+
+def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the triangle that each node lies in at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
+    rows, columns = mesh.shape
+    x, y = (a.ravel() for a in np.meshgrid(grid.x, grid.y))
+    column = np.clip(np.searchsorted(mesh.lines_x, x, side="right") - 1, 0, columns - 2)
+    row = np.clip(np.searchsorted(mesh.lines_y, y, side="right") - 1, 0, rows - 2)
+    place = mesh.rest[:, :2]
+    middle = place[mesh.faces].mean(axis=1)
+    cell_of_face = (
+        (np.searchsorted(mesh.lines_y, middle[:, 1]) - 1) * (columns - 1) + np.searchsorted(mesh.lines_x, middle[:, 0]) - 1
+    )
+    # Each cell is cut into two triangles.
+    two = mesh.faces[np.argsort(cell_of_face, kind="stable")].reshape(-1, 2, 3)[row * (columns - 1) + column]
+    weights = []
+    for k in range(2):
+        a, b, c = (place[two[:, k, m]] for m in range(3))
+        whole = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+        at_b = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / whole
+        at_c = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / whole
+        weights.append(np.stack([1.0 - at_b - at_c, at_b, at_c], axis=1))
+    second = weights[1].min(axis=1) > weights[0].min(axis=1)
+    weight = np.where(second[:, None], weights[1], weights[0])
+    return np.where(second[:, None], two[:, 1], two[:, 0]), np.maximum(weight, 0.0)
+
+
+def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """Traction [Pa], shape (B, Ny, Nx, 3), of a contact of which only the total is known, as that of an elastic foundation.
+
+    The normal traction is in proportion to the indentation where ``surface.contact`` (K. L. Johnson, Contact Mechanics, section 4.3);
+    the tangential force is shared as the normal one is, and the twist about the contact's centre likewise, growing with the distance
+    from it. Where the pressure really is, a load law does not know: totals are exact, the distribution is a model.
+
+    Args:
+        surface: gives contact and indentation.
+        force: of the object on the gel, pad frame [N], shape (B, 3).
+        twist: torque about +z through the contact's centre [N m], shape (B,).
+    """
+    grid, area = surface.grid, cell_areas(surface.grid)
+    out = np.zeros((*surface.height.shape, 3), np.float32)
+    for b in range(surface.batch):
+        share = np.where(surface.contact[b], np.maximum(surface.indentation[b], 0.0), 0.0)
+        total = float((share * area).sum())
+        if not total > 0.0:
+            continue
+        share = share / total
+        out[b] = share[..., None] * force[b]
+        x, y = grid.x[None, :], grid.y[:, None]
+        x, y = x - (share * area * x).sum(), y - (share * area * y).sum()
+        arm = float((share * area * (x**2 + y**2)).sum())
+        if arm > 0.0:
+            out[b, ..., 0] -= share * twist[b] / arm * y
+            out[b, ..., 1] += share * twist[b] / arm * x
+    return out

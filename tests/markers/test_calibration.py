@@ -1,0 +1,107 @@
+"""The fit: a search that finds minima, and constants that come back from markers made with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raytac.gel.surface import PadGrid
+from raytac.markers.calibration import ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
+from raytac.markers.calibration_presses import FIT, HELD_OUT, Press, PressFrame
+from raytac.markers.pattern import MarkerPattern
+from raytac.markers.tracker import MarkerTracker
+from raytac.specs import SensorSpec, load_sensor, validate_press
+from raytac.specs.marker_motion import load_marker_motion, marker_motion_text
+from tests.markers.pads import MOTION, coat_mesh, pose, pressed, with_coat
+
+
+def test_pattern_search_finds_the_bottom_of_a_valley() -> None:
+    def cost(x: np.ndarray) -> float:
+        return abs(x[0] - 0.3) + 3 * (x[1] + 1.2 + 0.5 * x[0]) ** 2
+
+    found, least = pattern_search(cost, np.zeros(2))
+    assert found == pytest.approx((0.3, -1.35), abs=0.01) and least < 0.01
+
+
+def test_presses_fit_the_sensor_and_are_held_out() -> None:
+    sensor = load_sensor("gelsight_mini")
+    for press in (*FIT, *HELD_OUT):
+        validate_press(sensor, press.scene())
+    assert not {str(press) for press in FIT} & {str(press) for press in HELD_OUT}
+    assert not {(p.kind, *p.params.values()) for p in FIT} & {(p.kind, *p.params.values()) for p in HELD_OUT}
+
+
+def test_probes_cover_the_view(sensor: SensorSpec) -> None:
+    pattern = MarkerPattern.of(probe_sensor(sensor))
+    low, high = pattern.pixel[0].min(axis=0), pattern.pixel[0].max(axis=0)
+    assert (low < 25).all() and (np.asarray(sensor.camera.resolution) - high < 25).all()
+
+
+@pytest.fixture(scope="module")
+def frames(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
+    """Presses whose coat is moved by FOTS itself, with the constants of ``MOTION``."""
+    mesh = coat_mesh(sensor, 76, 62)
+    found = []
+    for name, x, y, deep, shear, twist in (
+        ("a", 0.0, 0.0, 8e-4, (5e-4, 2e-4), 0.0), ("b", 1e-3, -2e-3, 6e-4, (-8e-4, 0.0), 0.0), ("c", -2e-3, 1e-3, 7e-4, (0.0, 0.0), 0.45)
+    ):  # fmt: skip
+        press = Press(name, "sphere", {"radius": 4e-3}, (x, y), deep)
+        moves = [("start", -1e-3, 0.0), ("normal", 0.5 * deep, 0.0), ("normal", deep, 0.0)]
+        moves += [("twist" if twist else "shear", deep, k / 4) for k in range(1, 5)]
+        for load, depth, share in moves:
+            px, py = x + share * shear[0], y + share * shear[1]
+            balls = [(px, py, depth)] if depth > 0 else []
+            surface = pressed(grid, balls, poses=[pose(px, py, -depth, share * twist)])
+            found.append((press, load, surface))
+    return _with_coats(sensor, grid, mesh, found)
+
+
+def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh, found: list) -> list[PressFrame]:
+    from raytac.markers.contacts import ContactCells, ContactTracker
+    from raytac.markers.fots import FotsMarkers
+
+    model, cells, frames, last = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid), [], None
+    for press, load, surface in found:
+        if press is not last:
+            tracker, last = ContactTracker(1), press
+        samples = cells.sample(surface)
+        moved = model.displacement(mesh.rest[None], surface, samples, tracker.update(surface, samples))
+        positions = mesh.rest[None] + np.concatenate([moved, np.zeros((1, len(mesh.rest), 1))], axis=-1)
+        frames.append(PressFrame(press, load, with_coat(surface, mesh, positions)))
+    return frames
+
+
+def test_the_fit_finds_the_constants_again(sensor: SensorSpec, frames: list[PressFrame]) -> None:
+    motion = fit_motion(ProbeData.of(sensor, frames), published=True, device="cpu")
+    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
+        assert getattr(motion, name) == pytest.approx(getattr(MOTION, name), rel=0.1), name
+
+
+def test_errors_are_small_for_the_model_that_made_the_data_only(
+    sensor: SensorSpec, grid: PadGrid, frames: list[PressFrame]
+) -> None:
+    errors, times = model_errors(sensor, frames, grid, models=("fots", "force_field"), device="cpu")
+    by = {(e.model, e.load): e for e in errors}
+    for load in ("normal", "shear", "twist"):
+        assert by["fots", load].mean < 3e-6
+        assert by["fots", load].mean < 0.2 * by["force_field", load].mean
+        assert by["fots", load].size == by["force_field", load].size > 5e-6
+    assert set(times) == {"surface", "fots", "force_field"}
+
+
+def test_the_tracker_at_the_probes_gives_what_the_fit_saw(sensor: SensorSpec, grid: PadGrid, frames: list[PressFrame]) -> None:
+    data = ProbeData.of(sensor, frames)
+    tracker = MarkerTracker(probe_sensor(sensor), "surface", grid)
+    seen = [tracker.update(frame.surface).displacement[0] for frame in frames if frame.load != "start"]
+    np.testing.assert_allclose(data.truth, np.stack(seen), atol=1e-12)
+
+
+def test_the_file_of_a_fit_is_read_back(tmp_path) -> None:
+    path = tmp_path / "made.toml"
+    path.write_text(marker_motion_text(MOTION))
+    again = load_marker_motion(path)
+    for name in MOTION.__dataclass_fields__:
+        if name == "provenance":
+            assert again.provenance.strip() == MOTION.provenance
+        elif name != "source":
+            assert getattr(again, name) == pytest.approx(getattr(MOTION, name), rel=1e-5), name

@@ -1,0 +1,269 @@
+"""The soft pad: what is commanded is reached, forces balance, and it agrees with the rigid pad where it should."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError, RaytacError, SpecError
+from raytac.gel.traction import cell_areas
+from raytac.physics.load_law import LoadLaw
+from raytac.physics.rigid import RigidPad
+from raytac.physics.soft import SoftPad
+from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.specs import load_sensor
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+
+SENSOR = load_sensor("gelsight_mini")
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+RADIUS = 4e-3
+PITCH = 0.2e-3
+FRICTIONLESS = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.0))
+
+
+def press(*stages, kind="sphere", position=(0.0, 0.0), moves="object", **settings):
+    params = {"sphere": {"radius": RADIUS}, "cylinder": {"radius": 3e-3, "length": 4e-3}, "none": {}}[kind]
+    return PressScene("test", ObjectSpec(kind, params, (*position, 0.0), IDENTITY, 0.05, **settings), stages, moves)
+
+
+def indent(depth=None, force=None):
+    return StageSpec("indent", depth=depth, force=force)
+
+
+def soft(scene, sensor=SENSOR, **settings):
+    return SoftPad(sensor, scene, pitch=PITCH, **settings)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A ball pressed 0.6 mm into the coarse pad, and the states on the way."""
+    pad = soft(press(indent(0.6e-3), StageSpec("release")))
+    return pad, list(pad.run(2))
+
+
+def reached(states):
+    """State at the end of the indent."""
+    return states[2]
+
+
+def test_the_imprint_is_as_deep_as_commanded(pressed):
+    pad, states = pressed
+    state = reached(states)
+    assert not state.failed[0]
+    assert state.depth[0] == pytest.approx(0.6e-3, abs=2e-6)
+    surface = pad.surface(state)
+    assert surface.indentation.max() == pytest.approx(0.6e-3, rel=0.02)
+    deepest = np.unravel_index(surface.indentation[0].argmax(), pad.grid.shape)
+    assert abs(pad.grid.x[deepest[1]]) < 0.3e-3 and abs(pad.grid.y[deepest[0]]) < 0.3e-3
+
+
+def test_inside_the_contact_the_coat_is_the_object_and_nowhere_in_it(pressed):
+    pad, states = pressed
+    surface = pad.surface(reached(states))
+    under = pad.object_height(surface)[0]
+    gap = under - surface.height[0]
+    assert surface.contact[0].sum() > 20
+    assert np.abs(gap[surface.contact[0]]).max() < 8e-6
+    assert gap.min() > -1e-6
+    assert under.min() == pytest.approx(-0.6e-3, abs=3e-6)  # the shown object is at the depth, without the barrier's clearance
+
+
+def test_forces_balance_and_traction_integrates_to_the_wrench(pressed):
+    pad, states = pressed
+    state = reached(states)
+    wrench, traction = pad.wrench(state)[0], pad.traction(state)[0].astype(float)
+    assert wrench[2] < -0.5
+    assert wrench[:3] == pytest.approx((traction * cell_areas(pad.grid)[..., None]).sum(axis=(0, 1)), rel=1e-4, abs=1e-4)
+    assert state.normal_force[0] == pytest.approx(-wrench[2])
+
+
+def test_the_case_feels_what_the_object_does():
+    """The wrench summed over the coat's contacts is that summed over the bonded vertices, within 1 % of the load."""
+    pad = soft(press(indent(0.3e-3), StageSpec("shear", shear=(0.1e-3, 0.0))))
+    wrench = pad.wrench(pad.peak(pad.run()))[0]
+    assert pad.solver is not None
+    held = pad.solver.world.wrench("pad")
+    load = np.linalg.norm(wrench[:3])
+    assert load > 0.3 and np.linalg.norm(held.force[0] - wrench[:3]) < 0.01 * load
+    assert np.linalg.norm(held.torque[0] - wrench[3:]) < 0.01 * load * SENSOR.gelpad.thickness
+
+
+def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
+    pad, states = pressed
+    wrench = pad.wrench(reached(states))[0]
+    assert np.abs(wrench[:2]).max() < 1e-6 * abs(wrench[2])
+    assert np.abs(wrench[3:]).max() < 1e-6 * abs(wrench[2]) * RADIUS
+    traction = pad.traction(reached(states))[0]
+    assert np.abs(traction[..., :2]).max() > 1e2  # it is there, and cancels
+    height = pad.surface(reached(states)).height[0]
+    assert np.abs(height - height[::-1]).max() < 1e-7 and np.abs(height - height[:, ::-1]).max() < 1e-7
+
+
+def test_a_release_leaves_the_pad_at_rest(pressed):
+    pad, states = pressed
+    last = states[-1]
+    assert last.kind == "release" and last.normal_force[0] == 0.0
+    assert np.abs(pad.surface(last).indentation).max() < 1e-6
+    assert not pad.surface(last).contact.any() and np.isnan(pad.surface(last).contact_centre).all()
+
+
+def test_running_again_forgets_the_press(pressed):
+    pad, states = pressed
+    again = list(pad.run(2))
+    for one, two in zip(states, again, strict=True):
+        assert np.abs(pad.surface(one).height - pad.surface(two).height).max() < 1e-9
+        assert one.normal_force[0] == pytest.approx(two.normal_force[0], abs=1e-9)
+
+
+def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
+    pad, states = pressed
+    scene = press(indent(0.6e-3))
+    rigid = RigidPad(SENSOR, scene, pitch=PITCH)
+    state = rigid.peak(rigid.run())
+    one, two = rigid.surface(state), pad.surface(reached(states))
+    both = one.contact[0] & two.contact[0]
+    assert both.sum() > 20 and np.abs(one.height[0] - two.height[0])[both].max() < 10e-6
+    areas = [surface.contact.sum() * PITCH**2 for surface in (one, two)]
+    assert areas[1] == pytest.approx(areas[0], rel=0.35)  # coarse cells of 1 mm
+    # The gel hardly changes its volume: pressed down in one place it comes up around it, which Gaussians cannot.
+    assert two.indentation.min() < -5e-6 and one.indentation.min() > -1e-7
+    rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
+    around = (rho > 2.5e-3) & (rho < 5e-3)
+    assert np.abs(one.height[0] - two.height[0])[around].mean() > 5e-6
+
+
+def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
+    pad = soft(press(indent(force=1.0), StageSpec("shear", shear=(0.2e-3, 0.0))))
+    states = list(pad.run())
+    for state in states[1:]:
+        assert not state.failed[0] and state.normal_force[0] == pytest.approx(1.0, rel=0.01)
+    assert states[1].depth[0] > 0.3e-3
+    wrench = pad.wrench(states[2])[0]
+    assert 0.05 < wrench[0] < 1.0 and abs(wrench[1]) < 0.01 * wrench[0]  # along the drag, within Coulomb's cone
+
+
+def test_friction_is_coulombs():
+    """A flat face dragged until all of it slides; its rim ploughs a little. Without friction, a ball drags next to nothing."""
+    sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.2))
+    pad = soft(press(indent(0.4e-3), StageSpec("shear", shear=(1.0e-3, 0.0)), kind="cylinder"), sensor)
+    state = pad.peak(pad.run())
+    assert state.shear_force[0, 0] == pytest.approx(0.2 * state.normal_force[0], rel=0.1)
+    pad = soft(press(indent(0.5e-3), StageSpec("shear", shear=(0.5e-3, 0.0))), FRICTIONLESS)
+    state = pad.peak(pad.run())
+    assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
+
+
+def test_twist_turns_with_the_object():
+    pad = soft(press(indent(0.4e-3), StageSpec("twist", twist=math.radians(4.0)), kind="cylinder"))
+    state = pad.peak(pad.run())
+    assert state.twist_torque[0] > 1e-4 and np.abs(state.shear_force[0]).max() < 1e-3 * state.normal_force[0]
+    coat = pad.surface(state).coat
+    assert coat is not None
+    here = np.linalg.norm(coat.mesh.rest[:, :2], axis=1) < 2e-3
+    x, y = coat.mesh.rest[here, :2].T
+    turned = (x * coat.displacement[0, here, 1] - y * coat.displacement[0, here, 0]).sum() / (x**2 + y**2).sum()
+    assert turned == pytest.approx(math.radians(4.0), rel=0.1)
+
+
+def test_case_and_object_give_the_same_press():
+    stages = indent(0.4e-3), StageSpec("shear", shear=(0.2e-3, -0.1e-3)), StageSpec("twist", twist=0.05)
+    one, two = (soft(press(*stages, moves=moves)) for moves in ("object", "case"))
+    a, b = one.peak(one.run()), two.peak(two.run())
+    assert not np.allclose(b.world_from_pad[0], np.eye(4)) and np.allclose(a.world_from_pad[0], np.eye(4))
+    assert np.abs(one.surface(a).height - two.surface(b).height).max() < 2e-6
+    assert one.wrench(a)[0] == pytest.approx(two.wrench(b)[0], rel=5e-3, abs=2e-3 * a.normal_force[0])
+    world_from_object = b.world_from_pad @ b.pad_from_object
+    assert np.allclose(world_from_object[0, :2, 3], 0.0, atol=1e-9) and np.allclose(
+        world_from_object[0, :3, :3], np.eye(3), atol=1e-9
+    )
+
+
+def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
+    scene = press(indent(0.4e-3))
+    offsets = np.array([[0.0, 0.0], [2e-3, -1e-3], [np.nan, 0.0]])
+    many = soft(scene, num_envs=3, offsets=offsets)
+    state = many.peak(many.run())
+    assert list(state.failed) == [False, False, True] and np.isnan(state.depth[2])
+    assert np.isnan(many.surface(state).height[2]).all() and np.isfinite(many.surface(state).height[:2]).all()
+    for b in range(2):
+        one = soft(scene, offsets=offsets[b : b + 1])
+        alone = one.peak(one.run())
+        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 1e-6
+        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=1e-3)
+
+
+def test_every_environment_has_its_depth():
+    depths = np.array([0.2e-3, 0.4e-3])
+    pad = soft(press(indent(0.3e-3)), num_envs=2, depths=depths)
+    state = pad.peak(pad.run())
+    assert state.depth == pytest.approx(depths, abs=2e-6) and state.normal_force[1] > 2 * state.normal_force[0]
+
+
+def test_a_resting_weight_presses_with_its_weight():
+    pad = soft(press(indent(force=0.3), StageSpec("release"), dynamics="affine"))
+    states = list(pad.run())
+    assert not states[1].failed[0]
+    assert states[1].normal_force[0] == pytest.approx(0.3, rel=0.01)
+    assert 0.0 < states[1].depth[0] < 1e-3
+    assert not pad.surface(states[2]).contact.any()
+
+
+def test_force_against_depth_is_the_bonded_layers():
+    """Without friction, small strain: Dimitriadis' law of a sphere on a bonded layer, which LoadLaw is held to, within 5 %."""
+    fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
+    scene = press(indent(0.15e-3), indent(0.3e-3))
+    pad = soft(scene, FRICTIONLESS, pad=pad_mesh(SENSOR.gelpad, fine))
+    force = [state.normal_force[0] for state in pad.run()][1:]
+    grid = pad.grid
+    x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
+    gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)
+    law = LoadLaw(gap + SENSOR.gelpad.sag(x, y), 1e-5**2, SENSOR.gelpad)
+    slope = math.log(force[1] / force[0]) / math.log(2.0)
+    expected = math.log(law.force(0.3e-3) / law.force(0.15e-3)) / math.log(2.0)
+    assert slope == pytest.approx(expected, rel=0.05)
+    assert force[1] == pytest.approx(law.force(0.3e-3), rel=0.12)
+    assert len(grid.x) > 10
+
+
+def test_an_untouched_pad_needs_no_solver():
+    pad = soft(press(kind="none"))
+    state = pad.peak(pad.run())
+    assert np.array_equal(pad.surface(state).height[0], pad.grid.rest.astype(np.float32))
+    assert not pad.wrench(state).any() and not pad.traction(state).any() and pad.object_height(pad.surface(state)) is None
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match=r"pad.*'huge'.*coarse, medium, fine"):
+        soft(press(indent(0.4e-3)), pad="huge")
+    with pytest.raises(InputError, match="num_envs"):
+        soft(press(indent(0.4e-3)), num_envs=0)
+    with pytest.raises(InputError, match="offsets"):
+        soft(press(indent(0.4e-3)), offsets=np.zeros((2, 2)))
+    with pytest.raises(SpecError, match=r"depth_mm"):
+        soft(press(indent(5e-3)))
+    with pytest.raises(SpecError, match=r"object\.dynamics.*'ghost'.*kinematic, affine, soft"):
+        soft(press(indent(0.4e-3), dynamics="ghost"))
+    pad = soft(press(kind="none"))
+    rigid = RigidPad(SENSOR, press(indent(0.4e-3)), pitch=PITCH)
+    with pytest.raises(InputError, match=r"must be a state that this pad's run\(\) gave"):
+        pad.surface(rigid.peak(rigid.run()))
+    with pytest.raises(InputError, match="steps_per_stage"):
+        next(pad.run(0))
+
+
+def test_an_object_that_overlaps_the_pad_at_the_start_is_named(tmp_path):
+    """A ball with a blade beside it that reaches lower, thinner than the grid that looks for the first touch."""
+    import trimesh
+
+    edge = SENSOR.gelpad.size[0] / 2
+    wall = trimesh.creation.box((0.1e-3, 30e-3, 6e-3), trimesh.transformations.translation_matrix((edge - 0.1e-3, 0.0, -4e-3)))
+    ball = trimesh.creation.icosphere(3, 4e-3)
+    both = trimesh.util.concatenate([wall, ball])
+    both.export(tmp_path / "cap.stl")
+    spec = ObjectSpec("mesh", {"path": str(tmp_path / "cap.stl"), "scale": 1.0}, (0.0, 0.0, 0.0), IDENTITY, 0.05)
+    scene = PressScene("cap", spec, (indent(0.4e-3),))
+    with pytest.raises(RaytacError, match=r"overlaps the pad where it starts"):
+        soft(scene)

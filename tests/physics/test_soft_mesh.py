@@ -1,0 +1,164 @@
+"""The tetrahedral pad and the surfaces of objects: volumes, closedness, symmetry, and that the cells do not lock."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+import ipc
+from raytac.errors import InputError
+from raytac.gel.object_height import object_height
+from raytac.gel.part import mesh_part, primitive
+from raytac.gel.rasterize import lowest_of_triangles
+from raytac.physics.objects import object_parts
+from raytac.physics.part_surface import object_surface, part_surface
+from raytac.physics.soft_mesh import PAD_LEVELS, PadMesh, pad_mesh
+from raytac.specs import load_press, load_sensor
+from raytac.specs.press import PADS
+
+GELPAD = load_sensor("gelsight_mini").gelpad
+VOLUMES = {
+    ("sphere", (4e-3,)): 4 / 3 * math.pi * 64e-9,
+    ("ellipsoid", (4e-3, 2e-3, 1e-3)): 4 / 3 * math.pi * 8e-9,
+    ("box", (1e-3, 2e-3, 3e-3)): 48e-9,
+    ("cylinder", (2e-3, 3e-3)): math.pi * 24e-9,
+    ("capsule", (2e-3, 3e-3)): math.pi * 24e-9 + 4 / 3 * math.pi * 8e-9,
+    ("cone", (4e-3, 5e-3, 0.0)): math.pi * 80e-9 / 3,
+    ("torus", (4e-3, 1e-3)): 2 * math.pi**2 * 4e-9,
+}
+
+
+def volume_of(mesh):
+    corners = mesh.vertices[mesh.tets]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+@pytest.mark.parametrize("level", PADS)
+def test_a_pad_fills_its_dome(level):
+    mesh = pad_mesh(GELPAD, level)
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 801) * size for size in GELPAD.size))
+    truth = GELPAD.size[0] * GELPAD.size[1] * (GELPAD.thickness - GELPAD.sag(x, y).mean())
+    assert volume_of(mesh.tets).sum() == pytest.approx(truth, rel=2e-3)
+    assert set(PAD_LEVELS) == set(PADS)
+    top = mesh.tets.vertices[mesh.coat_vertices]
+    assert np.array_equal(top, mesh.coat.rest) and np.allclose(top[:, 2], -GELPAD.sag(top[:, 0], top[:, 1]), atol=1e-15)
+    assert (mesh.tets.vertices[mesh.bonded, 2] == -GELPAD.thickness).all()
+
+
+def test_levels_are_graded_towards_the_face_and_the_middle():
+    mesh = pad_mesh(GELPAD, "medium")
+    along, heights = (
+        np.diff(mesh.coat.lines_x),
+        np.diff(np.unique(np.round(mesh.tets.vertices[:, 2][mesh.tets.vertices[:, 0] == 0], 9))),
+    )
+    assert along.argmin() in (len(along) // 2 - 1, len(along) // 2) and along.max() / along.min() > 2
+    assert heights[0] > 1.5 * heights[-1]
+
+
+def test_a_pad_is_symmetric():
+    mesh = pad_mesh(GELPAD, "coarse")
+    for axis in (0, 1):
+        flip = np.where(np.arange(3) == axis, -1.0, 1.0)
+        keys = {tuple(np.round(v, 9) + 0.0) for v in mesh.tets.vertices}
+        assert all(tuple(np.round(v * flip, 9) + 0.0) in keys for v in mesh.tets.vertices)
+        cells = {tuple(np.round(c, 9) + 0.0) for c in mesh.tets.vertices[mesh.tets.tets].mean(axis=1)}
+        assert all(tuple(np.round(c * flip, 9) + 0.0) in cells for c in mesh.tets.vertices[mesh.tets.tets].mean(axis=1))
+
+
+def test_the_coat_covers_the_face_facing_out():
+    coat = pad_mesh(GELPAD, "coarse").coat
+    a, b, c = (coat.rest[coat.faces[:, k], :2] for k in range(3))
+    area = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    assert (area > 0).all() and area.sum() == pytest.approx(GELPAD.size[0] * GELPAD.size[1], rel=1e-12)
+
+
+def test_sides_are_held_if_the_sensor_says_so():
+    back, both = (pad_mesh(replace(GELPAD, bonded=what), "coarse") for what in ("back", "back_and_sides"))
+    side = np.isclose(np.abs(both.tets.vertices[both.bonded, 0]), GELPAD.size[0] / 2)
+    assert len(both.bonded) > len(back.bonded) and side.any() and set(back.bonded) < set(both.bonded)
+
+
+def test_a_pad_that_cannot_be_is_refused():
+    mesh = pad_mesh(GELPAD, "coarse")
+    with pytest.raises(InputError, match=r"pad.*'finest'.*known level.*coarse, medium, fine"):
+        pad_mesh(GELPAD, "finest")
+    with pytest.raises(InputError, match=r"bonded.*at least one vertex"):
+        PadMesh(mesh.tets, mesh.coat, mesh.coat_vertices, np.array([], int), mesh.d_hat)
+    with pytest.raises(InputError, match=r"bonded.*can move"):
+        PadMesh(mesh.tets, mesh.coat, mesh.coat_vertices, np.arange(len(mesh.tets.vertices)), mesh.d_hat)
+    with pytest.raises(InputError, match="two cells"):
+        pad_mesh(GELPAD, replace(PAD_LEVELS["coarse"], cell=1.0))
+
+
+@pytest.mark.parametrize(("kind", "size"), VOLUMES)
+def test_part_surfaces_are_closed_and_fill_their_volume(kind, size):
+    surface = part_surface(primitive(kind, size))
+    solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert solid.is_watertight and solid.is_winding_consistent
+    assert 0.99 < solid.volume / VOLUMES[kind, size] < 1 + 1e-9  # inscribed
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    if kind != "cone":
+        assert np.allclose(low, -high, atol=2e-6)
+
+
+@pytest.mark.parametrize("scene", ["sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh"])
+def test_object_surfaces_lie_on_the_rigid_pads_undersides(scene):
+    """The same source: where both are, triangles and exact shapes differ by less than facets sag (a relief by its spacing)."""
+    parts = object_parts(load_press(scene).object)
+    surface = object_surface(parts)
+    x = np.linspace(-7.9e-3, 7.9e-3, 158)
+    exact = object_height(parts, np.eye(4)[None], x, x)[0]
+    facets = lowest_of_triangles(surface.vertices[surface.faces], x, x)
+    both = np.isfinite(exact) & np.isfinite(facets)
+    assert both.sum() > 300
+    off = np.abs(exact - facets)[both]
+    assert np.percentile(off, 95) < (6e-5 if scene == "coin" else 1e-5)
+
+
+def test_a_relief_is_closed():
+    coin = object_parts(load_press("coin").object)
+    surface = part_surface(coin[1])
+    edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
+    assert trimesh.Trimesh(surface.vertices, surface.faces, process=False).volume > 0
+
+
+def test_surfaces_that_cannot_be_are_refused():
+    with pytest.raises(InputError, match=r"plane.*no closed surface"):
+        part_surface(primitive("plane"))
+    with pytest.raises(InputError, match="without parts"):
+        object_surface(())
+    tetra = mesh_part(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * 1e-3, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    )
+    assert len(part_surface(tetra).faces) == 4
+
+
+def squeezed(mesh: ipc.TetMesh, poisson: float) -> float:
+    """Force [N] that pushes a small flat patch of a bonded block's face down by 1 % of its height."""
+    top, back = mesh.vertices[:, 2].max(), mesh.vertices[:, 2].min()
+    held = np.flatnonzero(mesh.vertices[:, 2] == back)
+    punch = ipc.KinematicBody(
+        "punch", ipc.box_surface((1e-3, 1e-3, 1e-3), (0.0, 0.0, 0.5e-3)), ipc.Pose((0.0, 0.0, top + 2.1e-5))
+    )
+    pad = ipc.SoftBody("pad", mesh, ipc.Material(4e5, poisson), bonded=held)
+    world = ipc.World([pad, punch], ipc.Settings(d_hat=2e-5, velocity_tolerance=2e-5), device="cpu")
+    for depth in (0.0, 2e-5, 4e-5):
+        world.set_target("punch", position=(0.0, 0.0, top - depth))
+        world.step()
+    return float(world.wrench("punch").force[0, 2])
+
+
+def test_mirrored_cells_lock_less_than_equal_ones():
+    """Same vertices, same number of tetrahedra; from ν = 0.3 to 0.495 an incompressible bonded layer stiffens, a locked mesh far more."""
+    flat = replace(GELPAD, dome_radius=(math.inf, math.inf), size=(12e-3, 12e-3))
+    mirrored = pad_mesh(flat, replace(PAD_LEVELS["coarse"], cell=1.5e-3, spread=1.0)).tets
+    x, y, z = (np.unique(np.round(mirrored.vertices[:, k], 12)) for k in range(3))
+    equal = ipc.box_mesh(x, y, z)
+    assert len(equal.tets) == len(mirrored.tets)
+    stiffening = [squeezed(mesh, 0.495) / squeezed(mesh, 0.3) for mesh in (mirrored, equal)]
+    assert 1.0 < stiffening[0] < 0.75 * stiffening[1]
