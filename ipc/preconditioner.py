@@ -13,22 +13,40 @@ from ipc.rest_stiffness import bonded_bodies
 from ipc.settings import Settings
 from ipc.substructure import choose_partition, entries
 
-__all__ = ["AUTOMATIC", "MAX_ENTRIES", "make_preconditioner"]
+__all__ = ["MAX_ENTRIES", "make_preconditioner", "pays"]
 
 MAX_ENTRIES = 60_000_000
 """Numbers of four bytes up to which the rest inverse of a body is built; the host needs a minute for that many, and more for more."""
-AUTOMATIC = {"cpu": "block_jacobi", "cuda": "block_jacobi"}
-"""What ``"auto"`` means: measured on the CPU (``docs/ipc-preconditioners.md``), not yet on CUDA."""
+_FEW_NODES, _MANY_NODES = 700, 3000
+_NEARLY_INCOMPRESSIBLE = 1 / (1 - 2 * 0.47)
+"""λ/μ of the energy at ν = 0.47."""
+
+
+def pays(layout: Layout, device: wp.Device) -> bool:
+    """Whether the rest inverse is expected to make a step faster than block-Jacobi (``docs/ipc-preconditioners.md`` has the figures).
+
+    On one H200 it did for pads of 1,428 vertices, and from ν = 0.47 on for 5,346 too, where block-Jacobi needs many iterations; below, and
+    on a CPU, applying a dense inverse costs more than it saves. A free body in the world keeps block-Jacobi and its iterations.
+    """
+    bodies = bonded_bodies(layout)
+    if not device.is_cuda or not bodies:
+        return False
+    spans = [slice(*layout.node_start[b : b + 2]) for b in bodies]
+    held = sum(span.stop - span.start for span in spans)
+    if held < len(layout.node_rest):
+        return False
+    nodes = max(int(layout.node_free[span].sum()) for span in spans)
+    return nodes >= _FEW_NODES and (nodes <= _MANY_NODES or float((layout.lam / layout.mu).max()) >= _NEARLY_INCOMPRESSIBLE)
 
 
 def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: int, device: wp.Device) -> Preconditioner:
-    """The one that ``settings.preconditioner`` names; ``"auto"`` is block-Jacobi wherever the rest inverse cannot be had.
+    """The one that ``settings.preconditioner`` names; ``"auto"`` takes the rest inverse where it pays and can be had.
 
     Raises:
         IpcError: if the rest inverse is asked for and no body is bonded, one is too large, or too ill-conditioned.
     """
     wanted, must = settings.preconditioner, settings.preconditioner != "auto"
-    if (wanted if must else AUTOMATIC["cuda" if device.is_cuda else "cpu"]) == "rest_inverse":
+    if wanted == "rest_inverse" or (not must and pays(layout, device)):
         sizes = [entries(layout, *choose_partition(layout, body)) for body in bonded_bodies(layout)]
         rule = f"no body is bonded, or one is too large (inverses of {sizes} numbers, at most {MAX_ENTRIES})"
         if sizes and max(sizes) <= MAX_ENTRIES:

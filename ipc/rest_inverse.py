@@ -108,7 +108,7 @@ class Product:
         """Do it for the running environments."""
         patches, inputs, outputs = self.matrix.shape
         common = [self.matrix, self.x, self.x_first, self.y_first]
-        device = self.matrix.device
+        device = wp.get_device(self.matrix.device)
         if not device.is_cuda:
             for p in range(patches):
                 x = self.x.numpy()[:, self.x_first + p * inputs :][:, :inputs]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 import warp as wp
@@ -10,6 +13,7 @@ import ipc
 from ipc.contact import Contacts, mat34d
 from ipc.layout import Layout, build_layout, rotation_matrix
 from ipc.linear import BlockJacobi, SystemView
+from ipc.preconditioner import pays
 from ipc.rest_inverse import RestInverse
 from ipc.rest_stiffness import rest_blocks
 from ipc.substructure import choose_partition, entries, partition
@@ -324,3 +328,21 @@ def test_cuda_agrees_and_can_be_captured(batch: int, patches: int, rng: np.rando
     for _ in range(2):
         wp.capture_launch(capture.graph)
     np.testing.assert_allclose(z.numpy()[:, here.free].reshape(batch, -1), expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("cells", "poisson", "cuda", "expected"),
+    [
+        ((6, 6, 2), 0.45, True, False),
+        ((16, 20, 3), 0.45, True, True),
+        ((16, 20, 3), 0.45, False, False),
+        ((26, 32, 5), 0.45, True, False),
+        ((26, 32, 5), 0.49, True, True),
+    ],
+)
+def test_auto_takes_the_rest_inverse_where_it_pays(
+    cells: tuple[int, int, int], poisson: float, cuda: bool, expected: bool
+) -> None:
+    body = bonded_pad(small_pad(cells), material=ipc.Material(1e5, poisson))
+    layout = build_layout([body], 0.0, {}, [])
+    assert pays(layout, cast(Any, SimpleNamespace(is_cuda=cuda))) == expected
