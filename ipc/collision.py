@@ -81,7 +81,7 @@ class Collision:
         self.vert_body = wp.array(layout.vert_body, dtype=wp.int32, device=device)
 
         self._meshes = len(meshes) > 0
-        by_trees = broad_phase == "bvh" or (broad_phase == "auto" and trees_pay(layout, meshes))
+        by_trees = broad_phase == "bvh" or (broad_phase == "auto" and trees_pay(layout, meshes, device.is_cuda))
         self._trees = Trees(layout, meshes, batch, device) if by_trees and meshes else None
 
         # Lists of primitives, six a body pair (three where a body meets itself): see _searches.

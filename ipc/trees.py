@@ -200,17 +200,14 @@ def ask_edges(
 _EDGES, _FACES = 1, 2
 
 # Where hierarchies begin to pay: edges of a body that touches itself, product of two bodies' edges, number of body pairs.
-_SELF_EDGES = 300
-_PRODUCT = 2e6
-_BODY_PAIRS = 3
+_CPU, _CUDA = (300, 2e6, 3), (700, 3e6, 10)
 
 
-def trees_pay(layout: Layout, pairs: Sequence[tuple[int, int, int]]) -> bool:
+def trees_pay(layout: Layout, pairs: Sequence[tuple[int, int, int]], cuda: bool) -> bool:
     """Whether hierarchies find the candidates of the body pairs (index, a, b) sooner than lists do; docs/ipc-broad-phase.md has figures."""
+    own, product, most = _CUDA if cuda else _CPU
     edges = np.diff(layout.edge_start).astype(float)
-    return len(pairs) >= _BODY_PAIRS or any(
-        edges[a] >= _SELF_EDGES if a == b else edges[a] * edges[b] >= _PRODUCT for _, a, b in pairs
-    )
+    return len(pairs) >= most or any(edges[a] >= own if a == b else edges[a] * edges[b] >= product for _, a, b in pairs)
 
 
 def _span(start: NDArray[np.int32], body: int) -> NDArray[np.int32]:

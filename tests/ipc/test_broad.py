@@ -298,15 +298,16 @@ def test_hierarchies_keep_a_batch_equal_to_single_worlds_and_survive_a_reset() -
 
 
 def test_choice_by_number_of_edges() -> None:
-    def choose(*chosen: ipc.Body) -> bool:
+    def choose(*chosen: ipc.Body, cuda: bool = False) -> bool:
         layout = build_layout(chosen, 0.0, {}, [])
-        return trees_pay(layout, [(i, int(a), int(b)) for i, (a, b) in enumerate(layout.pairs)])
+        return trees_pay(layout, [(i, int(a), int(b)) for i, (a, b) in enumerate(layout.pairs)], cuda)
 
     rubber, tool = ipc.Material(1e5), ipc.KinematicBody("tool", ipc.icosphere(0.5, 1))
     assert not choose(ipc.SoftBody("soft", unit_cell(2), rubber), tool)
     assert not choose(ipc.SoftBody("soft", unit_cell(2), rubber, self_contact=True))
     assert choose(ipc.SoftBody("soft", unit_cell(6), rubber, self_contact=True))
-    assert choose(*[ipc.AffineBody(str(k), ipc.icosphere(0.5, 0)) for k in range(4)])
+    few = [ipc.AffineBody(str(k), ipc.icosphere(0.5, 0)) for k in range(4)]
+    assert choose(*few) and not choose(*few, cuda=True)
     assert choose(ipc.SoftBody("soft", unit_cell(12), rubber), ipc.KinematicBody("tool", ipc.icosphere(0.5, 3)))
 
 
