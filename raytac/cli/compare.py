@@ -40,6 +40,9 @@ class CompareArgs(CommonOptions):
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """Also press into the simulated pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
+    markers: bool = False
+    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the simulated pad of the level
+    that --pad names, else medium; needs raytac[ipc] and a sensor with marker motion."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
 
@@ -72,5 +75,6 @@ class CompareArgs(CommonOptions):
             frames=self.frames,
             batch=self.batch,
             pad=self.pad,
+            markers=self.markers,
         )
         return chosen.quickened() if self.quick else chosen

@@ -24,9 +24,12 @@ from raytac.errors import BackendError, InputError, RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
+from raytac.markers.fots import marker_motion_of
 from raytac.report.image_error import METRICS, SSIM_BORDER, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
 from raytac.report.machine import machine
+from raytac.report.marker_error import PAD as MARKER_PAD
+from raytac.report.marker_error import MarkerErrors, held_out_frames, marker_errors
 from raytac.report.modes import Mode, Setting, comparison_modes
 from raytac.report.physics_error import PhysicsError, physics_errors
 from raytac.report.references import References
@@ -80,6 +83,8 @@ class CompareSettings:
     """Fewer modes."""
     pad: str | None = None
     """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
+    markers: bool = False
+    """Measure the marker models against surface tracking too, on the simulated pad of level ``pad``, else ``marker_error.PAD``."""
 
     def quickened(self) -> CompareSettings:
         """The first scene at 80 x 60 pixels with few samples, frames and modes."""
@@ -90,9 +95,10 @@ class CompareSettings:
         """Refuse what cannot be run, before anything is computed or written.
 
         Raises:
-            InputError: a number or a resolution out of range, or two scenes of one name.
+            InputError: a number or a resolution out of range, two scenes of one name, or a sensor without the marker motion that
+                ``markers`` needs.
             SpecError: an unknown sensor or scene, or a file that breaks a rule.
-            BackendError: a package of the ``report`` extra is missing.
+            BackendError: a package of the ``report`` extra is missing, or the solver's where ``pad`` or ``markers`` need it.
         """
         for name, value, lowest in (
             ("reference spp", self.reference_spp, 2),
@@ -118,11 +124,15 @@ class CompareSettings:
         if len(set(stems)) < len(stems):
             raise InputError("scenes", value=self.scenes, rule="must have different names, since rows are named after them")
         spec = load_sensor(self.sensor)
+        if self.markers:
+            marker_motion_of(spec)
         for scene in self.scenes:
             validate_press(spec, load_press(scene))
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install raytac[report]`")
+        if (self.markers or self.pad is not None) and importlib.util.find_spec("warp") is None:
+            raise BackendError("pad and markers need the contact solver: `pip install raytac[ipc]`")
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,8 @@ class Comparison:
     """Machine and versions."""
     physics: tuple[PhysicsError, ...] = ()
     """Rigid pad against the simulated one, if that was asked for."""
+    markers: MarkerErrors | None = None
+    """Marker models against surface tracking, if that was asked for."""
 
 
 def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] | None = None) -> Comparison:
@@ -178,11 +190,29 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
     with tqdm(total=total, desc="compare", unit="row", disable=None) as bar:
         for size in settings.resolutions:
             run.measure_all(size, modes, bar)
+        markers = None
+        if settings.markers:
+            bar.set_postfix_str("markers on the simulated pad")
+            markers = _marker_errors(settings, device)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
     return Comparison(
-        settings, device, tuple(run.rows), run.images, tuple(run.left_out), run.measured, facts | known, tuple(run.physics)
+        settings,
+        device,
+        tuple(run.rows),
+        run.images,
+        tuple(run.left_out),
+        run.measured,
+        facts | known,
+        tuple(run.physics),
+        markers,
     )
+
+
+def _marker_errors(settings: CompareSettings, device: str) -> MarkerErrors:
+    spec, pad = load_sensor(settings.sensor), settings.pad or ("coarse" if settings.quick else MARKER_PAD)
+    frames = held_out_frames(spec, pad=pad, device=device, quick=settings.quick)
+    return marker_errors(spec, frames, pad=pad, device=device)
 
 
 class _Run:

@@ -12,6 +12,7 @@ from raytac.io.metrics import Metric
 from raytac.report.compare import REGIONS, Comparison
 from raytac.report.equal_error import cost_at, spp_for_error
 from raytac.report.image_error import METRICS
+from raytac.report.marker_error import marker_error_metrics
 from raytac.report.physics_error import physics_metrics
 from raytac.report.row_store import Row
 
@@ -171,6 +172,7 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         "rows_measured_in_this_run": comparison.measured,
         **comparison.facts,
         **physics_metrics(comparison.physics),
+        **marker_error_metrics(comparison.markers),
     }
     for summary in summaries(rows):
         key = _key(summary.family, summary.device, summary.resolution, summary.spp)

@@ -103,6 +103,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
         families=FAMILIES,
         left_out=comparison.left_out,
         physics=comparison.physics,
+        markers=comparison.markers,
         sheets=[{"scene": scene, "resolution": size.replace("x", " × "), "png": _embedded(path)} for scene, size, path in sheets],
         groups=[
             {

@@ -19,7 +19,17 @@ if TYPE_CHECKING:
     from raytac.markers.calibration import ModelError
     from raytac.markers.calibration_presses import Press, PressFrame
 
-__all__ = ["FILES", "MotionReport", "calibrate_markers", "error_table", "motion_metrics", "run_calibrate_markers"]
+__all__ = [
+    "FILES",
+    "TESTED",
+    "MotionReport",
+    "calibrate_markers",
+    "error_metrics",
+    "error_table",
+    "motion_metrics",
+    "press_all",
+    "run_calibrate_markers",
+]
 
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Every file that a calibration writes."""
@@ -59,7 +69,7 @@ def run_calibrate_markers(
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
-        pressed = _press_all(sensor, (*fit, *held_out), pad, device, progress)
+        pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress)
         press_s = time.perf_counter() - began
         names = {press.name for press in fit}
         report = calibrate_markers(
@@ -81,7 +91,13 @@ def run_calibrate_markers(
     return [Path(out) / name for name in found]
 
 
-def _press_all(sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, progress: bool) -> list[PressFrame]:
+def press_all(sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, *, progress: bool) -> list[PressFrame]:
+    """States of all presses on the simulated pad of level ``pad``, in order; ``progress``: show a bar.
+
+    Raises:
+        RaytacError: a press did not settle, or fits nowhere on this sensor.
+        BackendError: the solver cannot run on ``device``.
+    """
     from tqdm import tqdm
 
     from raytac.device import resolve_device
@@ -148,17 +164,20 @@ def motion_metrics(report: MotionReport) -> dict[str, Metric]:
         metrics[name.replace("_", ".", 1)] = getattr(motion, name)
     for part, rows in (("held_out", report.errors), ("fit", report.fit_errors)):
         for row in rows:
-            key = f"{part}.{row.model}.{row.load}"
-            metrics |= {
-                f"{key}.mean_um": 1e6 * row.mean,
-                f"{key}.p95_um": 1e6 * row.p95,
-                f"{key}.mean_px": row.mean_px,
-                f"{key}.truth_mean_um": 1e6 * row.size,
-                f"{key}.frames": row.frames,
-            }
-            if math.isfinite(row.moved):
-                metrics[f"{key}.moved_um"] = 1e6 * row.moved
+            metrics |= error_metrics(f"{part}.{row.model}.{row.load}", row)
     return metrics | {f"{model}.ms_per_frame": value for model, value in report.times_ms.items()}
+
+
+def error_metrics(key: str, row: ModelError) -> dict[str, Metric]:
+    """Figures of one model and kind of load as ``<key>.<figure>``."""
+    metrics: dict[str, Metric] = {
+        f"{key}.mean_um": 1e6 * row.mean,
+        f"{key}.p95_um": 1e6 * row.p95,
+        f"{key}.mean_px": row.mean_px,
+        f"{key}.truth_mean_um": 1e6 * row.size,
+        f"{key}.frames": row.frames,
+    }
+    return metrics | ({f"{key}.moved_um": 1e6 * row.moved} if math.isfinite(row.moved) else {})
 
 
 def error_table(report: MotionReport) -> str:

@@ -10,6 +10,9 @@ import numpy as np
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.markers.calibration_presses import Press, PressFrame
+from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.fots import FotsMarkers
 from raytac.specs import MarkerMotionSpec, SensorSpec, load_sensor
 
 PITCH = 0.1e-3
@@ -86,3 +89,32 @@ def coat_mesh(sensor: SensorSpec, nx: int = 12, ny: int = 10) -> CoatMesh:
 
 def with_coat(surface: GelSurface, mesh: CoatMesh, positions: np.ndarray) -> GelSurface:
     return replace(surface, coat=DeformedCoat(mesh, positions))
+
+
+def fots_presses(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
+    """Presses whose coat is moved by FOTS itself, with the constants of ``MOTION``."""
+    mesh, found = coat_mesh(sensor, 76, 62), []
+    for name, x, y, deep, shear, twist in (
+        ("a", 0.0, 0.0, 8e-4, (5e-4, 2e-4), 0.0), ("b", 1e-3, -2e-3, 6e-4, (-8e-4, 0.0), 0.0), ("c", -2e-3, 1e-3, 7e-4, (0.0, 0.0), 0.45)
+    ):  # fmt: skip
+        press = Press(name, "sphere", {"radius": 4e-3}, (x, y), deep)
+        moves = [("start", -1e-3, 0.0), ("normal", 0.5 * deep, 0.0), ("normal", deep, 0.0)]
+        moves += [("twist" if twist else "shear", deep, k / 4) for k in range(1, 5)]
+        for load, depth, share in moves:
+            px, py = x + share * shear[0], y + share * shear[1]
+            balls = [(px, py, depth)] if depth > 0 else []
+            surface = pressed(grid, balls, poses=[pose(px, py, -depth, share * twist)])
+            found.append((press, load, surface))
+    return _with_coats(sensor, grid, mesh, found)
+
+
+def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh: CoatMesh, found: list) -> list[PressFrame]:
+    model, cells, frames, last = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid), [], None
+    for press, load, surface in found:
+        if press is not last:
+            tracker, last = ContactTracker(1), press
+        samples = cells.sample(surface)
+        moved = model.displacement(mesh.rest[None], surface, samples, tracker.update(surface, samples))
+        positions = mesh.rest[None] + np.concatenate([moved, np.zeros((1, len(mesh.rest), 1))], axis=-1)
+        frames.append(PressFrame(press, load, with_coat(surface, mesh, positions)))
+    return frames

@@ -7,12 +7,12 @@ import pytest
 
 from raytac.gel.surface import PadGrid
 from raytac.markers.calibration import ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
-from raytac.markers.calibration_presses import FIT, HELD_OUT, Press, PressFrame
+from raytac.markers.calibration_presses import FIT, HELD_OUT, PressFrame
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import SensorSpec, load_sensor, validate_press
 from raytac.specs.marker_motion import load_marker_motion, marker_motion_text
-from tests.markers.pads import MOTION, coat_mesh, pose, pressed, with_coat
+from tests.markers.pads import MOTION, fots_presses
 
 
 def test_pattern_search_finds_the_bottom_of_a_valley() -> None:
@@ -39,36 +39,7 @@ def test_probes_cover_the_view(sensor: SensorSpec) -> None:
 
 @pytest.fixture(scope="module")
 def frames(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
-    """Presses whose coat is moved by FOTS itself, with the constants of ``MOTION``."""
-    mesh = coat_mesh(sensor, 76, 62)
-    found = []
-    for name, x, y, deep, shear, twist in (
-        ("a", 0.0, 0.0, 8e-4, (5e-4, 2e-4), 0.0), ("b", 1e-3, -2e-3, 6e-4, (-8e-4, 0.0), 0.0), ("c", -2e-3, 1e-3, 7e-4, (0.0, 0.0), 0.45)
-    ):  # fmt: skip
-        press = Press(name, "sphere", {"radius": 4e-3}, (x, y), deep)
-        moves = [("start", -1e-3, 0.0), ("normal", 0.5 * deep, 0.0), ("normal", deep, 0.0)]
-        moves += [("twist" if twist else "shear", deep, k / 4) for k in range(1, 5)]
-        for load, depth, share in moves:
-            px, py = x + share * shear[0], y + share * shear[1]
-            balls = [(px, py, depth)] if depth > 0 else []
-            surface = pressed(grid, balls, poses=[pose(px, py, -depth, share * twist)])
-            found.append((press, load, surface))
-    return _with_coats(sensor, grid, mesh, found)
-
-
-def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh, found: list) -> list[PressFrame]:
-    from raytac.markers.contacts import ContactCells, ContactTracker
-    from raytac.markers.fots import FotsMarkers
-
-    model, cells, frames, last = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid), [], None
-    for press, load, surface in found:
-        if press is not last:
-            tracker, last = ContactTracker(1), press
-        samples = cells.sample(surface)
-        moved = model.displacement(mesh.rest[None], surface, samples, tracker.update(surface, samples))
-        positions = mesh.rest[None] + np.concatenate([moved, np.zeros((1, len(mesh.rest), 1))], axis=-1)
-        frames.append(PressFrame(press, load, with_coat(surface, mesh, positions)))
-    return frames
+    return fots_presses(sensor, grid)
 
 
 def test_the_fit_finds_the_constants_again(sensor: SensorSpec, frames: list[PressFrame]) -> None:

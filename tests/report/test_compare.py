@@ -261,6 +261,7 @@ def test_sheets_of_an_earlier_run_do_not_stay(greys_run: Path, tmp_path: Path) -
         (["--frames", "0"], "at least 3"),
         (["--batch", "1"], "at least 2"),
         (["--seed", "-1"], "2^32"),
+        (["--markers", "--sensor", "gelsight_dome"], "calibrate markers"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_is_written(

@@ -1,0 +1,95 @@
+"""How far the cheap marker models are from surface tracking: presses of the simulated pad that no fit has seen, error beside time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from raytac.io.metrics import Metric
+from raytac.report.markers import TESTED, error_metrics, press_all
+from raytac.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from raytac.markers.calibration import ModelError
+    from raytac.markers.calibration_presses import PressFrame
+
+__all__ = ["PAD", "MarkerErrors", "held_out_frames", "marker_error_metrics", "marker_errors"]
+
+PAD = "medium"
+"""Level of the simulated pad where none is asked for: the one that shipped marker motion was fitted to."""
+
+
+@dataclass(frozen=True)
+class MarkerErrors:
+    """Every model of ``raytac.report.markers.TESTED`` against surface tracking."""
+
+    pad: str
+    """How finely the simulated pad was cut whose surface is the truth."""
+    probes: int
+    """Markers that errors are averaged over, on a 1 mm grid over the view."""
+    presses: tuple[str, ...]
+    """What was pressed, in words."""
+    errors: tuple[ModelError, ...]
+    """By model and kind of load; the model ``surface`` has no row, since it is the truth."""
+    times_ms: dict[str, float]
+    """Median time of a frame of every model at the probes [ms]; of ``surface`` too, without the physics."""
+
+    @property
+    def loads(self) -> tuple[str, ...]:
+        """Kinds of load that were pressed."""
+        return tuple(dict.fromkeys(row.load for row in self.errors))
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """Mean displacement by surface tracking [m] by kind of load: the error of a model that never moves a marker."""
+        return {row.load: row.size for row in self.errors}
+
+    def by_model(self) -> list[tuple[str, list[ModelError], float]]:
+        """(model, its errors in the order of ``loads``, its time [ms]) of every model."""
+        models = dict.fromkeys(row.model for row in self.errors)
+        return [(name, [row for row in self.errors if row.model == name], self.times_ms[name]) for name in models]
+
+
+def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = False) -> list[PressFrame]:
+    """States of the presses that no fit sees, on the simulated pad of level ``pad``; ``quick``: few of them.
+
+    Raises:
+        RaytacError: a press did not settle, or fits nowhere on this sensor.
+        BackendError: the solver cannot run here.
+    """
+    from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
+
+    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=False)
+
+
+def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, device: str) -> MarkerErrors:
+    """Errors of the models with the marker motion that ``sensor`` has.
+
+    Args:
+        sensor: with a marker motion; its own pattern does not matter.
+        frames: whole presses, in order.
+        pad: level of the simulated pad that they come from.
+        device: ``auto``, ``cpu`` or ``cuda``.
+
+    Raises:
+        InputError: the sensor has no marker motion.
+        BackendError: a model's backend does not work here.
+    """
+    from raytac.markers.calibration import model_errors, probe_sensor
+
+    errors, times = model_errors(sensor, frames, frames[0].surface.grid, models=TESTED, device=device)
+    probes = probe_sensor(sensor).markers
+    presses = tuple(dict.fromkeys(str(frame.press) for frame in frames))
+    return MarkerErrors(pad, probes.rows * probes.columns, presses, tuple(errors), times)
+
+
+def marker_error_metrics(found: MarkerErrors | None) -> dict[str, Metric]:
+    """``markers.<pad>.<model>.<load>.<figure>`` and ``markers.<pad>.<model>.ms_per_frame``; nothing of None."""
+    if found is None:
+        return {}
+    key = f"markers.{found.pad}"
+    metrics: dict[str, Metric] = {f"{key}.probes": found.probes, f"{key}.presses": len(found.presses)}
+    for row in found.errors:
+        metrics |= error_metrics(f"{key}.{row.model}.{row.load}", row)
+    return metrics | {f"{key}.{model}.ms_per_frame": ms for model, ms in found.times_ms.items() if math.isfinite(ms)}
