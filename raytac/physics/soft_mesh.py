@@ -66,7 +66,8 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
 
     The six tetrahedra of a cell are those of its neighbour mirrored in the face between them. Linear tetrahedra all cut the same way lock
     where the gel is nearly incompressible; cut so, with the faces at which they meet in planes, they hold enough volume-preserving motions
-    (the pattern is a barycentric subdivision, as in S. Zhang, Numer. Math. 2008, on Powell-Sabin grids; docs/soft-pad.md has the figures).
+    (the pattern is a barycentric subdivision, as in S. Zhang, J. Comput. Math. 2008, on Powell-Sabin grids; docs/soft-pad.md has the
+    figures).
 
     Args:
         gelpad: size, thickness, dome, and what is bonded to the case: the back, or the back and the sides.

@@ -119,7 +119,7 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
 def _lay_out(panels: list[Callable[[Axes], None]], data: PreviewData) -> Figure:
     """Place the panels by hand, so that they line up whatever their labels are."""
     left, right, bottom, top = data.extent_mm
-    wide = 1.70
+    wide = 1.62  # leaves room for a colour bar's figures at the right edge
     high = wide * float(np.clip((bottom - top) / (right - left), 0.5, 1.3))
     margin, between, above, below, heading = 0.46, 0.74, 0.22, 0.36, 0.24  # inches
     rows = -(-len(panels) // 3)
