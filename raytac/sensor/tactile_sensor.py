@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
 import time
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +11,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.device import resolve_device
-from raytac.errors import BackendError, InputError
-from raytac.frame import OUTPUTS, TactileFrame
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
 from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.io.options import parse_resolution
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
-from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS
-from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_press
-from raytac.specs.press import PADS, PHYSICS
+from raytac.optics.base import OPTICAL_OUTPUTS
+from raytac.sensor.imaging import Imaging
+from raytac.sensor.options import (
+    check_markers,
+    check_optics,
+    check_physics,
+    check_whole,
+    checked_outputs,
+    checked_resolution,
+    checked_seed,
+    press_scene,
+    sensor_spec,
+    warn_of_other_shape,
+)
+from raytac.sensor.pad import load_pad, pad_forces, state_surface
+from raytac.specs import PressScene, SensorSpec, validate_press
+from raytac.specs.press import PADS
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
@@ -31,14 +42,7 @@ if TYPE_CHECKING:
     from raytac.physics.soft import SoftPad
     from raytac.physics.soft_mesh import PadMesh
 
-__all__ = ["INTEGRATORS", "OPTICS", "PADS", "PHYSICS", "TactileSensor", "sensor_outputs"]
-
-OPTICS = ("raytrace", "taxim", "phong")
-"""Names that ``optics=`` accepts."""
-LARGEST_SIDE = 8192
-"""Longest side of an image [px], as in sensor files."""
-SHAPE_TOLERANCE = 0.02
-"""How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
+__all__ = ["TactileSensor"]
 
 
 class TactileSensor:
@@ -110,55 +114,22 @@ class TactileSensor:
             SpecError: the sensor, light or calibration file breaks a rule.
             BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
-        if physics is not None:
-            _check_name("physics", physics, PHYSICS)
-        if isinstance(pad, str):
-            _check_name("pad", pad, PADS)
-        if pad is not None and physics == "rigid":
-            raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
-        if isinstance(optics, str):
-            _check_name("optics", optics, OPTICS)
-        _check_name("integrator", integrator, INTEGRATORS)
-        if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
-            raise InputError(
-                "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
-            )
-        if not isinstance(optics, str) and (integrator != "fast" or spp is not None or optics_options):
-            value = {"integrator": integrator, "spp": spp, "optics_options": optics_options}
-            raise InputError(
-                "integrator, spp, optics_options", value=value, rule="belong to a mode that is built here; it has its own"
-            )
+        check_physics(physics, pad)
+        check_optics(optics, integrator, spp, optics_options)
         resolve_device(device)
-        if not isinstance(outputs, (str, Sequence)):
-            raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
-        outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        for name in outputs:
-            _check_name("outputs", name, OUTPUTS)
-            if isinstance(optics, str) and name not in sensor_outputs(optics):
-                rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
-                raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
-        if markers is not None:
-            _check_name("markers", markers, MARKER_MODELS)
-            if markers == "surface" and physics == "rigid":
-                rule = "tracks the surface of a simulated gel; physics='rigid' has none"
-                raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
-        elif marker_perturbation is not None:
-            raise InputError("marker_perturbation", value=marker_perturbation, rule="needs a marker model: markers=…")
-        _check_whole("num_envs", num_envs)
-        _check_whole("spp", 1 if spp is None else spp)
-        size = _checked_resolution(resolution)
-        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
-            raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
-        if not isinstance(sensor, (str, Path, SensorSpec)):
-            raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
-        self.spec = sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
+        self.outputs = checked_outputs(outputs, optics)
+        check_markers(markers, marker_perturbation, physics)
+        check_whole("num_envs", num_envs)
+        check_whole("spp", 1 if spp is None else spp)
+        size = checked_resolution(resolution)
+        self.seed = checked_seed(seed)
+        self.spec = sensor_spec(sensor)
         self.integrator, self.spp = integrator, spp
         self._asked_physics, self._asked_pad = physics, pad
         self.physics = physics or ("ipc" if pad is not None else "rigid")
-        self.outputs = tuple(name for name in OUTPUTS if name in outputs)
         self.resolution = size if size is not None else self.spec.camera.resolution
-        _warn_of_other_shape(self.resolution, self.spec.camera.resolution)
-        self.device, self.seed, self.num_envs = device, int(seed), num_envs
+        warn_of_other_shape(self.resolution, self.spec.camera.resolution)
+        self.device, self.num_envs = device, num_envs
         self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self._pitch)
         self._level: str | PadMesh = pad or PADS[0]
@@ -166,16 +137,16 @@ class TactileSensor:
         if markers is not None:
             MarkerPattern.of(self.spec, self.resolution)  # a pattern that cannot be seen is told now
         self._tracker: MarkerTracker | None = None
-        self._optics_options = dict(optics_options or {})
-        if optics == "taxim" and isinstance(self._optics_options.get("calibration"), (str, Path)):
-            from raytac.optics.calib_folder import load_calibration
-
-            # A folder that cannot be used is told now, before anything is written.
-            self._optics_options["calibration"] = load_calibration(self._optics_options["calibration"])
-        self._mode: OpticalMode | None = None if isinstance(optics, str) else optics
-        self._optics = optics if isinstance(optics, str) else ""
-        self._optics_name = (
-            optics.label if not isinstance(optics, str) else "raytrace-" + integrator if optics == "raytrace" else optics
+        self._imaging = Imaging(
+            self.spec,
+            optics,
+            options=optics_options or {},
+            resolution=self.resolution,
+            outputs=self._optical_outputs,
+            device=device,
+            integrator=integrator,
+            spp=spp,
+            seed=self.seed,
         )
         self._pad: RigidPad | SoftPad | None = None
 
@@ -185,9 +156,8 @@ class TactileSensor:
 
         The optical mode names itself once it is built, which options such as a denoiser change.
         """
-        optics = self._optics_name if self._mode is None else self._mode.label
         physics = "ipc-" + self.pad if self.physics == "ipc" else self.physics
-        return f"{physics}+{optics}" if self._optical_outputs else physics
+        return f"{physics}+{self._imaging.label}" if self._optical_outputs else physics
 
     @property
     def pad(self) -> str:
@@ -199,12 +169,7 @@ class TactileSensor:
     @property
     def sampling(self) -> dict[str, int | str]:
         """``integrator`` and ``spp`` of the optical mode, for headers and reports; empty without images, or if it has neither."""
-        mode = self.optical_mode if self._optical_outputs else None
-        integrator = getattr(mode, "integrator", None)
-        if integrator is None:
-            return {}
-        spp = getattr(mode, "rays", 1) ** 2 if integrator == "fast" else getattr(mode, "spp", None)
-        return {"integrator": integrator} | ({} if spp is None else {"spp": spp})
+        return self._imaging.sampling if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
@@ -226,7 +191,7 @@ class TactileSensor:
             InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
-        press = _press_scene(scene)
+        press = press_scene(scene)
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, offsets=offsets, depths=depths)
@@ -251,17 +216,21 @@ class TactileSensor:
             BackendError: a simulated pad is asked for, and its solver cannot run here.
             RaytacError: the object overlaps a simulated pad where it starts.
         """
-        press = _press_scene(scene)
+        press = press_scene(scene)
         self.physics = self._asked_physics or ("ipc" if self._asked_pad is not None else press.physics or "rigid")
         self._level = self._asked_pad or press.pad or PADS[0]
-        settings: dict[str, Any] = {"pitch": self._pitch, "num_envs": self.num_envs, "seed": self.seed}
-        settings |= {"offsets": offsets, "depths": depths}
-        if self.physics == "ipc":
-            self._pad = _soft_pad()(self.spec, press, pad=self._level, device=_solver_device(self.device), **settings)
-        else:
-            from raytac.physics.rigid import RigidPad
-
-            self._pad = RigidPad(self.spec, press, **settings)
+        self._pad = load_pad(
+            self.spec,
+            press,
+            physics=self.physics,
+            level=self._level,
+            device=self.device,
+            pitch=self._pitch,
+            num_envs=self.num_envs,
+            seed=self.seed,
+            offsets=offsets,
+            depths=depths,
+        )
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
@@ -279,9 +248,10 @@ class TactileSensor:
             surface, force, area, failed = state, None, None, None
             forces: dict[str, Any] = {}
         else:
-            surface, failed = self._surface(state), state.failed
+            surface, failed = state_surface(self._pad, state), state.failed
+            assert self._pad is not None
             area = state.force_law_area if self.physics == "rigid" else None
-            forces = self._forces(state, surface)
+            forces = pad_forces(self._pad, state, surface, self.outputs)
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
@@ -362,7 +332,7 @@ class TactileSensor:
         """The same states, while markers that need it see every one of them."""
         for state in states:
             if self.markers is not None:
-                self.marker_tracker.follow(self._surface(state))
+                self.marker_tracker.follow(state_surface(self._pad, state))
             yield state
 
     def _dotted(self, surface: GelSurface, markers: MarkerFrame) -> GelSurface:
@@ -380,31 +350,6 @@ class TactileSensor:
         """
         return None if self._pad is None else self._pad.object_height(surface)
 
-    def _forces(self, state: ContactState, surface: GelSurface) -> dict[str, Any]:
-        """Wrench, traction and contact area, as far as they are asked for."""
-        pad, found = self._pad, {}
-        assert pad is not None
-        if "wrench" in self.outputs:
-            found["wrench"] = pad.wrench(state)
-        if "traction" in self.outputs:
-            found["traction"] = pad.traction(state)
-        if found:
-            cell = surface.grid.pitch[0] * surface.grid.pitch[1]
-            found["contact_area"] = np.where(state.failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
-        return found
-
-    def _surface(self, state: ContactState) -> GelSurface:
-        if not hasattr(state, "pad_from_object"):
-            raise InputError(
-                "state", value=type(state).__name__, rule="must be a GelSurface, or a state of the physics that load() returned"
-            )
-        if self._pad is None:
-            raise InputError("state", value=type(state).__name__, rule="needs a scene: call load() first, or give a GelSurface")
-        if state.scene is not None and state.scene != self._pad.scene:
-            rule = f"belongs to the scene {state.scene.name!r}, and {self._pad.scene.name!r} was loaded since"
-            raise InputError("state", value=type(state).__name__, rule=rule)
-        return self._pad.surface(state)
-
     @property
     def optical_mode(self) -> OpticalMode:
         """The renderer, built on first use.
@@ -413,85 +358,4 @@ class TactileSensor:
             InputError: an unknown name or a bad value in ``optics_options``.
             BackendError: the renderer or the device does not work here.
         """
-        mode = self._mode
-        if mode is None:
-            mode = self._mode = self._build_mode()
-        return mode
-
-    def _build_mode(self) -> OpticalMode:
-        settings: dict[str, Any] = {"resolution": self.resolution, "outputs": self._optical_outputs, "device": self.device}
-        if self._optics == "taxim":
-            from raytac.optics.taxim import TaximMode as Mode
-        elif self._optics == "phong":
-            from raytac.optics.phong import PhongMode as Mode
-        else:
-            from raytac.optics.raytrace import RayTracer as Mode
-
-            settings |= {"integrator": self.integrator, "spp": self.spp, "seed": self.seed}
-        known = [name for name in inspect.signature(Mode).parameters if name != "sensor" and name not in settings]
-        for name, value in self._optics_options.items():
-            if name not in known:
-                rule = f"is no option of optics={self._optics!r}, or an argument of TactileSensor itself"
-                raise InputError(f"optics_options[{name!r}]", value=value, rule=rule, choices=known)
-        return Mode(self.spec, **settings, **self._optics_options)
-
-
-def _soft_pad() -> type[SoftPad]:
-    try:
-        from raytac.physics.soft import SoftPad
-    except ImportError as error:
-        raise BackendError(f"physics='ipc' needs the contact solver ({error}): `pip install raytac[ipc]`") from error
-    return SoftPad
-
-
-def _solver_device(device: str) -> str:
-    """``cpu`` or ``cuda`` for the solver, which traces no rays and needs no OptiX."""
-    return resolve_device(device, ray_tracing=False)
-
-
-def sensor_outputs(optics: str) -> tuple[str, ...]:
-    """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
-    return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
-
-
-def _press_scene(scene: object) -> PressScene:
-    if not isinstance(scene, (str, Path, PressScene)):
-        raise InputError("scene", value=scene, rule=f"must be a name, a path or a PressScene, not {type(scene).__name__}")
-    return scene if isinstance(scene, PressScene) else load_press(scene)
-
-
-def _checked_resolution(resolution: object) -> tuple[int, int] | None:
-    if resolution is None:
-        return None
-    if isinstance(resolution, str):
-        resolution = parse_resolution(resolution)
-    if not isinstance(resolution, (tuple, list)) or len(resolution) != 2:
-        raise InputError("resolution", value=resolution, rule="must be (width, height) in pixels, as in (320, 240) or '320x240'")
-    for side in resolution:
-        _check_whole("resolution", side)
-        if side > LARGEST_SIDE:
-            raise InputError("resolution", value=side, rule=f"must be at most {LARGEST_SIDE} pixels a side")
-    return int(resolution[0]), int(resolution[1])
-
-
-def _warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) -> None:
-    """The field of view is the sensor's, so an image of another shape has pixels that are not as wide as high on the gel."""
-    stretch = (resolution[0] / native[0]) / (resolution[1] / native[1])
-    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
-        (width, height), (w, h) = resolution, native
-        warnings.warn(
-            f"resolution {width}x{height} squeezes the sensor's view of {w}x{h}: against the sensor's pixels these are "
-            f"{max(stretch, 1 / stretch):.3g} times as {'high as wide' if stretch > 1 else 'wide as high'}; "
-            f"{width}x{max(round(width * h / w), 1)} keeps their shape",
-            stacklevel=3,
-        )
-
-
-def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(name, value=value, rule="must be a known name", choices=choices)
-
-
-def _check_whole(name: str, value: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(name, value=value, rule="must be a whole number >= 1")
+        return self._imaging.mode

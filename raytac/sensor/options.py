@@ -1,0 +1,160 @@
+"""What may be asked of a sensor: every option is checked before anything is computed, and the message names value, rule and choices."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.frame import OUTPUTS
+from raytac.io.options import parse_resolution
+from raytac.markers import MARKER_MODELS, MarkerPerturbation
+from raytac.optics.base import INTEGRATORS
+from raytac.specs import PressScene, SensorSpec, load_press, load_sensor
+from raytac.specs.press import PADS, PHYSICS
+
+if TYPE_CHECKING:
+    from raytac.optics.base import OpticalMode
+    from raytac.physics.soft_mesh import PadMesh
+
+__all__ = [
+    "LARGEST_SIDE",
+    "OPTICS",
+    "check_markers",
+    "check_optics",
+    "check_physics",
+    "check_whole",
+    "checked_outputs",
+    "checked_resolution",
+    "checked_seed",
+    "press_scene",
+    "sensor_outputs",
+    "sensor_spec",
+    "warn_of_other_shape",
+]
+
+OPTICS = ("raytrace", "taxim", "phong")
+"""Names that ``optics=`` accepts."""
+LARGEST_SIDE = 8192
+"""Longest side of an image [px], as in sensor files."""
+SHAPE_TOLERANCE = 0.02
+"""How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
+
+
+def sensor_outputs(optics: str) -> tuple[str, ...]:
+    """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
+    return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
+
+
+def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
+    """Raises ``InputError`` for an unknown name, or a pad to be cut where none is simulated."""
+    if physics is not None:
+        _check_name("physics", physics, PHYSICS)
+    if isinstance(pad, str):
+        _check_name("pad", pad, PADS)
+    if pad is not None and physics == "rigid":
+        raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
+
+
+def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, options: dict[str, Any] | None) -> None:
+    """Raises ``InputError`` for an unknown name, or settings that the optical mode does not have."""
+    if isinstance(optics, str):
+        _check_name("optics", optics, OPTICS)
+    _check_name("integrator", integrator, INTEGRATORS)
+    if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
+        raise InputError(
+            "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
+        )
+    if not isinstance(optics, str) and (integrator != "fast" or spp is not None or options):
+        value = {"integrator": integrator, "spp": spp, "optics_options": options}
+        raise InputError(
+            "integrator, spp, optics_options", value=value, rule="belong to a mode that is built here; it has its own"
+        )
+
+
+def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> tuple[str, ...]:
+    """The names in the order of ``OUTPUTS``. Raises ``InputError`` for one that is unknown or that ``optics`` does not make."""
+    if not isinstance(outputs, (str, Sequence)):
+        raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
+    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    for name in outputs:
+        _check_name("outputs", name, OUTPUTS)
+        if isinstance(optics, str) and name not in sensor_outputs(optics):
+            rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
+            raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
+    return tuple(name for name in OUTPUTS if name in outputs)
+
+
+def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: str | None) -> None:
+    """Raises ``InputError`` for an unknown model, one that the physics cannot feed, or a perturbation of no markers."""
+    if markers is not None:
+        _check_name("markers", markers, MARKER_MODELS)
+        if markers == "surface" and physics == "rigid":
+            rule = "tracks the surface of a simulated gel; physics='rigid' has none"
+            raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
+    elif perturbation is not None:
+        raise InputError("marker_perturbation", value=perturbation, rule="needs a marker model: markers=…")
+
+
+def check_whole(name: str, value: object) -> None:
+    """Raises ``InputError`` for what is not a whole number >= 1."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(name, value=value, rule="must be a whole number >= 1")
+
+
+def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, int] | None:
+    """(width, height) [px]. Raises ``InputError`` for what cannot be read or is out of range."""
+    if resolution is None:
+        return None
+    if isinstance(resolution, str):
+        resolution = parse_resolution(resolution)
+    if not isinstance(resolution, (tuple, list)) or len(resolution) != 2:
+        raise InputError("resolution", value=resolution, rule="must be (width, height) in pixels, as in (320, 240) or '320x240'")
+    for side in resolution:
+        check_whole("resolution", side)
+        if side > LARGEST_SIDE:
+            raise InputError("resolution", value=side, rule=f"must be at most {LARGEST_SIDE} pixels a side")
+    return int(resolution[0]), int(resolution[1])
+
+
+def checked_seed(seed: int) -> int:
+    """Raises ``InputError`` for what is not a whole number in [0, 2^32)."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
+        raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
+    return int(seed)
+
+
+def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
+    """The specification itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
+    if not isinstance(sensor, (str, Path, SensorSpec)):
+        raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
+    return sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
+
+
+def press_scene(scene: str | Path | PressScene) -> PressScene:
+    """The scene itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
+    if not isinstance(scene, (str, Path, PressScene)):
+        raise InputError("scene", value=scene, rule=f"must be a name, a path or a PressScene, not {type(scene).__name__}")
+    return scene if isinstance(scene, PressScene) else load_press(scene)
+
+
+def warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) -> None:
+    """The field of view is the sensor's, so an image of another shape has pixels that are not as wide as high on the gel."""
+    stretch = (resolution[0] / native[0]) / (resolution[1] / native[1])
+    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        (width, height), (w, h) = resolution, native
+        warnings.warn(
+            f"resolution {width}x{height} squeezes the sensor's view of {w}x{h}: against the sensor's pixels these are "
+            f"{max(stretch, 1 / stretch):.3g} times as {'high as wide' if stretch > 1 else 'wide as high'}; "
+            f"{width}x{max(round(width * h / w), 1)} keeps their shape",
+            stacklevel=3,
+        )
+
+
+def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(name, value=value, rule="must be a known name", choices=choices)

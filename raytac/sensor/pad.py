@@ -1,0 +1,81 @@
+"""The pad under a scene's object, rigid or simulated, and what its states tell: surface and forces."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from raytac.device import resolve_device
+from raytac.errors import BackendError, InputError
+from raytac.gel.surface import GelSurface
+from raytac.specs import PressScene, SensorSpec
+
+if TYPE_CHECKING:
+    from raytac.physics.contact_state import ContactState
+    from raytac.physics.rigid import RigidPad
+    from raytac.physics.soft import SoftPad
+    from raytac.physics.soft_mesh import PadMesh
+
+__all__ = ["load_pad", "pad_forces", "state_surface"]
+
+
+def load_pad(
+    spec: SensorSpec, press: PressScene, *, physics: str, level: str | PadMesh, device: str, **settings: Any
+) -> RigidPad | SoftPad:
+    """The pad with the scene's object before it.
+
+    Args:
+        spec: the sensor.
+        press: the scene.
+        physics: ``rigid`` or ``ipc``.
+        level: how finely a simulated pad is cut, or a mesh of one's own.
+        device: of the solver, which traces no rays and needs no OptiX.
+        settings: ``pitch``, ``num_envs``, ``seed``, ``offsets`` and ``depths`` of both pads.
+
+    Raises:
+        BackendError: the solver cannot run here.
+        RaytacError: as the pad's own constructor.
+    """
+    if physics == "ipc":
+        try:
+            from raytac.physics.soft import SoftPad
+        except ImportError as error:
+            raise BackendError(f"physics='ipc' needs the contact solver ({error}): `pip install raytac[ipc]`") from error
+        return SoftPad(spec, press, pad=level, device=resolve_device(device, ray_tracing=False), **settings)
+    from raytac.physics.rigid import RigidPad
+
+    return RigidPad(spec, press, **settings)
+
+
+def state_surface(pad: RigidPad | SoftPad | None, state: ContactState) -> GelSurface:
+    """Surface of a state.
+
+    Raises:
+        InputError: no state, none of this pad's scene, or there is no pad.
+    """
+    if not hasattr(state, "pad_from_object"):
+        raise InputError(
+            "state", value=type(state).__name__, rule="must be a GelSurface, or a state of the physics that load() returned"
+        )
+    if pad is None:
+        raise InputError("state", value=type(state).__name__, rule="needs a scene: call load() first, or give a GelSurface")
+    if state.scene is not None and state.scene != pad.scene:
+        rule = f"belongs to the scene {state.scene.name!r}, and {pad.scene.name!r} was loaded since"
+        raise InputError("state", value=type(state).__name__, rule=rule)
+    return pad.surface(state)  # type: ignore[arg-type]
+
+
+def pad_forces(
+    pad: RigidPad | SoftPad, state: ContactState, surface: GelSurface, outputs: tuple[str, ...]
+) -> dict[str, np.ndarray | Any]:
+    """``wrench``, ``traction`` and, with either, ``contact_area`` of a state, as far as ``outputs`` ask for them."""
+    found: dict[str, Any] = {}
+    if "wrench" in outputs:
+        found["wrench"] = pad.wrench(state)  # type: ignore[arg-type]
+    if "traction" in outputs:
+        found["traction"] = pad.traction(state)  # type: ignore[arg-type]
+    if found:
+        cell = surface.grid.pitch[0] * surface.grid.pitch[1]
+        found["contact_area"] = np.where(state.failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
+    return found
