@@ -74,7 +74,7 @@ def bar(width: float, height: float, length: float, cells: tuple[int, int, int])
     """A box along x from −``length``/2 to ``length``/2, centred in y and z."""
     sides = (length, width, height)
     x, y, z = (np.linspace(-side / 2, side / 2, n + 1) for side, n in zip(sides, cells, strict=True))
-    return ipc.box_mesh(x, y, z, mirrored=cells[1] > 1)
+    return ipc.box_mesh(x, y, z)
 
 
 def moved(mesh: ipc.TetMesh, by: tuple[float, float, float], turn: NDArray | None = None) -> ipc.TetMesh:

@@ -17,10 +17,11 @@ SLOW = ["crush", "beam_twist", "mat_twist", "squeeze_and_release", "edge_alignme
 SETUP = Setup()
 
 
-def check(name: str, worst: Worst) -> None:
+def check(name: str, worst: Worst, most: int = MAX_NEWTON) -> None:
+    """``most``: Newton iterations a step."""
     told = f"{name}: gap {worst.min_gap:.3g} m, det F {worst.min_det:.3g}, {worst.max_newton} Newton iterations, {worst.notes}"
-    assert worst.passed(MAX_NEWTON), told
-    assert worst.unconverged == 0, f"{name}: {worst.unconverged} steps did not converge"
+    assert worst.passed(), f"{told}, {worst.unconverged} unconverged"
+    assert worst.max_newton <= most, told
     assert worst.world is not None
     layout, x = worst.world.layout, np.asfortranarray(surface_positions(worst.world))
     assert not ipctk.has_intersections(ipctk.CollisionMesh(x, layout.edges, layout.faces), x), f"{name}: surfaces cross"
@@ -51,7 +52,7 @@ def test_slow_cases_pass(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["beam_twist", "mat_twist"])
 def test_large_twists_pass(name: str) -> None:
-    check(name, CASES[name](Setup(large=True)))
+    check(name, CASES[name](Setup(large=True)), most=300)
 
 
 def test_random_presses_pass() -> None:
@@ -64,11 +65,11 @@ def test_a_thousand_random_presses_pass() -> None:
 
 
 def test_a_case_that_did_not_happen_fails() -> None:
-    """The verdict is not given away: nothing touched, a gap of zero, too many iterations, a wrong weight, all fail."""
-    good = Worst(min_gap=1e-5, min_det=0.5, max_newton=10)
-    assert good.passed(MAX_NEWTON)
-    assert not replace(good, min_gap=0.0).passed(MAX_NEWTON)
-    assert not replace(good, min_det=-0.1).passed(MAX_NEWTON)
-    assert not replace(good, max_newton=MAX_NEWTON + 1).passed(MAX_NEWTON)
-    assert not replace(good, finite=False).passed(MAX_NEWTON)
-    assert not replace(good, notes=["missed"]).passed(MAX_NEWTON)
+    """The verdict is not given away: a closed gap, an unconverged step, an expectation missed, all fail."""
+    good = Worst(min_gap=1e-5, min_det=0.5)
+    assert good.passed()
+    for change in ("min_gap", "min_det"):
+        assert not replace(good, **{change: 0.0}).passed()
+    assert not replace(good, unconverged=1).passed()
+    assert not replace(good, finite=False).passed()
+    assert not replace(good, notes=["missed"]).passed()
