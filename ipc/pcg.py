@@ -192,7 +192,7 @@ class Pcg:
         self._by_blocks, self._rr, self._rz = (
             wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
         )
-        self._by_rows = wp.zeros((batch, max(1, lanes // BLOCK)), dtype=wp.float64, device=device)
+        self._by_rows = wp.zeros((batch, -(-lanes // BLOCK)), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
         self.scalars = Scalars()
@@ -307,5 +307,5 @@ class Pcg:
             preconditioner.apply(residual, self._running, self._z)
             on = running != 0
             new = dot(r, z)
-            p[on] = z[on] + (new / rz)[on, None, None] * p[on]
+            p[on] = z[on] + (new[on] / rz[on])[:, None, None] * p[on]
             rz = new

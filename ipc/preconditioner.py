@@ -42,11 +42,13 @@ def pays(layout: Layout, device: wp.Device) -> bool:
 def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: int, device: wp.Device) -> Preconditioner:
     """The one that ``settings.preconditioner`` names; ``"auto"`` takes the rest inverse where it pays and can be had.
 
+    Its products of matrices add up in another order for another number of environments, so a deterministic world does without.
+
     Raises:
         IpcError: if the rest inverse is asked for and no body is bonded, one is too large, or too ill-conditioned.
     """
     wanted, must = settings.preconditioner, settings.preconditioner != "auto"
-    if wanted == "rest_inverse" or (not must and pays(layout, device)):
+    if wanted == "rest_inverse" or (not must and not settings.deterministic and pays(layout, device)):
         sizes = [entries(layout, *choose_partition(layout, body)) for body in bonded_bodies(layout)]
         rule = f"no body is bonded, or one is too large (inverses of {sizes} numbers, at most {MAX_ENTRIES})"
         if sizes and max(sizes) <= MAX_ENTRIES:

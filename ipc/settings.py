@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Literal
 
 from ipc.errors import IpcError
@@ -33,11 +34,12 @@ class Settings:
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
         broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
-            (bounding volume hierarchies), or ``"auto"`` (by the number of edges, for each pair of bodies). The pairs are the same.
+            (bounding volume hierarchies), or ``"auto"`` (by the numbers of edges and of body pairs). The pairs are the same.
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
             ``World.timers``.
         deterministic: on CUDA, add contact forces and rows in a fixed order, one thread an environment: the same call gives the same
-            bits, and an environment of a batch those of a world of its own. Slower; a CPU does it anyway.
+            bits, and an environment of a batch those of a world of its own. Slower; a CPU does it anyway. With ``"rest_inverse"`` asked
+            for, a batch agrees with single worlds to the linear tolerance only.
     """
 
     dt: float = 0.01
@@ -64,6 +66,8 @@ class Settings:
         for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):
             if not getattr(self, name) > 0:
                 raise IpcError(f"{name} = {getattr(self, name)}: it must be positive")
+        if len(self.gravity) != 3 or not all(isfinite(g) for g in self.gravity):
+            raise IpcError(f"gravity = {self.gravity}: it must be three finite numbers")
         for name in ("max_newton", "max_linear", "max_line_search"):
             if getattr(self, name) < 1:
                 raise IpcError(f"{name} = {getattr(self, name)}: at least one is needed")
