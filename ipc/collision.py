@@ -345,8 +345,9 @@ class Collision:
         self._reduce(self._change_size, active, SUM, changed)
         wp.launch(friction.share_of_change, dim=self.batch, inputs=[self._force, active], outputs=[changed], device=device)
 
-    def drop_lag(self, envs: np.ndarray) -> None:
-        """Forget the lagged pairs of the environments of the mask (B,)."""
-        count = self.lagged.count.numpy()
-        count[envs] = 0
-        self.lagged.count.assign(count)
+    def drop(self, envs: np.ndarray) -> None:
+        """Forget the contacts and the lagged pairs of the environments of the mask (B,)."""
+        for counts in (self.contacts.count, self.contacts.row_count, self.lagged.count):
+            count = counts.numpy()
+            count[envs] = 0
+            counts.assign(count)

@@ -47,6 +47,7 @@ INTS = (
         "searching",
         "trials",
         "taken",
+        "spent",
     ),
     *("poor", "rested", "ready", "used", "good"),
     *("failed", "converged", "stalled", "newton", "linear", "line_search", "relags"),
@@ -87,6 +88,7 @@ class Decisions:
     searching: wp.array(dtype=wp.int32)  # still looks for the length of its Newton step
     trials: wp.array(dtype=wp.int32)
     taken: wp.array(dtype=wp.int32)  # changes state now
+    spent: wp.array(dtype=wp.int32)  # PCG iterations in this iteration
     poor: wp.array(dtype=wp.int32)  # its frames hardly came ahead: plain iterations until the unknowns rest, then one more try
     rested: wp.array(dtype=wp.int32)
     ready: wp.array(dtype=wp.int32)
@@ -144,7 +146,7 @@ def start_step(friction: wp.int32, d: Decisions):
     d.active[env] = alive * (1 - friction)
     d.relags[env] = -friction
     if alive == 0:
-        d.share[env] = wp.float64(1.0)
+        d.share[env] = zero
     d.poor[env] = 0
     d.rested[env] = 0
     d.ready[env] = 1
@@ -207,6 +209,7 @@ def after_lag(tolerance: wp.float64, d: Decisions):
 def choose_travelling(d: Decisions, f: Flags):
     """Frames on their way advance, unless the last advance was poor and the unknowns have not rested since."""
     env = wp.tid()
+    d.spent[env] = 0
     go = 0
     if d.active[env] != 0 and d.share[env] < wp.float64(1.0) and d.ready[env] != 0:
         if d.poor[env] == 0 or d.rested[env] != 0:
@@ -229,8 +232,8 @@ def after_solve(
     """Counts iterations; environments that met negative curvature shall have a definite matrix."""
     env = wp.tid()
     again = 0
-    if mask[env] != 0:
-        d.linear[env] = d.linear[env] + iterations[env]
+    if mask[env] != 0 and f.halt[0] == 0:
+        d.spent[env] = d.spent[env] + iterations[env]
         if negative[env] != 0 and d.project[env] == 0:
             d.project[env] = 1
             again = 1
@@ -262,8 +265,6 @@ def judge_direction(dt: wp.float64, d: Decisions, f: Flags):
         return
     if d.active[env] == 0:
         return
-    d.newton[env] = d.newton[env] + 1
-    d.used[env] = d.used[env] + 1
     if not (d.size[env] < wp.float64(BAD)):
         d.failed[env] = 1
         d.active[env] = 0
@@ -413,6 +414,10 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
     if f.halt[0] != 0:
         return
     was_active = d.travelling[env] + d.plain[env]
+    if was_active != 0:
+        d.newton[env] = d.newton[env] + 1
+        d.used[env] = d.used[env] + 1
+        d.linear[env] = d.linear[env] + d.spent[env]
     if d.plain[env] != 0:
         d.ready[env] = 1
         slow = d.speed[env] <= tolerance
@@ -436,9 +441,12 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
 
 @wp.kernel
 def choose_good(d: Decisions):
+    """Environments that failed go back to where the step began, their frames too."""
     env = wp.tid()
     d.good[env] = d.alive[env] * (1 - d.failed[env])
     d.taken[env] = d.failed[env]
+    if d.failed[env] != 0:
+        d.share[env] = wp.float64(0.0)
 
 
 @wp.kernel

@@ -62,8 +62,12 @@ def frames_at(
         sign = wp.float64(-1.0)
     q1 = sign * end_q[env, b]
     q = sign * end_q[env, b]
-    if s < wp.float64(1.0) and wp.dot(q0, q1) < wp.float64(0.99999999999999):
-        q = wp.normalize(wp.quat_slerp(q0, q1, s))
+    if s < wp.float64(1.0):
+        if wp.dot(q0, q1) < wp.float64(0.99999999999999):
+            q = wp.normalize(wp.quat_slerp(q0, q1, s))
+        else:
+            # A turn of less than 3e-7 rad, whose arc and chord are the same to rounding.
+            q = wp.normalize((wp.float64(1.0) - s) * q0 + s * q1)
     now_q[env, b] = q
     R[env, b] = wp.quat_to_matrix(q)
     t[env, b] = start_p[env, b] + s * (end_p[env, b] - start_p[env, b])

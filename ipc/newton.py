@@ -293,6 +293,7 @@ class Newton:
             second = int(self.settings.integrator == "bdf2")
             pot.launch(control.end_step, self.batch, [second, d], [pot.second_order])
             pot.set_frames(d.share, pot.R, pot.t)
+            pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
             pot.energies()

@@ -21,8 +21,8 @@ class StepReport:
     Attributes:
         converged: Newton met its tolerance and the driven bodies reached their targets or are blocked.
         failed: a number was not finite; the environment stays where the step began until its state is set again.
-        stalled: no step lowered the energy although the tolerance was not met, or the environment failed.
-        blocked: share of the commanded motion that could not be made, 0 if all of it was.
+        stalled: no step lowered the energy although the tolerance was not met.
+        blocked: share of the commanded motion that could not be made, 0 if all of it was, 1 where the environment failed.
         min_gap: least distance between surfaces over all accepted states [m]; inf if none was below d̂.
         min_det: least det F over all accepted states [-].
         newton, linear, line_search, relags: iterations.

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies import Body, HalfSpace, SoftBody
+from ipc.bodies import AffineBody, Body, HalfSpace, SoftBody
 from ipc.errors import IpcError, OverlapError
 from ipc.layout import build_layout, rotation_matrix
 from ipc.newton import Newton
@@ -158,6 +158,17 @@ class World:
             raise IpcError(f"{what} = {array}: it must be finite")
         return np.broadcast_to(array, (self.num_envs, *shape))
 
+    def _pose(self, position: ArrayLike | None, rotation: ArrayLike | None) -> tuple[Floats | None, Floats | None]:
+        """Position (B, 3) and unit quaternion (w, x, y, z) (B, 4) of every environment, where given."""
+        p = None if position is None else self._per_env(position, (3,), "position")
+        if rotation is None:
+            return p, None
+        q = self._per_env(rotation, (4,), "rotation")
+        length = np.linalg.norm(q, axis=-1, keepdims=True)
+        if not np.allclose(length, 1, atol=1e-6):
+            raise IpcError(f"rotation = {rotation}: a quaternion (w, x, y, z) must have length 1")
+        return p, q / length
+
     def _mask(self, envs: ArrayLike | None) -> NDArray[np.bool_]:
         """A mask (B,) from a mask, a list of environments, or None for all."""
         if envs is None:
@@ -167,6 +178,8 @@ class World:
             if chosen.shape != (self.num_envs,):
                 raise IpcError(f"envs is a mask of shape {chosen.shape}: it must be ({self.num_envs},)")
             return chosen.copy()
+        if chosen.size and not np.issubdtype(chosen.dtype, np.integer):
+            raise IpcError(f"envs = {envs}: give a mask or whole numbers")
         if chosen.size and (chosen.min() < 0 or chosen.max() >= self.num_envs):
             raise IpcError(f"envs names environments {chosen.min()} to {chosen.max()}: there are {self.num_envs}")
         mask = np.zeros(self.num_envs, bool)
@@ -183,13 +196,11 @@ class World:
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps the last target's. Steps turn by less than half a turn.
         """
         frame = self._frame(name)
-        if position is not None:
-            self._goal_p[:, frame] = self._per_env(position, (3,), "position")
-        if rotation is not None:
-            q = self._per_env(rotation, (4,), "rotation")
-            if not np.allclose(np.linalg.norm(q, axis=-1), 1, atol=1e-6):
-                raise IpcError(f"rotation = {rotation}: a quaternion (w, x, y, z) must have length 1")
-            self._goal_q[:, frame] = (q / np.linalg.norm(q, axis=-1, keepdims=True))[:, [1, 2, 3, 0]]
+        p, q = self._pose(position, rotation)
+        if p is not None:
+            self._goal_p[:, frame] = p
+        if q is not None:
+            self._goal_q[:, frame] = q[:, [1, 2, 3, 0]]
         self._told = False
 
     def set_gravity(self, gravity: ArrayLike) -> None:
@@ -197,7 +208,10 @@ class World:
         self._potential.acceleration.assign(np.ascontiguousarray(self._per_env(gravity, (3,), "gravity")))
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
-        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame."""
+        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame.
+
+        With BDF2 the next step of these environments is backward Euler.
+        """
         body = self._index(name)
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
@@ -206,6 +220,10 @@ class World:
         v = _host(self._potential.v).copy()
         v[mask, first:last] = self._per_env(velocity, (3,), "velocity")[mask, None]
         self._potential.v.assign(v)
+        # The earlier states that BDF2 looks back to know nothing of this velocity.
+        history = _host(self._potential.second_order).copy()
+        history[mask] = 0
+        self._potential.second_order.assign(history)
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
@@ -267,6 +285,8 @@ class World:
         solver = self._potential
         if isinstance(self.bodies[body], SoftBody):
             y = _host(solver.y)[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
+            if frame == "body" and not self.layout.framed[body]:
+                raise IpcError(f"{name!r} has no bonded vertices and so no frame of its own: choose frame='world'")
             if frame == "body":
                 return y
             return np.einsum("bij,bnj->bni", _host(solver.R)[:, body], y) + _host(solver.t)[:, body, None]
@@ -286,7 +306,7 @@ class World:
         """A (B, 3, 3) and p [m] (B, 3) of an affine body's map x = A X + p."""
         body = self._index(name)
         first, last = self.layout.node_start[body : body + 2]
-        if last - first != 4 or isinstance(self.bodies[body], SoftBody):
+        if not isinstance(self.bodies[body], AffineBody):
             raise IpcError(f"{name!r} is no affine body")
         pose = self.bodies[body].pose
         corner = rotation_matrix(pose.rotation).T @ (self.layout.node_rest[first] - pose.position)
@@ -352,18 +372,26 @@ class World:
         collision = solver.collision
         forces = np.zeros((*solver.x.shape, 3))
         plane_of = self.layout.pairs[:, 1]
-        found, lagged = collision.contacts, collision.lagged
         x, start = _host(solver.x), _host(solver.x_start)
+        found, lagged = (
+            [_host(a) for a in (pairs.count, pairs.verts, pairs.pair, pairs.normal, size)]
+            for pairs, size in (
+                (collision.contacts, collision.contacts.force),
+                (collision.lagged, collision.lagged.limit),
+            )
+        )
+
+        def touching(count: NDArray, verts: NDArray, pair: NDArray, *values: NDArray) -> tuple[NDArray, ...]:
+            n = int(count[env])
+            mine = (verts[env, :n, 1] < 0) & (plane_of[pair[env, :n]] == body)
+            return verts[env, :n][mine, 0], *(a[env, :n][mine] for a in values)
+
         for env in range(self.num_envs):
-            n = int(_host(found.count)[env])
-            verts = _host(found.verts)[env, :n]
-            mine = (verts[:, 1] < 0) & (plane_of[_host(found.pair)[env, :n]] == body)
-            normal, force = _host(found.normal)[env, :n][mine], _host(found.force)[env, :n][mine]
-            np.add.at(forces[env], verts[mine, 0], -force[:, None] * normal)
-            n = int(_host(lagged.count)[env]) if collision.friction else 0
-            verts = _host(lagged.verts)[env, :n]
-            mine = (verts[:, 1] < 0) & (plane_of[_host(lagged.pair)[env, :n]] == body)
-            v, normal, limit = verts[mine, 0], _host(lagged.normal)[env, :n][mine], _host(lagged.limit)[env, :n][mine]
+            v, normal, force = touching(*found)
+            np.add.at(forces[env], v, -force[:, None] * normal)
+            if not collision.friction:
+                continue
+            v, normal, limit = touching(*lagged)
             u = x[env, v] - start[env, v]
             u -= (u * normal).sum(axis=1, keepdims=True) * normal
             y, eps = np.linalg.norm(u, axis=1), solver.friction_eps
@@ -408,6 +436,8 @@ class World:
     def restore(self, state: State, envs: ArrayLike | None = None) -> None:
         """Put environments back to a saved state; targets become the frames of that state.
 
+        Forces and contacts belong to a step, not to a state: there are none until the next one.
+
         Args:
             state: from :meth:`save` of a world of the same bodies.
             envs: a mask (B,) or list of the environments to restore; None for all. Others are not touched.
@@ -438,7 +468,11 @@ class World:
         self._goal_p[mask], self._goal_q[mask] = state.frame_position[mask], quaternions[mask]
         self._failed[mask] = state.failed[mask]
         s.collision.forget(mask)
-        s.collision.drop_lag(mask)
+        s.collision.drop(mask)
+        for forces in (s.gradient, s.vert_gradient):
+            kept = _host(forces).copy()
+            kept[mask] = 0.0
+            forces.assign(kept)
         s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
         s.place_vertices(s.y, s.R, s.t, s.x)
 
@@ -451,8 +485,10 @@ class World:
     ) -> None:
         """Move a driven body's frame at once, with all that is bonded to it; its velocities become zero.
 
+        Its target becomes that pose; those of other bodies stay. An affine body is put there, undeformed.
+
         Args:
-            name: a driven body.
+            name: a driven body or a grip.
             position: [m], shape (3,) or (B, 3); None keeps it.
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps it.
             envs: a mask (B,) or list of environments; None for all.
@@ -461,18 +497,27 @@ class World:
             OverlapError: if surfaces would cross or touch there.
         """
         frame, mask, state = self._frame(name), self._mask(envs), self.save()
+        p, q = self._pose(position, rotation)
         before = rotation_matrix(state.frame_rotation), state.frame_position.copy()
-        if position is not None:
-            state.frame_position[mask, frame] = self._per_env(position, (3,), "position")[mask]
-        if rotation is not None:
-            state.frame_rotation[mask, frame] = self._per_env(rotation, (4,), "rotation")[mask]
+        if p is not None:
+            state.frame_position[mask, frame] = p[mask]
+        if q is not None:
+            state.frame_rotation[mask, frame] = q[mask]
         body = int(self.layout.frame_body[frame])
+        moved = np.arange(len(self.layout.frame_names)) == frame
+        nodes = slice(self.layout.node_start[body], self.layout.node_start[body + 1])
         if frame == body:
             self._carry_grips(state, body, mask, before)
-        nodes = slice(self.layout.node_start[body], self.layout.node_start[body + 1])
+            moved = self.layout.frame_body == body
+        elif isinstance(self.bodies[body], AffineBody):
+            turned = np.einsum("bij,nj->bni", rotation_matrix(state.frame_rotation[:, frame]), self.layout.aim_local[nodes])
+            state.y[mask, nodes] = (turned + state.frame_position[:, frame, None])[mask]
         state.velocity[mask, nodes] = 0.0
         state.second_order[mask] = 0
+        goal_p, goal_q = self._goal_p[:, ~moved].copy(), self._goal_q[:, ~moved].copy()
         self.restore(state, mask)
+        self._goal_p[:, ~moved], self._goal_q[:, ~moved] = goal_p, goal_q
+        self._told = False
 
     def _carry_grips(self, state: State, body: int, mask: NDArray[np.bool_], before: tuple[Floats, Floats]) -> None:
         """Grips keep their places in the frame of the body that was moved."""
@@ -495,7 +540,3 @@ class World:
             found = find_overlap(self.layout, state.y[env], state.frame_rotation[env], state.frame_position[env])
             if found is not None:
                 raise OverlapError(f"environment {env}: {found}")
-
-    def pairs_of_bodies(self) -> list[tuple[str, str]]:
-        """The pairs of bodies that may touch."""
-        return [(self.layout.names[a], self.layout.names[b]) for a, b in self.layout.pairs]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ipc
+from ipc import dynamics
 from ipc.layout import rotation_matrix
 from tests.ipc.conftest import bonded_pad, small_pad
 
@@ -105,6 +107,28 @@ def test_a_driven_affine_body_covers_its_share_of_the_way(strength: float) -> No
     assert np.abs(p[0] - strength / (1 + strength) * np.array([1e-3, 0, -2e-3])).max() < 1e-9
 
 
+def test_teleport_puts_a_driven_affine_body_at_its_pose() -> None:
+    peg = ipc.AffineBody("peg", ipc.box_surface((2e-3, 2e-3, 2e-3), (1e-3, 0, 0)), drive=5.0)
+    world = ipc.World([peg], num_envs=2, device="cpu")
+    world.teleport("peg", (0.0, 1e-2, 0.0), turned(np.pi / 2), envs=[1])
+    expected = peg.surface.vertices @ rotation_matrix(turned(np.pi / 2)).T + [0, 1e-2, 0]
+    assert np.abs(world.positions("peg")[1] - expected).max() < 1e-15
+    assert np.abs(world.positions("peg")[0] - peg.surface.vertices).max() < 1e-15
+    world.step()
+    assert np.abs(world.positions("peg")[1] - expected).max() < 1e-12
+
+
+def test_a_turn_however_small_begins_where_the_frame_is() -> None:
+    """Half a turn of 1e-7 rad is half of it: no part of the way is made without a look at the gaps."""
+    start, end = wp.array([[(0.0, 0, 0, 1)]], dtype=wp.quatd), wp.array([[(0.0, 0, 5e-8, 1)]], dtype=wp.quatd)
+    place, turn = wp.zeros((1, 1), dtype=wp.vec3d), wp.zeros((1, 1), dtype=wp.mat33d)
+    for share in (0.0, 0.5, 1.0):
+        shares = wp.array([share], dtype=wp.float64)
+        inputs, outputs = [start, place, end, place, shares], [turn, wp.zeros_like(place), wp.zeros_like(start)]
+        wp.launch(dynamics.frames_at, dim=(1, 1), inputs=inputs, outputs=outputs, device="cpu")
+        assert turn.numpy()[0, 0, 1, 0] == pytest.approx(share * 1e-7, rel=1e-9, abs=1e-16)
+
+
 def test_a_drive_gives_way_to_contact() -> None:
     peg = ipc.AffineBody("peg", ipc.box_surface((2e-3, 2e-3, 2e-3)), ipc.Stiff(), ipc.Pose((0, 0, 1.3e-3)), drive=5.0)
     world = ipc.World([peg, ipc.HalfSpace("floor")], ipc.Settings(d_hat=2e-4), device="cpu")
@@ -117,8 +141,8 @@ def test_a_drive_gives_way_to_contact() -> None:
 
 
 def test_buffers_grow_in_the_middle_of_a_step() -> None:
-    """Buffers of one place each give the bit-same press as ample ones."""
-    results = []
+    """Buffers of one place each, and lists that overflow amid every step, give the bit-same press as ample ones."""
+    results, counts = [], []
     for room in (None, 1):
         ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((2e-4, 1e-4, 4e-3 + 1.2e-4)))
         world = ipc.World([bonded_pad(small_pad()), ball], ipc.Settings(d_hat=1e-4, friction=0.5), num_envs=2, device="cpu")
@@ -129,7 +153,15 @@ def test_buffers_grow_in_the_middle_of_a_step() -> None:
             world.set_target("ball", (2e-4, 1e-4, 4e-3 + 1.2e-4 - 1.5e-4 * (k + 1)))
             report = world.step()
             assert report.converged.all()
+            counts.append((report.newton, report.linear))
+            if room:
+                # As much as the present lists need: the next new list, in the middle of the step, is too long.
+                lists = world._potential.collision.candidates
+                now = [max(1, int(c.numpy().max())) for c in (lists.pt_count, lists.ee_count)]
+                world._potential.collision._size_candidates(*now)
+                world._potential.collision.forget(np.ones(2, bool))
         results.append((world.positions("pad"), report.newton, report.min_gap))
     assert report.pairs.min() > 1
     for one, other in zip(*results, strict=True):
         assert np.array_equal(one, other)
+    assert np.array_equal(counts[:4], counts[4:]), "iterations that were done again count once"

@@ -114,6 +114,21 @@ def collide(velocity_tolerance: float, linear_tolerance: float) -> tuple[float, 
     return max(drifts), float(np.diff(energies).max()) / energies[0]
 
 
+@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+def test_a_velocity_that_is_set_is_kept(integrator: Literal["euler", "bdf2"]) -> None:
+    """Also by BDF2, whose earlier states know nothing of it."""
+    cube = ipc.SoftBody("cube", unit_cell(1, 0.01), ipc.Material(1e5))
+    settings = ipc.Settings(integrator=integrator, velocity_tolerance=1e-9, linear_tolerance=1e-8)
+    world = ipc.World([cube], settings, num_envs=2, device="cpu")
+    for _ in range(3):
+        world.step()
+    world.set_velocity("cube", (1.0, 0.0, 0.0), envs=[1])
+    for _ in range(4):
+        world.step()
+    assert np.abs(world.velocities("cube")[1] - [1, 0, 0]).max() < 1e-8
+    assert np.abs(world.velocities("cube")[0]).max() < 1e-8
+
+
 def test_collision_keeps_momentum_and_energy_never_rises() -> None:
     """To rounding where the solver is; where it is told to be coarse both are seen to fail, so the measure does measure."""
     drift, rise = collide(1e-11, 1e-8)

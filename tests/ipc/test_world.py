@@ -5,8 +5,11 @@ from __future__ import annotations
 import ipctk
 import numpy as np
 import pytest
+import warp as wp
 
 import ipc
+from ipc.pcg import Pcg
+from ipc.reduce import BLOCK
 from tests.ipc.conftest import bonded_pad, small_pad
 
 RADIUS = 4e-3
@@ -177,8 +180,30 @@ def test_a_failed_environment_leaves_the_others_alone() -> None:
     for env in (0, 2):
         assert np.abs(world.positions("pad")[env] - single.positions("pad")[0]).max() <= 1e-12
     assert np.isfinite(world.positions("pad")).all()
+    assert (world.frame("ball")[1][1] == state.frame_position[1, 1]).all() and reports[-1].blocked[1] == 1
+    assert world.positions("ball")[1] == pytest.approx(world.positions("ball")[0] + [0, 0, 0.4e-3], abs=1e-15)
     world.reset([1])
     assert not world.step().failed.any()
+
+
+def test_forces_are_those_of_a_step_and_none_after_a_reset() -> None:
+    world = make_world(num_envs=2, friction=0.5)
+    press(world, 0.4e-3, 3, side=1e-4)
+    before = world.wrench("ball").force
+    world.reset([1])
+    for name in ("ball", "pad"):
+        assert (world.wrench(name).force[1] == 0).all() and (world.contact_forces(name)[1] == 0).all()
+    assert len(world.contacts(1).force) == 0 < len(world.contacts(0).force)
+    assert (world.wrench("ball").force[0] == before[0]).all() and before[1, 2] > 0.05
+
+
+def test_teleport_leaves_the_targets_of_others() -> None:
+    world = make_world()
+    world.set_target("ball", (1e-4, 0.0, RADIUS + GAP))
+    world.teleport("pad", (0.0, 0.0, -1e-3))
+    world.step()
+    assert (world.frame("ball")[1][0] == [1e-4, 0, RADIUS + GAP]).all()
+    assert (world.frame("pad")[1][0] == [0, 0, -1e-3]).all()
 
 
 def test_overlapping_starts_are_refused_with_names() -> None:
@@ -206,10 +231,15 @@ def test_bad_input_is_refused_before_anything_changes() -> None:
         world.set_target("ball", np.zeros((3, 3)))
     with pytest.raises(ipc.IpcError, match="finite"):
         world.set_target("ball", (0, 0, np.nan))
-    with pytest.raises(ipc.IpcError, match="length 1"):
-        world.set_target("ball", rotation=(1, 1, 0, 0))
+    told = world._goal_p.copy()
+    for ask in (world.set_target, world.teleport):
+        with pytest.raises(ipc.IpcError, match="length 1"):
+            ask("ball", (0, 0, 2 * RADIUS), (1, 1, 0, 0))
+    assert (world._goal_p == told).all() and (world.frame("ball")[1][:, 2] == RADIUS + GAP).all()
     with pytest.raises(ipc.IpcError, match="environments 0 to 2"):
         world.reset([0, 2])
+    with pytest.raises(ipc.IpcError, match="whole numbers"):
+        world.reset([0.5])
     with pytest.raises(ipc.IpcError, match="choose 'euler' or 'bdf2'"):
         ipc.Settings(integrator="verlet")  # type: ignore[arg-type]
     with pytest.raises(ipc.IpcError, match="unique"):
@@ -218,18 +248,26 @@ def test_bad_input_is_refused_before_anything_changes() -> None:
         ipc.World([world.bodies[1]], device="cpu")
 
 
-def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CUDA's loop of small kernels, run on the CPU, takes the iterations and gives the press of the CPU's own."""
-    from ipc import linear
+@pytest.mark.parametrize("lanes", [32, 131, 436, 655, 1024])
+def test_blocks_of_threads_reach_all_lanes_of_rows(lanes: int) -> None:
+    """On CUDA row r belongs to thread r mod lanes: with fewer threads than lanes, rows would be missing from the product."""
+    pcg = Pcg(2, 10, lanes, wp.get_device("cpu"))
+    assert lanes <= pcg._by_rows.shape[1] * BLOCK < lanes + BLOCK
 
-    ends = []
+
+def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop for any preconditioner, given block-Jacobi, takes the iterations and gives the press of the kernel that knows it."""
+    from ipc import pcg
+
+    ends, general = [], []
+    way = pcg.Pcg._solve_on_cpu
+    monkeypatch.setattr(pcg.Pcg, "_solve_on_cpu", lambda *args: general.append(1) or way(*args))
     for batched in (False, True):
         if batched:
-            monkeypatch.setattr(
-                linear, "BlockJacobi", type("Other", (), {})
-            )  # solve() no longer knows it and takes the general way
+            monkeypatch.setattr(pcg, "BlockJacobi", type("Other", (), {}))  # solve() no longer knows it and takes the general way
         world = make_world(num_envs=2, friction=0.3)
         reports = press(world, np.array([0.3e-3, 0.4e-3]), 2)
         ends.append((world.positions("pad"), reports[-1].linear))
+        assert bool(general) == batched
     assert (ends[0][1] > 0).all() and np.abs(ends[0][1] - ends[1][1]).max() <= 1
     assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-12
