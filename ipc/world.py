@@ -446,8 +446,12 @@ class World:
             OverlapError: if surfaces cross or touch in that state.
         """
         mask, s = self._mask(envs), self._potential
-        if state.y.shape != _host(s.y).shape:
-            raise IpcError(f"the state has nodes of shape {state.y.shape}: this world has {_host(s.y).shape}")
+        for what, found, needed in (
+            ("nodes", state.y.shape, (*s.y.shape, 3)),
+            ("frames", state.frame_position.shape, (*s.frame_p.shape, 3)),
+        ):
+            if found != needed:
+                raise IpcError(f"the state has {what} of shape {found}: this world has {needed}")
         self._check_overlap(state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         for target, values in (

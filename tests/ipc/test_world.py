@@ -14,12 +14,13 @@ from tests.ipc.conftest import bonded_pad, small_pad
 
 RADIUS = 4e-3
 GAP = 1.2e-4
+CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")])
 
 
-def make_world(num_envs: int = 1, friction: float = 0.0, **settings: object) -> ipc.World:
+def make_world(num_envs: int = 1, friction: float = 0.0, device: str = "cpu", **settings: object) -> ipc.World:
     options: dict = {"dt": 0.01, "d_hat": 1e-4, "friction": friction} | settings
     ball = ipc.KinematicBody("ball", ipc.icosphere(RADIUS, 2), ipc.Pose((0.0, 0.0, RADIUS + GAP)))
-    return ipc.World([bonded_pad(small_pad()), ball], ipc.Settings(**options), num_envs=num_envs, device="cpu")
+    return ipc.World([bonded_pad(small_pad()), ball], ipc.Settings(**options), num_envs=num_envs, device=device)
 
 
 def press(world: ipc.World, depth: float | np.ndarray, steps: int, side: float = 0.0) -> list[ipc.StepReport]:
@@ -141,6 +142,38 @@ def test_save_and_restore_repeat_a_press() -> None:
         press(world, 0.2e-3, 2, side=1e-4)
         ends.append(world.positions("pad").copy())
     assert np.abs(ends[0] - ends[1]).max() <= 1e-15
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_states_set_by_hand_are_seen_by_a_step_that_was_recorded(device: str) -> None:
+    """Restored, reset, failed and teleported after several steps, environments go on as a fresh world does."""
+    fine = {"velocity_tolerance": 1e-8, "linear_tolerance": 1e-8}
+    world, fresh = (make_world(3, 0.5, device, **fine) for device in (device, "cpu"))
+    place = np.array([1e-4, 2e-4, RADIUS + GAP])
+
+    def go(one: ipc.World, depth: float) -> ipc.StepReport:
+        for k in range(1, 4):
+            one.set_target("ball", place - [0, 0, depth * k / 3])
+            report = one.step()
+        return report
+
+    for one in (world, fresh):
+        one.teleport("ball", place)
+    start = world.save()
+    broken = world.save()
+    broken.velocity[1, 120] = np.nan
+    go(world, 0.5e-3)
+    world.restore(broken)
+    assert go(world, 0.5e-3).failed.tolist() == [False, True, False]
+    world.reset([0])
+    world.teleport("ball", place, envs=[0])
+    world.restore(start, [1, 2])
+    assert go(world, 0.4e-3).converged.all() and go(fresh, 0.4e-3).converged.all()
+    assert fresh.wrench("ball").force[:, 2].min() > 0.05
+    assert np.abs(world.positions("pad") - fresh.positions("pad")).max() < 1e-9
+    other = ipc.World([world.bodies[0]], num_envs=3, device="cpu")
+    with pytest.raises(ipc.IpcError, match="frames of shape"):
+        world.restore(other.save())
 
 
 def test_teleport_takes_the_pad_along() -> None:
