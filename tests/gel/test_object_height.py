@@ -8,7 +8,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from raytac.errors import InputError
@@ -104,6 +104,9 @@ def surface_distance(part: Part, point: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=12, deadline=None)
 @given(kind=st.sampled_from(["torus", "cone"]), seed=st.integers(0, 10_000))
+@example(kind="torus", seed=327)  # lines that graze the inside of the tube, where a step by the slope jumps over it
+@example(kind="torus", seed=394)
+@example(kind="torus", seed=466)
 def test_torus_and_cone_lie_on_their_surface_with_nothing_below(kind: str, seed: int) -> None:
     part = primitive(kind, (3e-3, 1e-3) if kind == "torus" else (2.5e-3, 4e-3, 0.6e-3))
     pose = random_pose(seed)
