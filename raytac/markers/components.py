@@ -10,12 +10,11 @@ __all__ = ["find_runs", "join_runs"]
 def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Runs of True along the rows of B masks (B, Ny, Nx): (row of all B · Ny, first column, column after the last), each (R,), in order."""
     batch, ny, nx = mask.shape
-    padded = np.zeros((batch * ny, nx + 2), dtype=np.int8)
+    padded = np.zeros((batch * ny, nx + 2), dtype=bool)
     padded[:, 1:-1] = mask.reshape(batch * ny, nx)
-    edges = np.diff(padded, axis=1)
-    row, start = np.nonzero(edges > 0)
-    _, stop = np.nonzero(edges < 0)
-    return row, start, stop
+    # Along a row, edges are in turn the first column of a run and the column after its last.
+    row, column = (padded[:, 1:] != padded[:, :-1]).nonzero()
+    return row[::2], column[::2], column[1::2]
 
 
 def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> list[int]:

@@ -60,17 +60,20 @@ class ContactCells:
         depth = np.zeros((batch, len(self.y), len(self.x)), dtype=np.float32)
         contact = np.zeros(depth.shape, bool)
         anywhere = np.asarray(surface.contact[0] if batch == 1 else surface.contact.any(axis=0))
-        rows, columns = np.flatnonzero(anywhere.any(axis=1)), np.flatnonzero(anywhere.any(axis=0))
+        rows = np.flatnonzero(anywhere.any(axis=1))
         if len(rows) == 0:
             return ContactSamples(self, depth, contact, (0, 0, 0, 0))
-        r0, r1, c0, c1 = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
+        r0, r1 = int(rows[0]), int(rows[-1])
+        columns = np.flatnonzero(anywhere[r0 : r1 + 1].any(axis=0))
+        c0, c1 = int(columns[0]), int(columns[-1])
         r0, r1, c0, c1 = r0 // ky, r1 // ky + 1, c0 // kx, c1 // kx + 1
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
         touched = np.asarray(surface.contact)[part]
         found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
         if not math.isfinite(found.sum()):
             touched = touched & np.all(np.isfinite(found), axis=(1, 2))[:, None, None]
-        found = np.where(touched, np.maximum(found, 0), np.float32(0))
+            found = np.where(touched, found, np.float32(0))
+        found = np.maximum(found, 0) * touched
         ny, nx = r1 - r0, c1 - c0
         # Whole cells, also at the pad's far edges.
         missing = ny * ky - found.shape[1], nx * kx - found.shape[2]
@@ -244,18 +247,24 @@ def _find(samples: ContactSamples) -> list[list[_Contact]]:
         return found
     ny, nx = r1 - r0, c1 - c0
     # A touch of no depth still has a place: the floor keeps its weights from all being zero.
-    weight = np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9).astype(float)
+    weight = np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9)
     sums = np.zeros((2, len(weight), nx + 1))
-    np.cumsum(weight, axis=1, out=sums[0, :, 1:])
-    np.cumsum(weight * cells.x[c0:c1], axis=1, out=sums[1, :, 1:])
-    total, along = (sums[:, row, stop] - sums[:, row, start]).tolist()
-    rows, y = row.tolist(), cells.y[r0 + row % ny].tolist()
-    first = join_runs(rows, start.tolist(), stop.tolist(), ny)
+    sums[0, :, 1:] = weight
+    np.multiply(sums[0, :, 1:], cells.x[c0:c1], out=sums[1, :, 1:])
+    sums = sums.cumsum(axis=2).reshape(2, -1)
+    line = row * (nx + 1)
+    total, along = (sums.take(line + stop, axis=1) - sums.take(line + start, axis=1)).tolist()
+    rows, starts, stops, y = row.tolist(), start.tolist(), stop.tolist(), cells.y[r0:r1].tolist()
     pieces: dict[int, list[float]] = {}
-    for i, number in enumerate(first):
-        piece = pieces.setdefault(number, [0.0, 0.0, 0.0, 0.0])
-        for n, value in enumerate((total[i], along[i], total[i] * y[i], float(stop[i] - start[i]))):
-            piece[n] += value
+    for i, number in enumerate(join_runs(rows, starts, stops, ny)):
+        piece = pieces.get(number)
+        if piece is None:
+            piece = pieces[number] = [0.0, 0.0, 0.0, 0.0]
+        piece[0] += total[i]
+        piece[1] += along[i]
+        piece[2] += total[i] * y[rows[i] % ny]
+        piece[3] += stops[i] - starts[i]
+    area = cells.area
     for number, (w, wx, wy, count) in pieces.items():
-        found[rows[number] // ny].append(_Contact(wx / w, wy / w, math.sqrt(count * cells.area / math.pi)))
+        found[rows[number] // ny].append(_Contact(wx / w, wy / w, math.sqrt(count * area / math.pi)))
     return found

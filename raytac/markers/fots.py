@@ -39,6 +39,8 @@ class FotsMarkers:
 
         motion = marker_motion_of(sensor)
         cells = ContactCells.over(grid)
+        self._rest: np.ndarray | None = None
+        self._xy: np.ndarray | None = None
         self._kernel = FotsKernel(cells.x, cells.y, device=device)
         self.device = self._kernel.device
         self.constants = FotsConstants(
@@ -57,4 +59,6 @@ class FotsMarkers:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert samples is not None and contacts is not None
         motion = contacts.active, contacts.centre, contacts.shear, contacts.twist, contacts.radius
-        return self._kernel.displacement(rest[..., :2], samples.depth, samples.boxes, motion, self.constants)
+        if self._xy is None or rest is not self._rest:
+            self._rest, self._xy = rest, rest[..., :2]  # one view for every frame: the kernel knows it again
+        return self._kernel.displacement(self._xy, samples.depth, samples.boxes, motion, self.constants)

@@ -13,22 +13,25 @@ __all__ = ["height_and_slope", "height_at", "object_way"]
 def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
     """Indices (env, row, column) of the cells' first nodes and the place in the cell along x and y, each (B, M); clipped to the pad."""
     grid = surface.grid
-    dx, dy = grid.pitch
-    # fmin and fmax pass over NaN: where an environment failed, any node will do.
-    fx = np.fmax(np.fmin((xy[..., 0] - grid.x[0]) / dx, len(grid.x) - 1.001), 0.0)
-    fy = np.fmax(np.fmin((xy[..., 1] - grid.y[0]) / dy, len(grid.y) - 1.001), 0.0)
-    column, row = fx.astype(int), fy.astype(int)
-    return (np.arange(len(xy))[:, None], row, column), fx - column, fy - row
+    last = np.array((len(grid.x) - 1.001, len(grid.y) - 1.001))
+    # Both axes in one call, since calls cost more than these numbers. fmin and fmax pass over NaN: where an environment failed, any
+    # node will do.
+    place = np.fmax(np.fmin((xy - np.array((grid.x[0], grid.y[0]))) / np.array(grid.pitch), last), 0.0)
+    node = place.astype(int)
+    part = place - node
+    return (np.arange(len(xy))[:, None], node[..., 1], node[..., 0]), part[..., 0], part[..., 1]
 
 
 def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
     """z of the surface at points (B, M, 2) [m], bilinear, shape (B, M)."""
     (env, row, column), wx, wy = _corners(surface, xy)
-    # One flat index and four takes: half the time of four look-ups by three indices.
+    # One take by flat indices: a fraction of the time of four look-ups by three indices.
     _, ny, nx = surface.height.shape
     node, height = (env * ny + row) * nx + column, np.ascontiguousarray(surface.height).reshape(-1)
-    a, b, c, d = (height.take(node + offset) for offset in (0, 1, nx, nx + 1))
-    top, bottom = a + wx * (b - a), c + wx * (d - c)
+    corners = height.take(node[..., None] + np.array((0, nx, 1, nx + 1)))
+    left, right = corners[..., :2], corners[..., 2:]
+    lines = left + wx[..., None] * (right - left)
+    top, bottom = lines[..., 0], lines[..., 1]
     return top + wy * (bottom - top)
 
 

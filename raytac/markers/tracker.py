@@ -121,12 +121,16 @@ class MarkerTracker:
     def _place(self, envs: range | list[int]) -> None:
         if not self._perturber.settings.moves_pattern:
             if not hasattr(self, "pattern"):
-                self.pattern = MarkerPattern.of(self.sensor, self._resolution)
-                self._grid_rest = self._height_at_rest()
+                self._set_pattern(MarkerPattern.of(self.sensor, self._resolution))
             return
         for b in envs:
             self._shift[b], self._turn[b] = self._perturber.placement(b)
-        self.pattern = MarkerPattern.of(self.sensor, self._resolution, shift=self._shift, turn=self._turn)
+        self._set_pattern(MarkerPattern.of(self.sensor, self._resolution, shift=self._shift, turn=self._turn))
+
+    def _set_pattern(self, pattern: MarkerPattern) -> None:
+        self.pattern = pattern
+        self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models know it again
+        self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
         self._grid_rest = self._height_at_rest()
 
     def _height_at_rest(self) -> np.ndarray:
@@ -163,11 +167,14 @@ class MarkerTracker:
         """
         if surface.batch != self.num_envs:
             raise InputError("surface", value=surface.batch, rule=f"must have {self.num_envs} environments, as this tracker")
+        # One NaN makes the sum one; the sum is several times cheaper than asking every node. First of all, since it brings the heights
+        # into the cache for those who pick some.
+        failed = ~np.isfinite(surface.height.reshape(self.num_envs, -1).sum(axis=1))
         samples, contacts = None, None
         if self._cells is not None:
             samples = self._cells.sample(surface)
             contacts = self._contacts.update(surface, samples)
-        rest = self.pattern.for_batch(self.num_envs)
+        rest = self._rest
         moved = self.model.displacement(rest, surface, samples, contacts)
         if moved.shape[-1] == 3:
             position = rest + moved
@@ -176,12 +183,10 @@ class MarkerTracker:
             xy = rest[..., :2] + moved
             z = rest[..., 2] + height_at(surface, xy) - self._grid_rest
             position = np.concatenate([xy, z[..., None]], axis=-1)
-        # One NaN makes the sum one; the sum is several times cheaper than asking every node.
-        failed = ~np.isfinite(surface.height.reshape(self.num_envs, -1).sum(axis=1))
         return self._frame(rest, position, failed)
 
     def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray) -> MarkerFrame:
-        pixel = np.broadcast_to(self.pattern.pixel, (*rest.shape[:2], 2))
+        pixel = self._pixel
         displacement = position[..., :2] - rest[..., :2]
         displacement_px = self.pattern.camera.project(position) - pixel
         noise = self._perturber.noise(self.pattern.count)

@@ -62,7 +62,7 @@ class FotsKernel:
         self._origin = float(x[0]), float(y[0])
         self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
         self._frozen: dict[tuple[int, int], Any] = {}
-        self._markers: tuple[np.ndarray, Any] | None = None
+        self._markers: tuple[np.ndarray, np.ndarray, Any] | None = None
         self._numbers: tuple[FotsConstants, Any] | None = None
 
     def displacement(
@@ -85,17 +85,16 @@ class FotsKernel:
         mi = self.mi
         batch, count = markers.shape[:2]
         k = 1 << (contacts[0].shape[1] - 1).bit_length()
-        table = np.zeros((batch, k, _ROW), dtype=np.float32)
+        # Contacts, boxes and depths in one array: one upload. Whole numbers as small as a grid's are exact in float32.
+        box, sample = batch * k * _ROW, batch * (k * _ROW + 4)
+        end = sample + batch * self.nx * self.ny
+        frame = np.zeros(end + -end % 4, dtype=np.float32)  # packet gathers want whole packets of four
         active, centre, shear, twist, radius = contacts
-        filled = table[:, : active.shape[1]]
+        filled = frame[:box].reshape(batch, k, _ROW)[:, : active.shape[1]]
         filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5], filled[..., 6] = active, centre, shear, twist, radius
-        inputs = (
-            self._on_device(markers),
-            mi.Float(np.ascontiguousarray(depth, dtype=np.float32).ravel()),
-            mi.UInt32(np.ascontiguousarray(boxes, dtype=np.uint32).ravel()),
-            mi.Float(table.ravel()),
-            self._constants(constants),
-        )
+        frame[box:sample].reshape(batch, 4)[:] = boxes
+        frame[sample:end].reshape(batch, self.ny, self.nx)[:] = depth
+        inputs = self._on_device(markers), mi.Float(frame), self._constants(constants)
         key = batch, k
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, *arrays))
@@ -104,10 +103,16 @@ class FotsKernel:
         return np.array(moved).reshape(batch, count, 2)
 
     def _on_device(self, markers: np.ndarray) -> Any:
-        """Places at rest hardly ever change, so the upload is kept."""
-        if self._markers is None or self._markers[0].shape != markers.shape or not np.array_equal(self._markers[0], markers):
-            self._markers = np.array(markers), self.mi.Float(np.ascontiguousarray(markers, dtype=np.float32).ravel())
-        return self._markers[1]
+        """Places at rest hardly ever change, so the upload is kept; a view that nobody may write is known again without a look."""
+        kept = self._markers
+        if kept is not None and markers is kept[0] and not markers.flags.writeable:
+            return kept[2]
+        if kept is None or kept[1].shape != markers.shape or not np.array_equal(kept[1], markers):
+            uploaded = self.mi.Float(np.ascontiguousarray(markers, dtype=np.float32).ravel())
+            self._markers = markers, np.array(markers), uploaded
+        else:
+            self._markers = markers, kept[1], kept[2]
+        return self._markers[2]
 
     def _constants(self, constants: FotsConstants) -> Any:
         if self._numbers is None or self._numbers[0] != constants:
@@ -116,21 +121,27 @@ class FotsKernel:
             self._numbers = constants, self.mi.Float(np.array(values, dtype=np.float32))
         return self._numbers[1]
 
-    def _sums(self, batch: int, count: int, k: int, xy: Any, depth: Any, boxes: Any, contacts: Any, constants: Any) -> Any:
+    def _sums(self, batch: int, count: int, k: int, xy: Any, frame: Any, constants: Any) -> Any:
+        """``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, nx), one after the other."""
         mi = self.mi
         i = dr.arange(mi.UInt32, batch * count)
         env = i // count
         place = dr.gather(mi.Point2f, xy, i)
         gain, ld, ls, smax, lt, tmax, radius = (dr.gather(mi.Float, constants, n) for n in range(7))
-        drag = _drag(mi, env, place, contacts, k, (ls, smax, lt, tmax, radius))
-        dilate = self._dilate(env, place + drag, depth, boxes, ld) * (gain * self._pitch[0] * self._pitch[1])
+        drag = _drag(mi, env, place, frame, k, (ls, smax, lt, tmax, radius))
+        box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // 4 + env)
+        first = mi.Int32(env) * (self.nx * self.ny) + batch * (k * _ROW + 4)
+        dilate = self._dilate(place + drag, frame, box, first, ld) * (gain * self._pitch[0] * self._pitch[1])
         return dr.ravel(dilate + drag)
 
-    def _dilate(self, env: Any, place: Any, depth: Any, boxes: Any, ld: Any) -> Any:
-        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker."""
+    def _dilate(self, place: Any, frame: Any, box: Any, first: Any, ld: Any) -> Any:
+        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker.
+
+        ``first``: where the samples of the marker's pad begin in ``frame``.
+        """
         mi, (x0, y0), (dx, dy) = self.mi, self._origin, self._pitch
         reach = dr.sqrt(_NEGLIGIBLE / ld)
-        c0, c1, r0, r1 = (mi.Int32(dr.gather(mi.UInt32, boxes, 4 * env + n)) for n in range(4))
+        c0, c1, r0, r1 = (mi.Int32(edge) for edge in box)
         c0, c1 = (
             dr.maximum(c0, mi.Int32(dr.ceil((place.x - reach - x0) / dx))),
             dr.minimum(c1, mi.Int32((place.x + reach - x0) / dx) + 1),
@@ -139,13 +150,12 @@ class FotsKernel:
             dr.maximum(r0, mi.Int32(dr.ceil((place.y - reach - y0) / dy))),
             dr.minimum(r1, mi.Int32((place.y + reach - y0) / dy) + 1),
         )
-        first = mi.Int32(env) * (self.nx * self.ny)
 
         def inside(c: Any, r: Any, sx: Any, sy: Any) -> Any:
             return (r < r1) & (c0 < c1)
 
         def add(c: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
-            h = dr.gather(mi.Float, depth, first + r * self.nx + c)
+            h = dr.gather(mi.Float, frame, first + r * self.nx + c)
             ex, ey = place.x - (x0 + mi.Float(c) * dx), place.y - (y0 + mi.Float(r) * dy)
             w = h * dr.exp(-ld * (ex * ex + ey * ey))
             wrap = c + 1 >= c1

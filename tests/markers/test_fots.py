@@ -173,3 +173,24 @@ def test_a_sensor_that_nobody_calibrated_says_how(grid: PadGrid) -> None:
     for model in ("fots", "force_field"):
         with pytest.raises(InputError, match="raytac calibrate markers"):
             MarkerTracker(plain, model, grid, device="cpu")
+
+
+def test_moved_places_at_rest_are_noticed(sensor: SensorSpec, grid: PadGrid) -> None:
+    """The upload of places is kept from frame to frame: not when an array is another one, or was written to."""
+    from raytac.markers.contacts import ContactCells, ContactTracker
+    from raytac.markers.fots import FotsMarkers
+
+    model, cells = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid)
+    surface = pressed(grid, [(1e-3, 0, DEEP)])
+    samples = cells.sample(surface)
+    contacts = ContactTracker(1).update(surface, samples)
+    rest = np.concatenate([marker_centres(sensor.markers), np.zeros((sensor.markers.rows * sensor.markers.columns, 1))], axis=1)
+    rest, moved = rest[None], rest[None] + (7e-4, 0, 0)
+    first = model.displacement(rest, surface, samples, contacts)
+    expected = FotsMarkers(sensor, grid, device="cpu").displacement(moved, surface, samples, contacts)
+    assert np.abs(first - expected).max() > 1e-5
+    np.testing.assert_array_equal(model.displacement(moved, surface, samples, contacts), expected)
+    rest[:] = moved
+    model.displacement(rest, surface, samples, contacts)
+    rest[..., 0] -= 7e-4
+    np.testing.assert_allclose(model.displacement(rest, surface, samples, contacts), first, atol=1e-9)
