@@ -33,6 +33,8 @@ CUDA_MINIMUM = (12, 2)
 """Oldest CUDA that Dr.Jit 1.5 takes: it switches its CUDA backend off below, and says so in its log only."""
 CUDA_REFUSED = (12, 7)
 """CUDA whose OptiX Dr.Jit 1.5 refuses."""
+LLVM_NAMED_BY_USER = bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
+"""Whether the environment already named a libLLVM when raytac started; ``raytac.optics``, which imports this first, sets it otherwise."""
 LLVM_MINIMUM = 16
 """Oldest LLVM looked for on the system: 14 is refused by Dr.Jit 1.5, and 15 was seen to abort the process."""
 

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from raytac import foreign_ipc
-from raytac.device import cuda_missing, llvm_library
+from raytac.device import LLVM_NAMED_BY_USER, cuda_missing, llvm_library
 from raytac.io.metrics import versions
 
 __all__ = ["PROBES", "Check", "Probe", "Report", "diagnose", "run_probe"]
@@ -85,9 +85,25 @@ print("matplotlib", matplotlib.__version__, "drew a figure; trimesh", trimesh.__
 
 _WARP = """
 import warp as wp
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 wp.init()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))
+"""
+
+_TETWILD = """
+import importlib.metadata, pathlib, tempfile
+import ipc
+with tempfile.TemporaryDirectory() as cache:
+    mesh = ipc.tetrahedralize(ipc.icosphere(1e-3, 1), 1e-3, pathlib.Path(cache))
+print("pytetwild", importlib.metadata.version("pytetwild"), "filled a ball with", len(mesh.tets), "tetrahedra")
+"""
+
+_REPORT = """
+import jinja2, pyarrow, skimage
+from skimage.metrics import structural_similarity
+from raytac.report.image_error import has_flip
+print("jinja2", jinja2.__version__, "pyarrow", pyarrow.__version__, "scikit-image", skimage.__version__, "imported;",
+      "FLIP is there" if has_flip() else "without flip-evaluator, so no FLIP column")
 """
 
 _DENOISER = """
@@ -159,8 +175,13 @@ class Report:
         return "\n".join([*lines, "", verdict])
 
 
-def _no_warp() -> str:
-    return "" if importlib.util.find_spec("warp") else "not installed: only the soft pad will need it"
+def _absent(needed_by: str, *packages: str) -> Callable[[], str]:
+    def reason() -> str:
+        missing = [name for name in packages if not importlib.util.find_spec(name)]
+        lack = f" (without {', '.join(missing)})" if len(packages) > 1 else ""
+        return f"not installed{lack}: only {needed_by}" if missing else ""
+
+    return reason
 
 
 def _no_denoiser() -> str:
@@ -192,7 +213,18 @@ PROBES = (
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),
     Probe("assets", _ASSETS, True, "reinstall raytac, or run it from a complete checkout"),
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
-    Probe("warp", _WARP, False, "pip install warp-lang; nothing here uses it yet", _no_warp),
+    Probe(
+        "warp", _WARP, False, "pip install 'raytac[ipc]'",
+        _absent("physics ipc (the simulated pad), raytac calibrate, and raytac compare with --pad or --markers need it", "warp"),
+    ),
+    Probe(
+        "pytetwild", _TETWILD, False, "pip install 'raytac[ipc]'",
+        _absent("soft objects on the simulated pad need it", "pytetwild", "pyvista"),
+    ),
+    Probe(
+        "report", _REPORT, False, "pip install 'raytac[report]'",
+        _absent("raytac compare needs it", "jinja2", "pyarrow", "skimage"),
+    ),
 )  # fmt: skip
 
 
@@ -230,7 +262,7 @@ def run_probe(probe: Probe, *, timeout: float = 180.0) -> Check:
 def _library_used(probe: Probe) -> str:
     if probe.name != "mitsuba-llvm":
         return ""
-    chosen = "set by DRJIT_LIBLLVM_PATH" if os.environ.get("DRJIT_LIBLLVM_PATH") else "found"
+    chosen = "set by DRJIT_LIBLLVM_PATH" if LLVM_NAMED_BY_USER else "found"
     return f"; LLVM {chosen}: {llvm_library()}"
 
 
@@ -252,5 +284,5 @@ def _check_ipc() -> Check:
     where = foreign_ipc()
     if where is None:
         return Check("ipc", True, False, "the package of that name is raytac's own", "")
-    fix = "uninstall the other package, or put raytac first on the path; only the soft pad needs it"
+    fix = "uninstall the other package, or put raytac first on the path; only the simulated pad needs it"
     return Check("ipc", False, False, f"another package answers to that name: {where}", fix)

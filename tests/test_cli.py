@@ -11,7 +11,18 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
+from raytac.errors import BackendError
 from raytac.io.metrics import read_metrics
+from raytac.sensor import TactileSensor
+
+TOUCH = """
+[object]
+kind = "sphere"
+radius_mm = 4.0
+[[trajectory]]
+kind = "indent"
+depth_mm = 0.1
+"""
 
 
 def run(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -50,6 +61,43 @@ def test_wrong_input_is_one_line_and_writes_nothing(
     for word in words:
         assert word in told.err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "args", [["press", "sphere", "--physics", "ipc"], ["press", "sphere", "--pad", "coarse"], ["calibrate", "markers"]]
+)
+def test_without_the_solver_one_line_says_what_to_install(
+    args: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in sys.modules if name == "warp" or name.startswith("ipc.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "warp", None)  # as if it were not installed
+    assert main(args) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.startswith("raytac: error: ") and told.err.count("\n") == 1
+    assert 'pip install "raytac[ipc]"' in told.err and "Warp" in told.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_the_solver_a_sensor_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)
+    with pytest.raises(BackendError, match=r'pip install "raytac\[ipc\]"'):
+        TactileSensor(physics="ipc", outputs="height", device="cpu").load("sphere")
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_warp_is_heard_only_if_asked(verbose: bool, tmp_path: Path) -> None:
+    scene = tmp_path / "touch.toml"
+    scene.write_text(TOUCH, encoding="utf-8")
+    words = ["press", str(scene), "--physics", "ipc", "--outputs", "height", "--device", "cpu", "--out", "there"]
+    done = run(*words, *(["--verbose"] if verbose else []), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    heard = done.stdout + done.stderr
+    assert ("Module ipc." in heard and "Warp" in heard) is verbose
+    if not verbose:
+        assert "Warp" not in heard and "Module" not in heard
+        assert all(line.startswith("there") for line in done.stdout.splitlines())
 
 
 BAD = ([], ["press"], ["pres", "coin"], ["press", "coin", "--device", "gpu"], ["press", "coin", "--sed", "1"])

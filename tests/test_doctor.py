@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 import raytac.doctor as doctor
 from raytac.cli import main
+from raytac.device import llvm_library
 from raytac.doctor import Check, Probe, Report, diagnose, run_probe
 
 WORKS = "print('it works')"
@@ -43,11 +48,45 @@ def test_nothing_is_started_where_there_is_nothing_to_try() -> None:
 
 
 def test_warp_that_is_not_installed_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "warp", None)
     (warp,) = (p for p in doctor.PROBES if p.name == "warp")
     check = run_probe(warp)
-    assert check.detail == "not installed: only the soft pad will need it" and not check.required
+    assert check.detail.startswith("not installed: only physics ipc") and "raytac[ipc]" in check.fix and not check.required
     assert "failed" not in Report("cpu", (check,), {}).to_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "needed_by", "extra"),
+    [
+        ("pytetwild", "pyvista", "soft objects", "raytac[ipc]"),
+        ("pytetwild", "pytetwild", "soft objects", "raytac[ipc]"),
+        ("report", "pyarrow", "raytac compare", "raytac[report]"),
+    ],
+)
+def test_each_extra_says_what_lacks_and_what_needs_it(
+    name: str, package: str, needed_by: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda asked: None if asked == package else object())
+    (found,) = (p for p in doctor.PROBES if p.name == name)
+    check = run_probe(found)
+    assert check.detail.startswith(f"not installed (without {package}): only {needed_by}")
+    assert extra in check.fix and not check.required
+
+
+@pytest.mark.parametrize("by_user", [False, True])
+def test_who_named_llvm(by_user: bool) -> None:
+    library = str(llvm_library())
+    env = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
+    code = (
+        "import os, raytac.optics\n"
+        "from raytac.doctor import PROBES, run_probe\n"
+        "from dataclasses import replace\n"
+        "assert os.environ['DRJIT_LIBLLVM_PATH']\n"
+        "print(run_probe(replace(PROBES[1], code='print()')).detail)"
+    )
+    env |= {"PYTHONPATH": str(Path(doctor.__file__).parents[1])} | ({"DRJIT_LIBLLVM_PATH": library} if by_user else {})
+    told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
+    assert f"LLVM {'set by DRJIT_LIBLLVM_PATH' if by_user else 'found'}: {library}" in told
 
 
 def test_a_broken_llvm_leaves_the_gpu_and_the_other_way_round() -> None:
@@ -81,5 +120,5 @@ def test_the_command_prints_one_json_object(
 
 
 def test_this_machine_can_do_the_default_job() -> None:
-    report = diagnose([p for p in doctor.PROBES if p.name != "warp"])
+    report = diagnose([p for p in doctor.PROBES if p.name not in ("warp", "pytetwild", "report")])
     assert report.ok, report.to_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
@@ -71,3 +72,18 @@ def test_unknown_names_are_refused_with_the_choices():
         TactileSensor(physics="ipc", pad="huge")
     with pytest.raises(InputError, match=r"pad.*physics='rigid' has none"):
         TactileSensor(physics="rigid", pad="fine")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("progress", [False, True])
+def test_a_long_press_shows_its_stages_on_a_terminal(progress, monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    TactileSensor(outputs=("height",), physics="ipc", pitch=0.2e-3, device="cpu").press(SCENE, progress=progress)
+    assert ("stage 1 of 1: indent" in screen.getvalue() and "step" in screen.getvalue()) is progress
+    if not progress:
+        assert screen.getvalue() == ""

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
-from raytac.io.options import CommonOptions
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
 from raytac.specs.press import PADS
@@ -19,7 +19,7 @@ __all__ = ["CalibrateArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateArgs(CommonOptions):
+class CalibrateArgs(SolverOptions):
     """Fit the marker motion of a sensor's pad: press the simulated pad, fit FOTS and the force field to how its surface moves.
 
     Writes marker_motion.toml (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model
@@ -41,6 +41,7 @@ class CalibrateArgs(CommonOptions):
         if self.pad not in PADS:
             raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         sensor = load_sensor(self.sensor)
+        self.prepare_solver("calibrate markers")
         name = sensor.name + ("-quick" if self.quick else "")
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
         for path in run_calibrate_markers(

@@ -10,7 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.cli.solver_options import SolverOptions
+from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare import CompareSettings, run_comparison
 from raytac.report.compare_report import write_comparison
 from raytac.sensor import PADS
@@ -19,7 +20,7 @@ __all__ = ["CompareArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareArgs(CommonOptions):
+class CompareArgs(SolverOptions):
     """Render the same gel surfaces with every optical mode, and report error beside time.
 
     Writes report.html (one file), pareto.png, a sheet of images a scene, results.parquet and metrics.json. Interrupted, it keeps what
@@ -51,6 +52,8 @@ class CompareArgs(CommonOptions):
         out = self.out if self.out is not None else Path("runs") / "compare"
         settings = self.settings()
         settings.check()
+        if settings.uses_solver:
+            self.prepare_solver("a comparison with pad or markers")
         try:
             comparison = run_comparison(settings, out)
             written = write_comparison(comparison, out, time.perf_counter() - start)

@@ -9,9 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
+from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
-from raytac.io.options import CommonOptions, parse_outputs, parse_resolution
+from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.report.press import run_press
 from raytac.sensor import INTEGRATORS, OPTICS, PADS, PHYSICS, TactileSensor, sensor_outputs
@@ -21,7 +22,7 @@ __all__ = ["PressArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PressArgs(CommonOptions):
+class PressArgs(SolverOptions):
     """Press an object into the gel and write image, layers, height and a preview to a folder.
 
     Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, traction.npy, markers.npz,
@@ -67,6 +68,8 @@ class PressArgs(CommonOptions):
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         scene = load_press(self.scene)
         physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
+        if physics == "ipc":
+            self.prepare_solver("physics='ipc'")
         sensor = TactileSensor(
             self.sensor,
             physics=physics,
@@ -82,7 +85,7 @@ class PressArgs(CommonOptions):
             optics_options=self._optics_options(),
         )
         out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)
-        for path in run_press(sensor, scene, out, outputs=outputs, start=start):
+        for path in run_press(sensor, scene, out, outputs=outputs, start=start, progress=True):
             print(path)
         return 0
 

@@ -104,9 +104,13 @@ def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "c
     """Run a press on the simulated pad of level ``pad`` and give its states in order.
 
     Raises:
+        BackendError: the solver is not installed.
         RaytacError: the press did not settle.
         SpecError: the press does not fit this sensor.
     """
+    from raytac.physics.solver import check_solver
+
+    check_solver("a press on the simulated pad")
     from raytac.physics.rigid import RigidPad
     from raytac.physics.soft import SoftPad
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from tqdm import tqdm
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.coat_mesh import DeformedCoat
@@ -113,6 +114,7 @@ class SoftPad:
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, self.parts)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
+        self._bar = tqdm(disable=True)
         self.solver: SoftContact | None = None
         """Pad and object in the contact solver; None without an object."""
         self._is_free = scene.object.dynamics == "affine"
@@ -127,7 +129,7 @@ class SoftPad:
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
-    def run(self, steps_per_stage: int = 1) -> Iterator[SoftState]:
+    def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[SoftState]:
         """States along the trajectory from the start: one before it (lifted by ``CLEARANCE``), ``steps_per_stage`` through each stage.
 
         Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
@@ -135,18 +137,22 @@ class SoftPad:
         the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to rest. A
         ``release`` lifts the object ``CLEARANCE`` above the gel.
 
+        ``progress``: on a terminal, a bar of the solver's steps with the stage beside it; how many a search takes is not known before.
+
         Raises:
             InputError: ``steps_per_stage`` below 1.
         """
         if steps_per_stage < 1:
             raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
         self.reset()
-        yield self._state(-1, "start", 1.0)
-        for index, stage in enumerate(self.scene.trajectory):
-            before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
-            for step in range(1, steps_per_stage + 1):
-                self._advance(stage, step / steps_per_stage, *before)
-                yield self._state(index, stage.kind, step / steps_per_stage)
+        with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as self._bar:
+            yield self._state(-1, "start", 1.0)
+            for index, stage in enumerate(self.scene.trajectory):
+                self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
+                before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
+                for step in range(1, steps_per_stage + 1):
+                    self._advance(stage, step / steps_per_stage, *before)
+                    yield self._state(index, stage.kind, step / steps_per_stage)
 
     def peak(self, states: Iterable[SoftState]) -> SoftState:
         """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
@@ -242,6 +248,7 @@ class SoftPad:
     def _step(self) -> None:
         assert self.solver is not None
         self._failed |= self.solver.drive(self._poses(), self._case())
+        self._bar.update()
 
     def _settle_depth(self) -> None:
         """Drive until the coat, not the barrier's shell, is at the depth."""
@@ -294,6 +301,7 @@ class SoftPad:
         self.solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
             self._failed |= self.solver.drive(self._poses())
+            self._bar.update()
             if (self.solver.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
                 return
         self._failed |= self.solver.speed() >= _STILL

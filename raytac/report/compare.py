@@ -25,6 +25,7 @@ from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
 from raytac.markers.fots import marker_motion_of
+from raytac.physics.solver import check_solver
 from raytac.report.image_error import METRICS, SSIM_BORDER, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
 from raytac.report.machine import machine
@@ -131,8 +132,13 @@ class CompareSettings:
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install raytac[report]`")
-        if (self.markers or self.pad is not None) and importlib.util.find_spec("warp") is None:
-            raise BackendError("pad and markers need the contact solver: `pip install raytac[ipc]`")
+        if self.uses_solver:
+            check_solver("a comparison with pad or markers")
+
+    @property
+    def uses_solver(self) -> bool:
+        """Whether anything is pressed into the simulated pad."""
+        return self.markers or self.pad is not None
 
 
 @dataclass(frozen=True)

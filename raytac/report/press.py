@@ -24,12 +24,18 @@ FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "p
 
 
 def run_press(
-    sensor: TactileSensor, scene: PressScene, out: Path, *, outputs: tuple[str, ...], start: float | None = None
+    sensor: TactileSensor,
+    scene: PressScene,
+    out: Path,
+    *,
+    outputs: tuple[str, ...],
+    start: float | None = None,
+    progress: bool = False,
 ) -> list[Path]:
     """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
 
-    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. Returns the files written.
-    Nothing in ``out`` changes until everything is computed and written.
+    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: a bar for a simulated
+    pad, on a terminal. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
 
     Raises:
         SpecError: the scene does not fit this sensor.
@@ -41,7 +47,7 @@ def run_press(
         began = time.perf_counter()
         rest = sensor.rest()
         setup_ms = 1e3 * (time.perf_counter() - began)
-        frame = sensor.press(scene)
+        frame = sensor.press(scene, progress=progress)
         if frame.failed is not None and frame.failed[0]:
             raise RaytacError(f"the press {scene.name!r} did not settle, or its state is not finite: nothing is written")
         if "rgb" in outputs and frame.rgb is not None:

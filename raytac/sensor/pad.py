@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.device import resolve_device
-from raytac.errors import BackendError, InputError
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.physics.solver import check_solver
 from raytac.specs import PressScene, SensorSpec
 
 if TYPE_CHECKING:
@@ -38,10 +39,9 @@ def load_pad(
         RaytacError: as the pad's own constructor.
     """
     if physics == "ipc":
-        try:
-            from raytac.physics.soft import SoftPad
-        except ImportError as error:
-            raise BackendError(f"physics='ipc' needs the contact solver ({error}): `pip install raytac[ipc]`") from error
+        check_solver("physics='ipc'")
+        from raytac.physics.soft import SoftPad
+
         return SoftPad(spec, press, pad=level, device=resolve_device(device, ray_tracing=False), **settings)
     from raytac.physics.rigid import RigidPad
 

@@ -181,11 +181,17 @@ class TactileSensor:
         return tuple(name for name in self.outputs if name in OPTICAL_OUTPUTS)
 
     def press(
-        self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
+        self,
+        scene: str | Path | PressScene,
+        *,
+        offsets: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
+        progress: bool = False,
     ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
 
-        ``offsets`` and ``depths`` are as for ``load``.
+        ``offsets`` and ``depths`` are as for ``load``. ``progress``: a simulated pad, which takes seconds to minutes, shows its stages and
+        the solver's steps in a bar on standard error, if that is a terminal.
 
         Raises:
             InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
@@ -195,7 +201,8 @@ class TactileSensor:
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, offsets=offsets, depths=depths)
-        state = pad.peak(self._followed(pad.run()))  # type: ignore[arg-type]
+        states = pad.run(progress=progress) if self.physics == "ipc" else pad.run()  # type: ignore[call-arg]
+        state = pad.peak(self._followed(states))  # type: ignore[arg-type]
         physics_ms = 1e3 * (time.perf_counter() - start)
         frame = self.update(state)
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
