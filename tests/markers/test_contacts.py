@@ -58,6 +58,22 @@ def test_centre_of_a_ball(grid: PadGrid) -> None:
     assert not contacts.shear.any() and not contacts.twist.any()
 
 
+@pytest.mark.parametrize("radius", [0.5e-3, 2e-3, 5e-3])
+def test_the_radius_counts_every_cell_that_a_disc_touches(radius: float, grid: PadGrid) -> None:
+    """Over places at random, cells touched × their area is the area of the disc swept by a cell's nodes: π R² + 2 R (a + b) + a b."""
+    cells, draw, found = ContactCells.over(grid), np.random.default_rng(0), []
+    for x, y in draw.uniform(-2e-3, 2e-3, (30, 2)):
+        contact = (((grid.x - x) ** 2)[None, :] + ((grid.y - y) ** 2)[:, None] < radius**2)[None]
+        height = (grid.rest - 1e-4 * contact).astype(np.float32)
+        surface = GelSurface(grid, height, contact, np.array([[x, y]]), pose()[None])
+        found.append(ContactTracker(1).update(surface, cells.sample(surface)).radius[0, 0])
+    a, b = ((count - 1) * pitch for count, pitch in zip(cells.nodes, grid.pitch, strict=True))
+    swept = np.sqrt(radius**2 + (2.0 * radius * (a + b) + a * b) / np.pi)
+    assert np.mean(found) == pytest.approx(swept, abs=1e-5)
+    assert 0.14e-3 < swept - radius < 0.17e-3  # the bias that it is, on this grid
+    assert np.ptp(found) < 0.15e-3
+
+
 def test_shear_and_twist_add_up_from_first_touch(grid: PadGrid) -> None:
     places = [(0.0, 0.0), (2e-4, 0.0), (2e-4, 3e-4)]
     twists = [0.3, 0.3, 0.5]

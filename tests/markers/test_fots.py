@@ -10,6 +10,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.pattern import marker_centres
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import SensorSpec, load_sensor
@@ -134,16 +135,19 @@ def test_a_wide_contact_drags_farther(grid: PadGrid, sensor: SensorSpec) -> None
 
     def reach(depth: float, radius: float) -> np.ndarray:
         scaled = replace(sensor, marker_motion=replace(MOTION, contact_radius=radius, dilate_gain=0.0))
-        return run(scaled, grid, *(pressed(grid, [(x, 0, depth)], poses=[pose(x)]) for x in (0.0, 3e-4)))[0][:, 0]
+        return run(scaled, grid, *(ball(x, depth) for x in (0.0, 3e-4)))[0][:, 0]
+
+    def ball(x: float, depth: float) -> GelSurface:
+        return pressed(grid, [(x, 0, depth)], poses=[pose(x)])
 
     out2 = (marker_centres(sensor.markers) ** 2).sum(axis=1)
     for depth in (2e-4, 8e-4):
-        radius = np.sqrt(8e-3 * depth - depth**2)
-        scaled = 3e-4 * np.exp(-MOTION.shear_lambda * (2e-3 / radius) ** 2 * out2)
-        # The contact's area is counted in cells of 0.4 mm, all that it touches.
-        cells = np.log(np.maximum(reach(depth, 2e-3), 1e-12) / 3e-4)[out2.argsort()[:9]]
-        ideal = np.log(scaled / 3e-4)[out2.argsort()[:9]]
-        assert 0.6 < cells[1:].sum() / ideal[1:].sum() < 1.0
+        # R_c counts all cells that the contact touches (test_contacts has by how much that is more than the ball's own).
+        surface = ball(3e-4, depth)
+        counted = ContactTracker(1).update(surface, ContactCells.over(grid).sample(surface)).radius[0, 0]
+        assert counted == pytest.approx(math.sqrt(8e-3 * depth - depth**2) + 0.15e-3, abs=0.04e-3)
+        expected = 3e-4 * np.exp(-MOTION.shear_lambda * (2e-3 / counted) ** 2 * out2)
+        np.testing.assert_allclose(reach(depth, 2e-3), expected, atol=1e-6)
         np.testing.assert_allclose(reach(depth, 0.0), 3e-4 * np.exp(-MOTION.shear_lambda * out2), atol=1e-6)
 
 
@@ -177,7 +181,6 @@ def test_a_sensor_that_nobody_calibrated_says_how(grid: PadGrid) -> None:
 
 def test_moved_places_at_rest_are_noticed(sensor: SensorSpec, grid: PadGrid) -> None:
     """The upload of places is kept from frame to frame: not when an array is another one, or was written to."""
-    from raytac.markers.contacts import ContactCells, ContactTracker
     from raytac.markers.fots import FotsMarkers
 
     model, cells = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid)
