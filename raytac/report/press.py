@@ -194,6 +194,7 @@ def _write_preview(
         markers=frame.markers,
         resolution=sensor.resolution,
         traction=frame.traction[0] if frame.traction is not None and "traction" in outputs else None,
+        traction_at_rest=surface.coat is not None,
         section=(float(surface.contact_centre[0, 0]), float(surface.contact_centre[0, 1])),
     )
     write_preview(path, data, sensor.spec)

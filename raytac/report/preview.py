@@ -77,6 +77,8 @@ class PreviewData:
     """(width, height) of the image [px]."""
     traction: np.ndarray | None = None
     """Force of the object on the pad per area, pad frame [Pa], shape (Ny, Nx, 3)."""
+    traction_at_rest: bool = False
+    """Whether ``traction`` is at the place that the coat has at rest (a simulated pad's), not where the contact is now."""
     section: tuple[float, float] | None = None
     """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
 
@@ -100,10 +102,15 @@ def write_preview(path: Path, data: PreviewData, sensor: SensorSpec, *, dpi: int
 
 def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
     """A figure 7.16 inches wide (two columns of a paper), three panels a row; maps in mm at one scale."""
-    panels: list[Callable[[Axes], None]] = [lambda axes: _object_panel(axes, data), lambda axes: _indentation_panel(axes, data)]
-    if data.rgb is not None:
-        panels.append(lambda axes: _image_panel(axes, data))
-    panels.append(lambda axes: _section_panel(axes, data, sensor))
+    panels: list[Callable[[Axes], None]] = [
+        lambda axes: _object_panel(axes, data),
+        lambda axes: _indentation_panel(axes, data),
+        lambda axes: _image_panel(axes, data),
+        lambda axes: _section_panel(axes, data, sensor),
+    ]
+    if data.rgb is None:
+        # The section's long label has no room beside a colour bar: it comes before the indentation, as elsewhere at the left edge.
+        panels = [panels[0], panels[3], panels[1]]
     if data.normals is not None:
         panels.append(lambda axes: _normals_panel(axes, data))
     if data.rgb is not None and data.rest_rgb is not None:
@@ -200,9 +207,13 @@ def _marker_panel(axes: Axes, data: PreviewData) -> None:
     axes.set_title(f"markers × {magnified:g}, longest {longest:.1f} px", loc="left")
 
 
+def _traction_title(kind: str, data: PreviewData) -> str:
+    return f"{kind} traction [kPa]" + (", rest place" if data.traction_at_rest else "")
+
+
 def _pressure_panel(axes: Axes, data: PreviewData) -> None:
     assert data.traction is not None
-    _map_axes(axes, data, "normal traction [kPa]")
+    _map_axes(axes, data, _traction_title("normal", data))
     pressure = -1e-3 * data.traction[..., 2]
     extent = _grid_extent_mm(data.grid)
     _colour_bar(axes, axes.imshow(pressure, extent=extent, cmap="magma", vmin=0.0, vmax=max(float(pressure.max()), 1e-3)))
@@ -211,7 +222,7 @@ def _pressure_panel(axes: Axes, data: PreviewData) -> None:
 def _shear_panel(axes: Axes, data: PreviewData) -> None:
     """Size of the shear traction, and its direction at some places where it is not small."""
     assert data.traction is not None
-    _map_axes(axes, data, "shear traction [kPa]")
+    _map_axes(axes, data, _traction_title("shear", data))
     shear = 1e-3 * data.traction[..., :2]
     size = np.hypot(shear[..., 0], shear[..., 1])
     largest = max(float(size.max()), 1e-3)

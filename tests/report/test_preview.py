@@ -66,8 +66,33 @@ def test_a_press_changes_the_picture(data: PreviewData, sensor_spec: SensorSpec,
 
 def test_what_was_not_computed_has_no_panel(data: PreviewData, sensor_spec: SensorSpec) -> None:
     bare = replace(data, rgb=None, rest_rgb=None, normals=None, object_height=None)
-    assert titles(bare, sensor_spec) == ["(a) object: none", "(b) indentation [mm]", titles(bare, sensor_spec)[2]]
-    assert titles(bare, sensor_spec)[2].startswith("(c) section")
+    assert titles(bare, sensor_spec) == ["(a) object: none", titles(bare, sensor_spec)[1], "(c) indentation [mm]"]
+    assert titles(bare, sensor_spec)[1].startswith("(b) section")
+
+
+@pytest.mark.parametrize("without", [(), ("rgb", "rest_rgb"), ("normals",), ("rgb", "rest_rgb", "normals")])
+def test_no_panel_runs_into_another(without: tuple[str, ...], data: PreviewData, sensor_spec: SensorSpec) -> None:
+    """Bars with figures of four signs, and whatever outputs are left out."""
+    traction = np.full((*data.height.shape, 3), -1e6 / 3)
+    deep = data.grid.rest + 0.25 * (data.height - data.grid.rest)
+    shown = replace(data, height=deep, traction=traction, traction_at_rest=True, **dict.fromkeys(without))
+    figure = draw_preview(shown, sensor_spec)
+    figure.set_dpi(300)
+    figure.canvas.draw()
+    found = {axes.get_title(loc="left"): axes.get_tightbbox() for axes in figure.axes if axes.get_title(loc="left")}
+    boxes = {title: box for title, box in found.items() if box is not None}
+    assert len(boxes) == 8 - len(without)
+    for a, first in boxes.items():
+        assert first.x0 >= 0.0 and first.x1 <= figure.bbox.x1, a
+        for b, second in boxes.items():
+            assert a == b or not first.overlaps(second), (a, b)
+
+
+def test_traction_says_whether_it_lies_where_the_coat_was_at_rest(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    now = replace(data, traction=np.zeros((*data.height.shape, 3)))
+    for shown, end in ((now, "[kPa]"), (replace(now, traction_at_rest=True), "[kPa], rest place")):
+        found = [title for title in titles(shown, sensor_spec) if "traction" in title]
+        assert len(found) == 2 and all(title.endswith(end) for title in found)
 
 
 def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: SensorSpec) -> None:
