@@ -133,7 +133,8 @@ class SoftPad:
         """States along the trajectory from the start: one before it (lifted by ``CLEARANCE``), ``steps_per_stage`` through each stage.
 
         Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
-        depth: what the barrier keeps between it and the object is added to the object's height. One to a force moves the object until
+        depth: what the barrier keeps between it and the object is added to the object's height; on the way the coat is there within some
+        micrometres, and never deeper than the stage's end. One to a force moves the object until
         the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to rest. A
         ``release`` lifts the object ``CLEARANCE`` above the gel.
 
@@ -200,8 +201,9 @@ class SoftPad:
         self._shear, self._twist = np.zeros((batch, 2)), np.zeros(batch)
         self._force = np.full(batch, np.nan)
         """Normal force that is being kept [N]; NaN while a depth is."""
-        self._kept = np.full(batch, 0.6 * self.mesh.d_hat)
-        """Clearance that the object is held higher by [m]."""
+        self._kept = np.full(batch, self.mesh.d_hat)
+        """Clearance that the object is held higher by [m]: at first as far as the barrier reaches, then as it was last read."""
+        self._last: SoftReading | None = None
         self._stiffness = np.full(batch, np.nan)
         self._failed: np.ndarray = self._lost.copy()
 
@@ -226,9 +228,27 @@ class SoftPad:
             self._force[:] = np.nan
             target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
             start = np.maximum(depth, 0.0)
-            self._go(start + fraction * (np.where(np.isfinite(target), target, 0.0) - start), self._shear, self._twist)
-            if fraction == 1.0:
-                self._settle_depth()
+            end = np.where(np.isfinite(target), target, 0.0)
+            self._indent(start + fraction * (end - start), is_last=fraction == 1.0)
+
+    def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
+        """Drive the coat to a depth, without passing it on the way; exactly there at the stage's end."""
+        assert self.solver is not None
+        way = depth - np.maximum(self._depth, -self.mesh.d_hat)
+        if self._last is not None:
+            # Follow the clearance, but never so fast that the object would stand still or turn back.
+            off = np.nan_to_num(self._last.clearance - self._kept)
+            self._kept = self._kept + np.clip(off, -self.mesh.d_hat, 0.5 * np.abs(way))
+        short = np.clip(way, 0.0, self.mesh.d_hat) if is_last else 0.0
+        self._go(depth - short, self._shear, self._twist)
+        if is_last:
+            clearance = self._reader.clearance(self.solver, self._poses())
+            self._kept = np.where(np.isfinite(clearance) & ~self._failed, clearance, self._kept)
+            self._depth = depth
+            self._step()
+            self._settle_depth()
+        if (way < 0.0).any():
+            self._settle_friction()
 
     def _go(self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0) -> None:
         """Drive straight to a place in steps short enough; a force that is kept is kept on the way."""
@@ -250,8 +270,12 @@ class SoftPad:
         self._failed |= self.solver.drive(self._poses(), self._case())
         self._bar.update()
 
+    def _settle_friction(self) -> None:
+        assert self.solver is not None
+        self._failed |= self.solver.settle_friction(self._poses(), self._case(), self._failed)
+
     def _settle_depth(self) -> None:
-        """Drive until the coat, not the barrier's shell, is at the depth."""
+        """Correct until the coat, not the barrier's shell, is at the depth."""
         assert self.solver is not None
         for _ in range(_REFINEMENTS):
             clearance = self._reader.clearance(self.solver, self._poses())
@@ -270,6 +294,7 @@ class SoftPad:
                 self._depth = lift - CLEARANCE
             return
         self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
+        self._settle_friction()
 
     def _load(self) -> None:
         """Let the contact bear ``self._force``: a free object by its weight, a driven one by a secant search of its depth."""

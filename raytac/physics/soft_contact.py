@@ -25,6 +25,10 @@ _CREEP = 1e-6
 """What sticks may creep by so much a step [m]."""
 _BLOCKED = 1e-3
 """Share of a step's motion that may be left undone."""
+_UNSETTLED, _SETTLINGS = 0.01, 60
+"""Friction has settled when the coat's forces change by less than this share in a step; so many steps are tried."""
+_SLIGHT = 1e-5
+"""A force too small to be judged [N]."""
 
 
 class SoftContact:
@@ -43,14 +47,14 @@ class SoftContact:
         Raises:
             RaytacError: the object overlaps the pad where it starts; the message names the surfaces.
         """
-        self.mesh, self.body = mesh, body
+        self.mesh, self.body, self._friction = mesh, body, gelpad.friction
         settings = ipc.Settings(
             dt=_TIME_STEP,
             d_hat=mesh.d_hat,
             friction=gelpad.friction,
             velocity_tolerance=_CLOSE / _TIME_STEP,
             friction_velocity=_CREEP / _TIME_STEP,
-            friction_relags=0,  # steps are small, and a stage ends with steps that go nowhere
+            friction_relags=0,  # a loading in small steps stays within the cone; what unloads is followed by settle_friction
         )
         first = starts[0]
         pose = ipc.Pose(tuple(first[:3, 3].tolist()), _quaternion(first[:3, :3]))
@@ -86,6 +90,27 @@ class SoftContact:
             self.world.set_target(OBJECT, world_from_object[:, :3, 3], _quaternions(world_from_object))
         report = self.world.step()
         return report.failed | (report.blocked > _BLOCKED)
+
+    def settle_friction(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None, failed: np.ndarray) -> np.ndarray:
+        """Stand still until friction is that of the contacts there are; poses as for ``drive``.
+
+        Friction is bounded by the normal forces with which a step begins. In an unloading those are too large, and some are of contacts
+        that the step has opened: friction would pull on the pad where nothing touches it any more. Environments that ``failed``, (B,),
+        are not waited for. Returns which failed meanwhile, (B,).
+        """
+        lost, forces = failed.copy(), self.forces()
+        for _ in range(_SETTLINGS):
+            if not forces[~lost].any():
+                break
+            lost |= self.drive(pad_from_object, world_from_pad)
+            before, forces = forces, self.forces()
+            changed, borne = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces - before, forces))
+            total = forces.sum(axis=1)
+            cone = (1.0 + _UNSETTLED) * self._friction * np.maximum(-total[:, 2], 0.0) + _SLIGHT
+            settled = (changed <= _UNSETTLED * borne) & (np.linalg.norm(total[:, :2], axis=1) <= cone)
+            if (settled | lost).all():
+                break
+        return lost
 
     def weigh(self, share: float) -> None:
         """Let gravity act with ``share`` of its strength, towards −z of the world."""

@@ -110,6 +110,34 @@ def test_a_release_leaves_the_pad_at_rest(pressed):
     assert not pad.surface(last).contact.any() and np.isnan(pad.surface(last).contact_centre).all()
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_a_release_keeps_coulombs_law_and_never_pulls(kind):
+    """At every state, the pad sheared: friction within its cone, no force that holds the object back, no vertex in tension."""
+    pad = soft(press(indent(0.6e-3), StageSpec("shear", shear=(0.0, 0.5e-3)), StageSpec("release"), kind=kind))
+    released = [state for state in pad.run(8) if state.kind == "release"]
+    loaded = [state for state in released if state.normal_force[0] > 0.0]
+    assert len(loaded) >= 2
+    assert max(np.linalg.norm(s.shear_force[0]) / s.normal_force[0] for s in loaded) > 0.3  # the law has something to bound
+    for state in released:
+        force = pad.wrench(state)[0, :3]
+        assert force[2] <= 1e-4
+        assert np.linalg.norm(force[:2]) <= 1.02 * SENSOR.gelpad.friction * -force[2] + 1e-4
+        assert state.reading is not None and state.reading.forces[..., 2].max() <= 1e-4
+    assert released[-1].normal_force[0] == 0.0
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_a_depth_is_approached_without_passing_it(kind):
+    """The states on the way go deeper one by one, bear more one by one, and end at the depth."""
+    pad = soft(press(indent(0.5e-3), kind=kind))
+    states = list(pad.run(16))[1:]
+    depth, force = (np.array([getattr(state, name)[0] for state in states]) for name in ("depth", "normal_force"))
+    assert depth.max() <= 0.5e-3 + 2e-6 and depth[-1] == pytest.approx(0.5e-3, abs=2e-6)
+    assert (np.diff(depth) > 0.0).all() and (np.diff(force[force > 0.0]) > 0.0).all()
+    commanded = 0.5e-3 * np.arange(1, 17) / 16
+    assert np.abs(depth - commanded)[4:].max() < 20e-6
+
+
 def test_running_again_forgets_the_press(pressed):
     pad, states = pressed
     again = list(pad.run(2))
