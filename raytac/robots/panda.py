@@ -48,7 +48,10 @@ _SERVO: Final = (1e4, 100.0, 70.0)
 
 @dataclass(frozen=True)
 class PandaRobot:
-    """A Panda with sensors: an editable spec, and the names in it. Put it into a scene with ``MjSpec.attach``, or compile it."""
+    """A Panda with sensors: an editable spec, and the names in it.
+
+    Add table and objects to the spec and compile it; attached to another spec, its names carry the prefix given there.
+    """
 
     spec: mujoco.MjSpec
     sensors: tuple[MountedSensor, ...]
