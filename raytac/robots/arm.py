@@ -1,0 +1,135 @@
+"""An arm in a compiled MuJoCo model: the joints that move one site, by index, and what control needs to know of them."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import mujoco
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.robots.pose import world_from_site
+
+__all__ = ["Arm"]
+
+
+class Arm:
+    """``n`` hinge or slide joints and the site that they carry, e.g. a sensor's pad frame. Holds indices only, no state.
+
+    Attributes:
+        model: the compiled model.
+        site: index of the site.
+        joints: names of the joints, in order.
+        qpos, dof: indices (n,) into ``data.qpos`` and ``data.qvel``.
+        range: limits (n, 2) of the joints [rad or m]; ±inf where MuJoCo has none.
+        motors: indices (n,) of the actuators that apply a torque to these joints, or None if some joint has none; ``ctrl`` is then
+            the torque [N·m] or force [N].
+        torque_limit: what these actuators give at most (n, 2); None with ``motors``.
+    """
+
+    def __init__(self, model: mujoco.MjModel, site: str, joints: Sequence[str]) -> None:
+        """Look the names up.
+
+        Raises:
+            InputError: an unknown site or joint (with the names there are), a joint that is no hinge or slide or that is named
+                twice, no joints, or a site that the joints do not move.
+        """
+        self.model = model
+        self.site = _index(model, mujoco.mjtObj.mjOBJ_SITE, "site", site)
+        if not joints or len(set(joints)) != len(joints):
+            raise InputError("joints", value=tuple(joints), rule="must name one joint or more, none twice")
+        ids = np.array([_index(model, mujoco.mjtObj.mjOBJ_JOINT, "joints", name) for name in joints])
+        self.joints = tuple(joints)
+        for name, kind in zip(joints, model.jnt_type[ids], strict=True):
+            if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+                raise InputError("joints", value=name, rule="must be a hinge or a slide")
+        carriers = _ancestors(model, int(model.site_bodyid[self.site]))
+        for name, body in zip(joints, model.jnt_bodyid[ids], strict=True):
+            if body not in carriers:
+                raise InputError(
+                    "joints", value=name, rule=f"must carry the site {site!r}, which is not on its branch of the robot"
+                )
+        self.qpos, self.dof = model.jnt_qposadr[ids].copy(), model.jnt_dofadr[ids].copy()
+        self.range = np.where(model.jnt_limited[ids, None] == 1, model.jnt_range[ids], (-np.inf, np.inf))
+        self.motors = _motors(model, ids)
+        self.torque_limit = None if self.motors is None else _limits(model, self.motors)
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def world_from_site(self, data: mujoco.MjData) -> np.ndarray:
+        """Pose (4, 4) of the site as the last ``mj_kinematics`` or ``mj_step`` left it."""
+        return world_from_site(data, self.site)
+
+    def jacobian(self, data: mujoco.MjData) -> np.ndarray:
+        """J (6, n), world axes: velocity of the site's origin [m/s] above its angular velocity [rad/s], per joint velocity."""
+        full = np.zeros((6, self.model.nv))
+        mujoco.mj_jacSite(self.model, data, full[:3], full[3:], self.site)
+        return full[:, self.dof]
+
+    def mass_matrix(self, data: mujoco.MjData) -> np.ndarray:
+        """Joint-space inertia M (n, n) [kg·m²], rows and columns of these joints only."""
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, data, full)
+        return full[np.ix_(self.dof, self.dof)]
+
+    def bias(self, data: mujoco.MjData) -> np.ndarray:
+        """C(q, q̇) q̇ + g(q) (n,) [N·m]: at rest, the torques that hold the arm against gravity."""
+        return data.qfrc_bias[self.dof]
+
+    def drive(self, data: mujoco.MjData, torque: np.ndarray) -> None:
+        """Ask the joints' motors for ``torque`` (n,) [N·m], as the model's actuators take it (they saturate at ``torque_limit``).
+
+        Raises ``InputError`` if a joint has no torque motor or a torque is not finite.
+        """
+        if self.motors is None:
+            raise InputError("joints", value=self.joints, rule="must all have a torque motor (<motor joint=…>) to be driven")
+        if np.shape(torque) != (len(self),) or not np.isfinite(torque).all():
+            raise InputError("torque", value=np.asarray(torque).tolist(), rule=f"must be {len(self)} finite numbers")
+        data.ctrl[self.motors] = torque
+
+
+def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, what: str, name: str) -> int:
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        count = model.nsite if kind == mujoco.mjtObj.mjOBJ_SITE else model.njnt
+        names = (mujoco.mj_id2name(model, kind, i) for i in range(count))
+        rule = f"must be the name of a {'site' if kind == mujoco.mjtObj.mjOBJ_SITE else 'joint'} of the model"
+        raise InputError(what, value=name, rule=rule, choices=[n for n in names if n])
+    return index
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
+    found = {body}
+    while body > 0:
+        body = int(model.body_parentid[body])
+        found.add(body)
+    return found
+
+
+def _motors(model: mujoco.MjModel, joints: Iterable[int]) -> np.ndarray | None:
+    """For each joint the actuator that is a plain torque: fixed unit gain, no bias, unit gear, no activation."""
+    found = []
+    for joint in joints:
+        plain = (
+            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
+            & (model.actuator_trnid[:, 0] == joint)
+            & (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
+            & (model.actuator_gainprm[:, 0] == 1.0)
+            & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
+            & (model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE))
+            & (model.actuator_gear[:, 0] == 1.0)
+        )
+        if plain.sum() != 1:
+            return None
+        found.append(int(np.flatnonzero(plain)[0]))
+    return np.array(found)
+
+
+def _limits(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray:
+    ctrl = np.where(model.actuator_ctrllimited[motors, None] == 1, model.actuator_ctrlrange[motors], (-np.inf, np.inf))
+    force = np.where(model.actuator_forcelimited[motors, None] == 1, model.actuator_forcerange[motors], (-np.inf, np.inf))
+    return np.stack([np.maximum(ctrl[:, 0], force[:, 0]), np.minimum(ctrl[:, 1], force[:, 1])], axis=1)

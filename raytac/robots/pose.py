@@ -1,0 +1,60 @@
+"""Poses as 4 × 4 matrices, checked, and what MuJoCo's data say about a site."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from raytac.errors import InputError
+
+__all__ = ["check_pose", "pose", "pose_error", "quaternion", "world_from_site"]
+
+_ORTHONORMAL = 1e-6
+"""How far RᵀR of a rotation may be from 1."""
+
+
+def pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """``target_from_source`` (4, 4) from a rotation matrix (3, 3) and a position (3,) [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
+    return matrix
+
+
+def check_pose(name: str, value: np.ndarray) -> np.ndarray:
+    """``value`` as a float64 (4, 4) rigid transform. Raises ``InputError``, naming ``name``, if it is none."""
+    try:
+        matrix = np.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(name, value=value, rule="must be a 4 x 4 matrix target_from_source") from error
+    if matrix.shape != (4, 4):
+        raise InputError(name, value=matrix.shape, rule="must have the shape (4, 4) of a matrix target_from_source")
+    if not np.isfinite(matrix).all():
+        raise InputError(name, value=matrix.tolist(), rule="must be finite")
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL:
+        raise InputError(name, value=matrix[3].tolist(), rule="must have the last row 0, 0, 0, 1")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
+        raise InputError(name, value=rotation.tolist(), rule="must hold a rotation: orthonormal columns, determinant +1")
+    return matrix
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion w, x, y, z (4,) of a rotation matrix (3, 3)."""
+    result = np.zeros(4)
+    mujoco.mju_mat2Quat(result, np.ascontiguousarray(rotation, float).ravel())
+    return result
+
+
+def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
+    """Pose (4, 4) of a site by its index, as the last ``mj_kinematics`` (or step) left it."""
+    return pose(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
+
+
+def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
+    """What leads from b to a (6,), in world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long."""
+    turn = np.zeros(3)
+    mujoco.mju_quat2Vel(turn, quaternion(world_from_a[:3, :3] @ world_from_b[:3, :3].T), 1.0)
+    return np.concatenate([world_from_a[:3, 3] - world_from_b[:3, 3], turn])
