@@ -26,7 +26,7 @@ from raytac.physics.press_plan import (
     scene_parts,
 )
 from raytac.physics.rig import PressRig
-from raytac.specs.press import PressScene
+from raytac.specs.press import DYNAMICS, PressScene
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CLEARANCE", "ContactState", "RigidPad"]
@@ -89,6 +89,10 @@ class RigidPad:
         self.sensor, self.scene, self.seed, self.num_envs = sensor, scene, seed, num_envs
         if num_envs < 1:
             raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
+        if scene.object.dynamics == "soft":
+            rule = "is for the simulated pad, physics='ipc': the rigid pad's object does not give way"
+            choices = tuple(name for name in DYNAMICS if name != "soft")
+            raise SpecError(rule, file=scene.source, key="object.dynamics", value="soft", choices=choices)
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
         self._surround = ElasticSurround(self.grid)

@@ -38,7 +38,8 @@ class SoftReading:
     poses: np.ndarray
     """``pad_from_object`` (B, 4, 4), lowered by the clearance."""
     underside: np.ndarray
-    """Underside of the object there over the grid [m], shape (B, Ny, Nx), where it is below the pad's highest point; else inf."""
+    """Underside of the object there over the grid [m], shape (B, Ny, Nx), inf where it is not. Of a rigid object, what lies wholly
+    above the pad's highest point may be left out; of a soft one, all is there, in contact or not."""
 
 
 class SoftReader:
@@ -78,6 +79,7 @@ class SoftReader:
             coat[b, :, 2] += fit.shift
             height[b] = self._heights(places, coat[b])
             if not np.isfinite(fit.clearance):
+                undersides[b] = self._underside(contact, poses[b], 0.0, b)
                 continue
             clearance[b] = fit.clearance
             poses[b, 2, 3] -= fit.clearance
@@ -114,6 +116,7 @@ class SoftReader:
     def _underside(self, contact: SoftContact, shown: np.ndarray, clearance: float, b: int) -> np.ndarray:
         """Underside of the shown object over the grid [m], (Ny, Nx)."""
         parts, pose = self._object(contact, shown, b)
-        if parts is not self.parts:
-            pose[2, 3] = -clearance
-        return object_height(parts, pose[None], self.grid.x, self.grid.y, below=float(self.grid.rest.max()))[0]
+        if parts is self.parts:
+            return object_height(parts, pose[None], self.grid.x, self.grid.y, below=float(self.grid.rest.max()))[0]
+        pose[2, 3] = -clearance
+        return object_height(parts, pose[None], self.grid.x, self.grid.y)[0]

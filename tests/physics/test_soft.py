@@ -257,6 +257,18 @@ def test_a_soft_object_gives_way():
     assert squash.surface(two).indentation.max() < 0.8 * hard.surface(one).indentation.max()
     under = squash.object_height(squash.surface(two))
     assert under is not None and np.abs((under - squash.surface(two).height)[squash.surface(two).contact]).max() < 3e-5
+    # All of the ball is there, up to its equator and far from the contact, whether it touches or not.
+    start = next(iter(squash.run()))
+    for shown in (squash.object_height(squash.surface(start)), under):
+        assert shown is not None
+        there = np.isfinite(shown[0])
+        assert there.sum() * PITCH**2 == pytest.approx(math.pi * RADIUS**2, rel=0.05)
+        assert np.ptp(shown[0][there]) > 0.5 * RADIUS
+
+
+def test_the_rigid_pad_refuses_a_soft_object():
+    with pytest.raises(SpecError, match=r"object\.dynamics.*physics='ipc'.*kinematic, affine"):
+        RigidPad(SENSOR, press(indent(0.4e-3), dynamics="soft", youngs_modulus=2e5), pitch=PITCH)
 
 
 def test_force_against_depth_is_the_bonded_layers():
