@@ -66,7 +66,7 @@ Scene = tuple[Layout, NDArray[np.float64], float]
 
 def press_scenes() -> Iterator[Scene]:
     for cells in ((3, 4, 1), (8, 10, 2), (16, 20, 3), (26, 32, 5), (40, 48, 8)):
-        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells)
+        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells, cut="alike")
         ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP - SUNK)))
         layout = build_layout([ipc.SoftBody("pad", mesh, MATERIAL), ball], 0.0, {}, [])
         yield layout, layout.vert_local + layout.frame_pose[layout.vert_body, :3], D_HAT
@@ -74,7 +74,7 @@ def press_scenes() -> Iterator[Scene]:
 
 def plate_scenes() -> Iterator[Scene]:
     for cells in ((2, 3, 1), (4, 5, 1), (8, 10, 2), (16, 20, 3), (26, 32, 5)):
-        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells)
+        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells, cut="alike")
         used, faces = np.unique(surface_of(mesh.tets), return_inverse=True)
         aside = 0.3 * SIZE[0] / cells[0]
         plate = ipc.KinematicBody(
@@ -88,7 +88,7 @@ def mat_scenes() -> Iterator[Scene]:
     for n in (2, 3, 4, 6, 8, 12, 16, 24, 32, 40, 56):
         side, h = 1.0, 1.0 / n
         line = np.linspace(0.0, side, n + 1)
-        mesh = ipc.box_mesh(line, line - side / 2, np.array([0.0, h]))
+        mesh = ipc.box_mesh(line, line - side / 2, np.array([0.0, h]), cut="alike")
         layout = build_layout([ipc.SoftBody("mat", mesh, MATERIAL, self_contact=True)], 0.0, {}, [])
         angle = 2 * math.pi * TURNS * layout.vert_local[:, 0]
         c, s, (x, y, z) = np.cos(angle), np.sin(angle), layout.vert_local.T

@@ -48,6 +48,8 @@ from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 
+CUT: ipc.Cut = "alike"
+"""Cells of the pad (``ipc.box_mesh``): docs/performance.md has figures of these, also pyuipc's."""
 BATCHED = 1400
 """The most vertices that are measured with more than one environment."""
 
@@ -107,7 +109,7 @@ def memory_in_use(device: str) -> int:
 def compile_kernels(device: str) -> float:
     """Seconds until a first small press has taken two steps: mostly compiling or loading kernels."""
     begin = time.perf_counter()
-    world = press_world((2, 2, 1), ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION), 1, device)
+    world = press_world((2, 2, 1), ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION), 1, device, CUT)
     for step in range(2):
         world.set_target("ball", (0, 0, ball_height(step)))
         world.step()
@@ -151,7 +153,7 @@ def run(world_of: Iterator[tuple[ipc.World, str]], num_envs: int, device: str, l
 def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Down for ``PRESS`` steps, then at rest."""
     settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, cuda_graph=cuda_graph)
-    world = press_world(CELLS[size], settings, envs, args.device)
+    world = press_world(CELLS[size], settings, envs, args.device, CUT)
     share = 1 - args.spread * np.random.default_rng(args.seed).random(envs)
     for step in range(PRESS + HOLD):
         target = np.zeros((envs, 3))

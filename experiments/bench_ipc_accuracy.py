@@ -6,8 +6,8 @@
 The press of ``bench_ipc.py`` for each mesh and velocity tolerance; at the end of the way down the outer surface is compared with that of
 the ``--reference`` mesh (mirrored cells) at ``--reference-tolerance`` and a linear tolerance of 1e-4, on a common grid of 0.1 mm: under
 the contact (as far out as the reference carries load) and around it (twice as far). The sphere, d̂ and κ are the same in all of them, so
-neither its facets nor the stand-off count as error. ``alike`` cells are those of ``ipc.domed_pad``, all cut the same way; ``mirrored``
-ones those of raytac's soft pad. The reference is kept in DIR/references by content. docs/performance.md says what came out.
+neither its facets nor the stand-off count as error. ``ipc.box_mesh`` says how cells are cut ``alike`` and ``mirrored``. The reference is
+kept in DIR/references by content. docs/performance.md says what came out.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.report.machine import machine
 
-KINDS = ("alike", "mirrored")
-"""How cells are cut: the benchmark's way, and raytac's."""
+KINDS: tuple[ipc.Cut, ...] = ("alike", "mirrored")
+"""How cells are cut, see ``ipc.box_mesh``: as in ``bench_ipc.py``, and as in raytac's soft pad."""
 PITCH = 1e-4
 """Of the grid on which surfaces are compared [m]."""
 
@@ -123,9 +123,9 @@ def outer_surface(world: ipc.World) -> tuple[NDArray[np.int64], NDArray[np.int64
     return vertices[top].astype(np.int64), number[faces[top[faces].all(axis=1)]].astype(np.int64)
 
 
-def press(cells: tuple[int, int, int], mirrored: bool, settings: ipc.Settings, device: str) -> Press:
+def press(cells: tuple[int, int, int], cut: ipc.Cut, settings: ipc.Settings, device: str) -> Press:
     """Down and hold, timed."""
-    world = press_world(cells, settings, 1, device, mirrored)
+    world = press_world(cells, settings, 1, device, cut)
     vertices, triangles = outer_surface(world)
     seconds, busy, newton, converged = [], [], [], True
     points, radius, force = np.zeros(0), 0.0, 0.0
@@ -161,7 +161,7 @@ def press(cells: tuple[int, int, int], mirrored: bool, settings: ipc.Settings, d
 
 def reference_press(size: int, tolerance: float, device: str, folder: Path) -> Press:
     """The fine solution, computed unless ``folder`` holds one of the same mesh, sphere, drive and settings."""
-    mesh, base = press_pad(CELLS[size], mirrored=True)
+    mesh, base = press_pad(CELLS[size], "mirrored")
     settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=tolerance, linear_tolerance=1e-4)
     digest = hashlib.sha256(repr((asdict(settings), asdict(MATERIAL), RADIUS, GAP, PRESS, HOLD)).encode())
     ball = ball_surface()
@@ -174,7 +174,7 @@ def reference_press(size: int, tolerance: float, device: str, folder: Path) -> P
         with np.load(path) as held:
             return Press(**{name: held[name] if held[name].ndim else held[name].item() for name in held.files})
     print(f"reference: {len(mesh.vertices)} vertices at {tolerance:g} m/s, kept as {path}", flush=True)
-    done = press(CELLS[size], True, settings, device)
+    done = press(CELLS[size], "mirrored", settings, device)
     folder.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial.npz")
     np.savez(partial, **asdict(done))
@@ -291,7 +291,8 @@ def vertices(size: int) -> int:
 def main(args: Args) -> int:
     begin = time.perf_counter()
     sizes = parse_numbers(args.sizes, "sizes", tuple(CELLS))
-    tolerances, kinds = parse_names(args.tolerances, "tolerances"), parse_names(args.cells, "cells", KINDS)
+    tolerances, wanted_kinds = parse_names(args.tolerances, "tolerances"), parse_names(args.cells, "cells", KINDS)
+    kinds: tuple[ipc.Cut, ...] = tuple(kind for kind in KINDS if kind in wanted_kinds)
     for tolerance in tolerances:
         try:
             good = 0 < float(tolerance) < np.inf
@@ -320,9 +321,7 @@ def main(args: Args) -> int:
         own = size == args.reference and kind == "mirrored"
         wanted = [t for t in tolerances if not own or float(t) > args.reference_tolerance]
         settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION)
-        found = {
-            t: press(CELLS[size], kind == "mirrored", replace(settings, velocity_tolerance=float(t)), args.device) for t in wanted
-        }
+        found = {t: press(CELLS[size], kind, replace(settings, velocity_tolerance=float(t)), args.device) for t in wanted}
         least = min(found, key=float, default="")
         for tolerance, run in found.items():
             key = f"{device}.{size}.{tolerance}" if kind == "alike" else f"{device}.{kind}.{size}.{tolerance}"

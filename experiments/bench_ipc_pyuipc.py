@@ -33,6 +33,7 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from bench_ipc import CUT
 from bench_ipc_scenes import (
     CELLS,
     D_HAT,
@@ -197,7 +198,7 @@ def measure_press(size: int, envs: int, preconditioner: str, args: Args) -> dict
     from uipc.geometry import label_surface, trimesh
 
     begin, memory = time.perf_counter(), used_memory_mb()
-    mesh, base = press_pad(CELLS[size])
+    mesh, base = press_pad(CELLS[size], CUT)
     ball = ball_surface()
     columns = int(np.ceil(np.sqrt(envs)))
     centre = np.zeros((envs, 3))

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ipc
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
-from raytac.specs.sensor import GelpadSpec
 
 __all__ = [
     "CELLS",
@@ -47,21 +45,14 @@ PRESS, HOLD, DT, D_HAT, FRICTION = 20, 5, 0.01, 1e-4, 0.5
 """Steps down, steps at rest, time step [s], d̂ [m] and μ."""
 
 
-def press_pad(cells: tuple[int, int, int], mirrored: bool = False) -> tuple[ipc.TetMesh, NDArray[np.int64]]:
+def press_pad(cells: tuple[int, int, int], cut: ipc.Cut) -> tuple[ipc.TetMesh, NDArray[np.int64]]:
     """The flat pad and its bonded vertices: those of the base.
 
     Args:
-        cells: in x, y and z; with ``mirrored`` those in x and y are even, and y follows from x.
-        mirrored: every cell is cut into the mirror image of its neighbour's tetrahedra, as in raytac's soft pad, which locks less.
+        cells: in x, y and z.
+        cut: how a cell is cut into tetrahedra, see ``ipc.box_mesh``.
     """
-    if mirrored:
-        level = PadLevel(SIZE[0] / cells[0], cells[2], 1.0, 1.0, D_HAT)
-        flat = (math.inf, math.inf)
-        mesh = pad_mesh(
-            GelpadSpec(SIZE, THICKNESS, flat, MATERIAL.young, MATERIAL.poisson, MATERIAL.density, FRICTION), level
-        ).tets
-    else:
-        mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells)
+    mesh = ipc.domed_pad(SIZE, THICKNESS, (math.inf, math.inf), cells, cut=cut)
     return mesh, ipc.vertices_in_box(mesh, (-1, -1, -THICKNESS), (1, 1, -THICKNESS))
 
 
@@ -75,11 +66,9 @@ def ball_height(step: int) -> float:
     return RADIUS + GAP - TRAVEL * min(step + 1, PRESS) / PRESS
 
 
-def press_world(
-    cells: tuple[int, int, int], settings: ipc.Settings, num_envs: int, device: str, mirrored: bool = False
-) -> ipc.World:
+def press_world(cells: tuple[int, int, int], settings: ipc.Settings, num_envs: int, device: str, cut: ipc.Cut) -> ipc.World:
     """The pad and, above it, the sphere."""
-    mesh, base = press_pad(cells, mirrored)
+    mesh, base = press_pad(cells, cut)
     pad = ipc.SoftBody("pad", mesh, MATERIAL, bonded=base)
     ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP)))
     return ipc.World([pad, ball], settings, num_envs=num_envs, device=device)
@@ -141,7 +130,7 @@ def peg_world(num_envs: int, device: str, cuda_graph: bool = True) -> ipc.World:
     settings = ipc.Settings(
         dt=PEG_DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=1e-3, friction_velocity=1e-3, cuda_graph=cuda_graph
     )
-    mesh = ipc.domed_pad(PEG_PAD, PEG_THICKNESS, (math.inf, math.inf), PEG_CELLS)
+    mesh = ipc.domed_pad(PEG_PAD, PEG_THICKNESS, (math.inf, math.inf), PEG_CELLS, cut="alike")
     base = ipc.vertices_in_box(mesh, (-1, -1, -PEG_THICKNESS), (1, 1, -PEG_THICKNESS))
     left, right = _pad_poses()
     peg = ipc.box_surface((PEG_SIDE, PEG_SIDE, PEG_LENGTH))

@@ -144,7 +144,7 @@ def time_calls(call: Callable[[], None], device: wp.Device) -> float:
 
 def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict[str, Metric]:
     """One press."""
-    mesh, base = press_pad(CELLS[size])
+    mesh, base = press_pad(CELLS[size], "alike")
     pad = ipc.SoftBody("pad", mesh, replace(MATERIAL, poisson=poisson), bonded=base)
     ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP)))
     settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, preconditioner="block_jacobi")

@@ -186,7 +186,7 @@ PAD_SPHERE = 50 * PAD_CONTACT
 
 def press_pad(cells: int, tool: str, device: str) -> tuple[Pressed, float]:
     """A flat pad of 20 × 20 × 4 mm of cubic cells, ``cells`` to its thickness, bonded below; and the oracle's force at that depth."""
-    mesh = ipc.domed_pad((5 * PAD, 5 * PAD), PAD, (np.inf, np.inf), (5 * cells, 5 * cells, cells))
+    mesh = ipc.domed_pad((5 * PAD, 5 * PAD), PAD, (np.inf, np.inf), (5 * cells, 5 * cells, cells), cut="alike")
     held = ipc.vertices_in_box(mesh, (-1, -1, -PAD), (1, 1, -PAD))
     layer = BondedLayer(PAD_SOLID, PAD)
     rings = 2 * round(cells * PAD_CONTACT / PAD) + 6
@@ -267,7 +267,7 @@ def causes(device: str) -> dict[str, Metric]:
 def block_pressure(device: str) -> dict[str, Metric]:
     """Two blocks of different meshes pressed together (ν = 0, so the exact pressure is uniform): spread of the stress inside."""
     seven, six, four = (np.linspace(0, 10e-3, n) for n in (7, 6, 4))
-    lower, upper = ipc.box_mesh(seven, seven, four), ipc.box_mesh(six, six, four)
+    lower, upper = (ipc.box_mesh(line, line, four, cut="alike") for line in (seven, six))
     material = ipc.Material(SOLID.young, 0.0)
     pose = ipc.Pose((0, 0, 10.1e-3))
     bodies = [
@@ -299,7 +299,7 @@ def cantilever_error(cells: int, device: str = "cpu") -> float:
     """Relative error of the sag of a clamped beam of length 5 heights under its weight against Timoshenko's, ν = 0."""
     length, height, young, density, g = 0.1, 0.02, 1e6, 1000.0, 0.05
     x, y = np.linspace(0, length, 5 * cells + 1), np.linspace(0, height, cells + 1)
-    mesh = ipc.box_mesh(x, y, y)
+    mesh = ipc.box_mesh(x, y, y, cut="alike")
     clamped = ipc.vertices_in_box(mesh, (0, -1, -1), (0, 1, 1))
     beam = ipc.SoftBody("beam", mesh, ipc.Material(young, 0.0, density), bonded=clamped)
     settings = ipc.Settings(dt=1e3, gravity=(0, 0, -g), velocity_tolerance=1e-12, linear_tolerance=1e-8, max_linear=20000)

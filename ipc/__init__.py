@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ipc.bodies import AffineBody, HalfSpace, KinematicBody, Pose, SoftBody, vertices_in_box, vertices_near
 from ipc.errors import IpcError, OverlapError, SolverError
 from ipc.materials import Material, Stiff
-from ipc.meshes import TetMesh, TriMesh, box_mesh, box_surface, domed_pad, graded, icosphere
+from ipc.meshes import Cut, TetMesh, TriMesh, box_mesh, box_surface, domed_pad, graded, icosphere
 from ipc.report import ContactPairs, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.tetwild import tetrahedralize
@@ -23,6 +23,7 @@ __all__ = [
     "RAYTAC_IPC_MARKER",
     "AffineBody",
     "ContactPairs",
+    "Cut",
     "HalfSpace",
     "IpcError",
     "KinematicBody",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ipc.errors import IpcError
 
 __all__ = [
+    "Cut",
     "TetMesh",
     "TriMesh",
     "box_mesh",
@@ -87,17 +89,36 @@ def graded(length: float, count: int, ratio: float = 1.0) -> NDArray[np.float64]
     return np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
 
 
-# The six tetrahedra of a cube around its diagonal 0-7 (corner k has bits x = k & 1, y = k & 2, z = k & 4). Faces of neighbouring
-# cells match without flipping every other cell.
+Cut = Literal["mirrored", "alike"]
+"""How the cells of a grid are cut into tetrahedra; see ``box_mesh``."""
+
+# The six tetrahedra of a cube around its diagonal 0-7 (corner k has bits x = k & 1, y = k & 2, z = k & 4). Opposite faces of the cube have
+# the same diagonals, so neighbouring cells match whether or not they are mirrored in the face between them.
 _KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 
 
-def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, mirrored: bool = False) -> TetMesh:
+def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, cut: Cut = "mirrored") -> TetMesh:
     """A box of tetrahedra on the grid of the three rising coordinate lists [m]; six tetrahedra a cell.
 
-    Vertex (i, j, k) has index (k·ny + j)·nx + i. With ``mirrored``, the diagonals are reflected in the planes between the cell halves
-    (an even cell count in x and y makes a mesh that is symmetric in both).
+    Vertex (i, j, k) has index (k·ny + j)·nx + i.
+
+    Args:
+        x, y, z: grid lines [m], at least two each.
+        cut: which way the diagonals of the cells run.
+
+            - ``"mirrored"``: each cell is the mirror image of its neighbours, in all three directions. Two by two by two cells are the
+              barycentric subdivision of a cube, as the Powell-Sabin split is of a triangle; there, continuous piecewise linear fields
+              without divergence approximate well (S. Zhang, J. Comput. Math. 26, 2008, in two dimensions; that it helps in three is seen
+              and not proven). Locks little where ν nears 0.5; docs/soft-pad.md has figures.
+            - ``"alike"``: all diagonals run the same way, but for a reflection in the middle of x and of y. Locks where ν nears 0.5.
+
+            With even cell counts in x and y either mesh is symmetric about its middle planes, if the grid lines are.
+
+    Raises:
+        IpcError: grid lines that do not rise, or an unknown ``cut``.
     """
+    if cut not in get_args(Cut):
+        raise IpcError(f"cut = {cut!r}: it must be one of {', '.join(get_args(Cut))}")
     axes = [np.asarray(a, dtype=np.float64) for a in (x, y, z)]
     for name, axis in zip("xyz", axes, strict=True):
         if axis.ndim != 1 or len(axis) < 2 or not (np.diff(axis) > 0).all():
@@ -105,25 +126,27 @@ def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, mirrored: bool = False) -
     nx, ny, nz = (len(a) for a in axes)
     zz, yy, xx = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     vertices = np.stack([xx, yy, zz], axis=-1).reshape(-1, 3)
-    k, j, i = np.meshgrid(np.arange(nz - 1), np.arange(ny - 1), np.arange(nx - 1), indexing="ij")
-    flip_x = (i.ravel() >= (nx - 1) / 2) if mirrored else np.zeros(i.size, bool)
-    flip_y = (j.ravel() >= (ny - 1) / 2) if mirrored else np.zeros(i.size, bool)
-    tets = []
-    for tet in _KUHN:
-        corners = []
-        for corner in tet:
-            dx = np.where(flip_x, 1 - (corner & 1), corner & 1)
-            dy = np.where(flip_y, 1 - (corner >> 1 & 1), corner >> 1 & 1)
-            corners.append(((k.ravel() + (corner >> 2 & 1)) * ny + j.ravel() + dy) * nx + i.ravel() + dx)
-        tets.append(np.stack(corners, axis=-1))
-    cells = np.stack(tets, axis=1).reshape(-1, 4)
-    negative = tet_volumes(vertices, cells) < 0
-    cells[negative] = cells[negative][:, [0, 1, 3, 2]]
-    return TetMesh(vertices, cells.astype(np.int32))
+    k, j, i = (a.ravel() for a in np.meshgrid(np.arange(nz - 1), np.arange(ny - 1), np.arange(nx - 1), indexing="ij"))
+    # Layers are counted from the top, so that the pattern of the face that is touched does not depend on their number.
+    patterns = {"mirrored": (i % 2, j % 2, (nz - 2 - k) % 2), "alike": (2 * i >= nx - 1, 2 * j >= ny - 1, np.zeros_like(k))}
+    corner = np.arange(8)
+    at_x, at_y, at_z = (
+        start[:, None] + ((corner >> bit & 1) ^ flip[:, None].astype(int))
+        for bit, (start, flip) in enumerate(zip((i, j, k), patterns[cut], strict=True))
+    )
+    tets = ((at_z * ny + at_y) * nx + at_x)[:, _KUHN].reshape(-1, 4)
+    inside_out = tet_volumes(vertices, tets) < 0
+    tets[inside_out] = tets[inside_out][:, [0, 1, 3, 2]]
+    return TetMesh(vertices, tets)
 
 
 def domed_pad(
-    size: tuple[float, float], thickness: float, radius: tuple[float, float], cells: tuple[int, int, int], grading: float = 1.0
+    size: tuple[float, float],
+    thickness: float,
+    radius: tuple[float, float],
+    cells: tuple[int, int, int],
+    grading: float = 1.0,
+    cut: Cut = "mirrored",
 ) -> TetMesh:
     """A pad whose outer surface z = 0 at the centre falls off as a toroidal cap; the base is flat at z = −``thickness``.
 
@@ -133,13 +156,14 @@ def domed_pad(
         radius: radius of curvature along x and along y [m]; ``math.inf`` is flat.
         cells: number of cells in x, y and z.
         grading: ratio of each layer's height to the one below it; below 1 the layers get thinner towards the outer surface.
+        cut: how a cell is cut into tetrahedra, see ``box_mesh``.
 
     Raises:
         IpcError: if the edge of the dome would fall below the base.
     """
     x = np.linspace(-size[0] / 2, size[0] / 2, cells[0] + 1)
     y = np.linspace(-size[1] / 2, size[1] / 2, cells[1] + 1)
-    mesh = box_mesh(x, y, graded(thickness, cells[2], grading) - thickness, mirrored=True)
+    mesh = box_mesh(x, y, graded(thickness, cells[2], grading) - thickness, cut)
     v = mesh.vertices.copy()
 
     def sag(offset: NDArray[np.float64], r: float) -> NDArray[np.float64]:

@@ -13,9 +13,6 @@ from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["PAD_LEVELS", "PadLevel", "PadMesh", "pad_mesh"]
 
-_KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
-"""Six tetrahedra about the diagonal from corner 0 to 7 of a cube (corner k has the bits x, y, z of k)."""
-
 
 @dataclass(frozen=True)
 class PadLevel:
@@ -64,10 +61,8 @@ class PadMesh:
 def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
     """Cut the gelpad into tetrahedra, six a cell of a grid that follows the dome.
 
-    The six tetrahedra of a cell are those of its neighbour mirrored in the face between them. Linear tetrahedra all cut the same way lock
-    where the gel is nearly incompressible; cut so, with the faces at which they meet in planes, they hold enough volume-preserving motions
-    (the pattern is a barycentric subdivision, as in S. Zhang, J. Comput. Math. 2008, on Powell-Sabin grids; docs/soft-pad.md has the
-    figures).
+    Cells are mirror images of their neighbours (``ipc.box_mesh``): cut all the same way they would lock where the gel is nearly
+    incompressible (docs/soft-pad.md has the figures).
 
     Args:
         gelpad: size, thickness, dome, and what is bonded to the case: the back, or the back and the sides.
@@ -82,7 +77,7 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
         level = PAD_LEVELS[level]
     x, y = (_lines(size, level) for size in gelpad.size)
     z = -ipc.graded(gelpad.thickness, level.layers, level.layer_spread ** (1.0 / max(level.layers - 1, 1)))[::-1]
-    tets = _mirrored_cells(x, y, z)
+    tets = ipc.box_mesh(x, y, z, cut="mirrored")
     vertices = tets.vertices.copy()
     vertices[:, 2] -= gelpad.sag(vertices[:, 0], vertices[:, 1]) * (1.0 + vertices[:, 2] / gelpad.thickness)
     per_layer = len(x) * len(y)
@@ -101,33 +96,6 @@ def _lines(size: float, level: PadLevel) -> np.ndarray:
         raise InputError("pad", value=level, rule=f"must leave at least two cells over the pad's {size} m")
     ends = ipc.graded(0.5 * size, half, level.spread ** (1.0 / max(half - 1, 1)))
     return np.concatenate([-ends[:0:-1], ends])
-
-
-def _mirrored_cells(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> ipc.TetMesh:
-    """A box on the grid of three rising coordinate lists; vertex (i, j, k) has the number (k·ny + j)·nx + i."""
-    nx, ny, nz = len(x), len(y), len(z)
-    above, across, along = np.meshgrid(z, y, x, indexing="ij")
-    vertices = np.stack([along, across, above], axis=-1).reshape(-1, 3)
-    k, j, i = (a.ravel() for a in np.meshgrid(*(np.arange(n - 1) for n in (nz, ny, nx)), indexing="ij"))
-    # Counted from the face that is touched, so that its pattern does not depend on the number of layers.
-    flip_x, flip_y, flip_z = i % 2, j % 2, (nz - 2 - k) % 2
-    corner = np.arange(8)
-    at_x, at_y, at_z = (
-        start[:, None] + ((corner >> bit & 1) ^ flip[:, None])
-        for start, flip, bit in ((i, flip_x, 0), (j, flip_y, 1), (k, flip_z, 2))
-    )
-    number = (at_z * ny + at_y) * nx + at_x
-    cells = number[:, _KUHN]
-    # An odd number of mirrored axes turns a cell inside out.
-    inside_out = ((flip_x + flip_y + flip_z) % 2).astype(bool)[:, None] ^ _inverted()[None, :]
-    cells[inside_out] = cells[inside_out][:, [0, 1, 3, 2]]
-    return ipc.TetMesh(vertices, cells.reshape(-1, 4))
-
-
-def _inverted() -> np.ndarray:
-    """Which of the tetrahedra of ``_KUHN`` have a negative volume, shape (6,)."""
-    corners = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)[_KUHN]
-    return np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
 
 
 def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,11 +11,18 @@ import pytest
 import ipc
 from ipc.meshes import surface_of, surface_topology, tet_volumes
 from ipc.tetwild import tetrahedralize
+from tests.ipc.conftest import bonded_pad
+
+CUTS = get_args(ipc.Cut)
 
 
-def test_box_fills_its_volume_with_a_closed_outward_surface() -> None:
-    mesh = ipc.box_mesh(np.linspace(0, 2, 4), np.linspace(0, 1, 3), ipc.graded(0.5, 3, 0.7), mirrored=True)
-    assert tet_volumes(mesh.vertices, mesh.tets).sum() == pytest.approx(1.0, rel=1e-13)
+@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize("cells", [(1, 1, 1), (3, 2, 3), (4, 6, 2)])
+def test_box_fills_its_volume_with_a_closed_outward_surface(cells: tuple[int, int, int], cut: ipc.Cut) -> None:
+    x, y, z = cells
+    mesh = ipc.box_mesh(np.linspace(0, 2, x + 1), np.linspace(0, 1, y + 1), ipc.graded(0.5, z, 0.7), cut)
+    volumes = tet_volumes(mesh.vertices, mesh.tets)
+    assert len(volumes) == 6 * x * y * z and (volumes > 0).all() and volumes.sum() == pytest.approx(1.0, rel=1e-13)
     faces = surface_of(mesh.tets)
     corners = mesh.vertices[faces]
     assert np.linalg.det(corners).sum() / 6 == pytest.approx(1.0, rel=1e-13)
@@ -24,12 +32,75 @@ def test_box_fills_its_volume_with_a_closed_outward_surface() -> None:
     assert topology.vertex_area.sum() == pytest.approx(area) and topology.edge_area.sum() == pytest.approx(area)
 
 
-def test_mirrored_box_is_symmetric() -> None:
-    mesh = ipc.domed_pad((2.0, 2.0), 0.5, (5.0, 7.0), (4, 4, 2))
-    flipped = mesh.vertices * [-1, 1, 1]
+@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize("cells", [(1, 2, 3), (5, 4, 3)])
+def test_inner_faces_are_shared_by_two_cells_on_either_side(cells: tuple[int, int, int], cut: ipc.Cut) -> None:
+    mesh = ipc.box_mesh(*(np.linspace(0, n, n + 1) for n in cells), cut=cut)
+    faces = np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    apex = mesh.vertices[mesh.tets.ravel()]
+    found, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    middles = mesh.vertices[found].mean(axis=1)
+    outer = ((middles < 1e-9) | (middles > np.array(cells) - 1e-9)).any(axis=1)
+    assert (count[outer] == 1).all() and (count[~outer] == 2).all() and outer.any() and (~outer).any()
+    a, b, c = (mesh.vertices[found[which.ravel(), k]] for k in range(3))
+    side = np.sign(np.einsum("fi,fi->f", np.cross(b - a, c - a), apex - a))
+    assert (np.bincount(which.ravel(), weights=side)[~outer] == 0).all()
+
+
+def test_neighbouring_cells_are_mirror_images() -> None:
+    """Two halves of a box of two cells, in each direction; only some of them with cells cut alike."""
+
+    def halves_match(axis: int, cut: ipc.Cut) -> bool:
+        cells = np.where(np.arange(3) == axis, 6, 1)
+        mesh = ipc.box_mesh(*(np.linspace(0, n, n + 1) for n in cells), cut=cut)
+        middles = mesh.vertices[mesh.tets].mean(axis=1)
+        flip = np.where(np.arange(3) == axis, -1.0, 1.0)
+        sets = []
+        for k in range(6):
+            inside = middles[(middles[:, axis] > k) & (middles[:, axis] < k + 1)].copy()
+            inside[:, axis] -= k + 0.5
+            sets.append({tuple(np.round(m * (flip if k % 2 else 1.0), 9) + 0.0) for m in inside})
+        return all(found == sets[0] for found in sets)
+
+    for axis in range(3):
+        assert halves_match(axis, "mirrored")
+        assert not halves_match(axis, "alike")
+
+
+@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_even_pads_are_symmetric(axis: int, cut: ipc.Cut) -> None:
+    mesh = ipc.domed_pad((2.0, 2.0), 0.5, (5.0, 7.0), (4, 4, 3), cut=cut)
+    flipped = mesh.vertices * np.where(np.arange(3) == axis, -1, 1)
     where = np.linalg.norm(mesh.vertices[:, None] - flipped[None], axis=-1).argmin(axis=0)
     cells = {tuple(sorted(t)) for t in mesh.tets}
     assert {tuple(sorted(where[t])) for t in mesh.tets} == cells
+
+
+def squeezed(cut: ipc.Cut, poisson: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Vertices at rest, their displacements and the force [N] of a small flat punch on the middle of a bonded pad."""
+    mesh = ipc.domed_pad((12e-3, 12e-3), 4e-3, (np.inf, np.inf), (8, 8, 3), cut=cut)
+    pad = bonded_pad(mesh, material=ipc.Material(4e5, poisson))
+    block = ipc.box_mesh([-1.5e-3, 0, 1.5e-3], [-1.5e-3, 0, 1.5e-3], [0, 1e-3])  # its triangles are symmetric too
+    punch = ipc.KinematicBody("punch", ipc.TriMesh(block.vertices, surface_of(block.tets)), ipc.Pose((0, 0, 2.1e-5)))
+    settings = ipc.Settings(d_hat=2e-5, velocity_tolerance=1e-6, linear_tolerance=1e-8)
+    world = ipc.World([pad, punch], settings, device="cpu")
+    for depth in (0.0, 2e-5, 4e-5):
+        world.set_target("punch", position=(0.0, 0.0, -depth))
+        assert world.step().converged.all()
+    return mesh.vertices, world.positions("pad")[0] - mesh.vertices, float(world.wrench("punch").force[0, 2])
+
+
+def test_mirrored_cells_lock_less_and_a_symmetric_press_stays_symmetric() -> None:
+    (rest, moved, force), (_, _, locked) = squeezed("mirrored", 0.48), squeezed("alike", 0.48)
+    assert locked > 1.3 * force > 0
+    rounding = 1e-6 * np.abs(moved).max()  # grown over the iterations; a hundred times below the tolerance of the solve, 1e-8 m
+    for axis in (0, 1):
+        flip = np.where(np.arange(3) == axis, -1.0, 1.0)
+        where = np.linalg.norm(rest[:, None] - (rest * flip)[None], axis=-1).argmin(axis=0)
+        np.testing.assert_allclose(moved[where] * flip, moved, rtol=0, atol=rounding)
+    swapped = np.linalg.norm(rest[:, None] - rest[None][..., [1, 0, 2]], axis=-1).argmin(axis=0)
+    np.testing.assert_allclose(moved[swapped][:, [1, 0, 2]], moved, rtol=0, atol=rounding)
 
 
 def test_dome_has_its_radii() -> None:
@@ -52,6 +123,8 @@ def test_bad_meshes_are_refused() -> None:
     x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     with pytest.raises(ipc.IpcError, match="volume"):
         ipc.TetMesh(x, np.array([[0, 2, 1, 3]], np.int32))
+    with pytest.raises(ipc.IpcError, match=r"cut = 'halved'.*mirrored, alike"):
+        ipc.box_mesh([0, 1], [0, 1], [0, 1], cut="halved")  # type: ignore[arg-type]
     with pytest.raises(ipc.IpcError, match="there are 4"):
         ipc.TetMesh(x, np.array([[0, 1, 2, 4]], np.int32))
 
