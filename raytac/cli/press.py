@@ -38,7 +38,7 @@ class PressArgs(SolverOptions):
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
     scene says if not given, else rigid."""
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """ipc: how finely the pad is cut; as the scene says if not given, else coarse."""
+    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given) or phong."""
     calibration: Path | None = None
