@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import raytac
 from raytac.cli import main
 from raytac.errors import BackendError
 from raytac.io.metrics import read_metrics
@@ -98,6 +99,11 @@ def test_warp_is_heard_only_if_asked(verbose: bool, tmp_path: Path) -> None:
     if not verbose:
         assert "Warp" not in heard and "Module" not in heard
         assert all(line.startswith("there") for line in done.stdout.splitlines())
+
+
+def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"raytac {raytac.__version__}\n"
 
 
 BAD = ([], ["press"], ["pres", "coin"], ["press", "coin", "--device", "gpu"], ["press", "coin", "--sed", "1"])

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from raytac import __version__
 from raytac.cli.bake import BakeArgs
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare import CompareArgs
@@ -24,11 +25,16 @@ _Command = (
     | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
+_DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 1 the doctor found the default job broken, 2 wrong input."""
-    command = tyro.cli(_Command, prog="raytac", description="Simulate GelSight tactile sensors.", args=args)  # type: ignore[call-overload]
+    args = sys.argv[1:] if args is None else args
+    if list(args) == ["--version"]:
+        print(f"raytac {__version__}")
+        return 0
+    command = tyro.cli(_Command, prog="raytac", description=_DESCRIPTION, args=args)  # type: ignore[call-overload]
     try:
         return command.run()
     except RaytacError as error:
