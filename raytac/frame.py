@@ -52,6 +52,9 @@ class TactileFrame:
     Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model)."""
     contact_area: np.ndarray | None = None
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
+    contact_cells: np.ndarray | None = None
+    """Width of the narrowest patch of contact in cells of a simulated pad, shape (B,), NaN without contact (comes with ``wrench`` or
+    ``traction``): with fewer than 6 the force at a given depth is too large. None for the rigid pad."""
     force: np.ndarray | None = None
     """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
     force_law_area: np.ndarray | None = None

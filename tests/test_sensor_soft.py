@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import warnings
+from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import pytest
 from raytac.errors import InputError
 from raytac.gel.traction import cell_areas
 from raytac.sensor import TactileSensor
+from raytac.sensor.contact_width import NarrowContactWarning
 from raytac.specs import load_press
 from raytac.specs.press import StageSpec
 
@@ -23,7 +27,8 @@ def frames():
     made = {}
     for physics in ("rigid", "ipc"):
         sensor = TactileSensor(outputs=OUTPUTS, physics=physics, pitch=0.2e-3, device="cpu")
-        made[physics] = sensor, sensor.press(SCENE)
+        with pytest.warns(NarrowContactWarning) if physics == "ipc" else nullcontext():
+            made[physics] = sensor, sensor.press(SCENE)
     return made
 
 
@@ -87,3 +92,43 @@ def test_a_long_press_shows_its_stages_on_a_terminal(progress, monkeypatch):
     assert ("stage 1 of 1: indent" in screen.getvalue() and "step" in screen.getvalue()) is progress
     if not progress:
         assert screen.getvalue() == ""
+
+
+def loop(scene: Any, outputs=("height", "wrench"), pad="coarse") -> tuple[list[Any], list[str]]:
+    """Frames of a press in three steps a stage, and the warnings of narrow contacts on the way."""
+    sensor = TactileSensor(outputs=outputs, physics="ipc", pad=pad, pitch=0.1e-3, device="cpu")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        frames = [sensor.update(state) for state in sensor.load(scene).run(steps_per_stage=3)]
+    return frames, [str(w.message) for w in told if issubclass(w.category, NarrowContactWarning)]
+
+
+def ball(radius, *stages):
+    scene = load_press("sphere")
+    return replace(scene, object=replace(scene.object, params={"radius": radius}), trajectory=stages)
+
+
+def test_a_contact_of_few_cells_is_warned_of_once_a_press():
+    deep, sideways = StageSpec("indent", depth=0.3e-3), StageSpec("shear", shear=(1e-4, 0.0))
+    frames, told = loop(ball(3e-3, deep, sideways))
+    assert len(frames) == 7 and frames[0].contact_cells.shape == (1,) and np.isnan(frames[0].contact_cells[0])
+    assert 1.0 < frames[3].contact_cells[0] < 3.0
+    assert len(told) == 1
+    width = f"{frames[3].contact_cells[0]:.1f} cells across"
+    assert all(word in told[0] for word in ("pad = 'coarse'", width, "at least 6", "choose pad='medium'"))
+
+
+def test_neither_a_wide_contact_nor_a_given_force_nor_an_image_is_warned_of():
+    frames, told = loop(ball(15e-3, StageSpec("indent", depth=0.8e-3)))
+    assert frames[-1].contact_cells[0] > 6.0 and not told
+    assert np.nanmin(frames[1].contact_cells) < 6.0  # narrow on the way, as every contact is
+    frames, told = loop(ball(3e-3, StageSpec("indent", force=0.2), StageSpec("shear", shear=(1e-4, 0.0))))
+    assert frames[-1].contact_cells[0] < 3.0 and not told
+    frames, told = loop(ball(3e-3, StageSpec("indent", depth=0.3e-3)), outputs=("height",))
+    assert frames[-1].contact_cells is None and not told
+
+
+@pytest.mark.slow
+def test_a_fine_pad_has_cells_enough_for_the_shipped_ball():
+    frames, told = loop("sphere", pad="fine")
+    assert max(np.nan_to_num(frame.contact_cells[0]) for frame in frames) > 9.0 and not told

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from raytac.optics.base import INTEGRATORS
+from raytac.sensor.contact_width import NarrowContactWarning
 from raytac.sensor.options import LARGEST_SIDE, OPTICS, sensor_outputs
 from raytac.sensor.tactile_sensor import TactileSensor
 from raytac.specs.press import PADS, PHYSICS
 
-__all__ = ["INTEGRATORS", "LARGEST_SIDE", "OPTICS", "PADS", "PHYSICS", "TactileSensor", "sensor_outputs"]
+__all__ = ["INTEGRATORS", "LARGEST_SIDE", "OPTICS", "PADS", "PHYSICS", "NarrowContactWarning", "TactileSensor", "sensor_outputs"]

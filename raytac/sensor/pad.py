@@ -10,6 +10,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.physics.solver import check_solver
+from raytac.sensor.contact_width import cells_across
 from raytac.specs import PressScene, SensorSpec
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ def state_surface(pad: RigidPad | SoftPad | None, state: ContactState) -> GelSur
 def pad_forces(
     pad: RigidPad | SoftPad, state: ContactState, surface: GelSurface, outputs: tuple[str, ...]
 ) -> dict[str, np.ndarray | Any]:
-    """``wrench``, ``traction`` and, with either, ``contact_area`` of a state, as far as ``outputs`` ask for them."""
+    """``wrench``, ``traction`` and, with either, ``contact_area`` and (of a simulated pad) ``contact_cells`` of a state, as far as
+    ``outputs`` ask for them."""
     found: dict[str, Any] = {}
     if "wrench" in outputs:
         found["wrench"] = pad.wrench(state)  # type: ignore[arg-type]
@@ -78,4 +80,6 @@ def pad_forces(
     if found:
         cell = surface.grid.pitch[0] * surface.grid.pitch[1]
         found["contact_area"] = np.where(state.failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
+    if found and surface.coat is not None:
+        found["contact_cells"] = np.where(state.failed, np.nan, cells_across(surface, surface.coat.mesh))
     return found

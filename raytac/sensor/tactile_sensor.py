@@ -18,6 +18,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.optics.base import OPTICAL_OUTPUTS
+from raytac.sensor.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.imaging import Imaging
 from raytac.sensor.options import (
     check_markers,
@@ -149,6 +150,8 @@ class TactileSensor:
             seed=self.seed,
         )
         self._pad: RigidPad | SoftPad | None = None
+        self._is_narrow = False
+        """Whether this press was warned of already."""
 
     @property
     def label(self) -> str:
@@ -238,6 +241,7 @@ class TactileSensor:
             offsets=offsets,
             depths=depths,
         )
+        self._is_narrow = False
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
@@ -259,6 +263,7 @@ class TactileSensor:
             assert self._pad is not None
             area = state.force_law_area if self.physics == "rigid" else None
             forces = pad_forces(self._pad, state, surface, self.outputs)
+            self._check_width(state, forces.get("contact_cells"))
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
@@ -268,6 +273,18 @@ class TactileSensor:
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
         return self._frame(surface, markers, done, time_ms, force=force, force_law_area=area, failed=failed, **forces)
+
+    def _check_width(self, state: ContactState, cells: np.ndarray | None) -> None:
+        """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.
+
+        On the way every contact is narrow once, so what lies between the ends of stages is not looked at.
+        """
+        if state.stage < 0:
+            self._is_narrow = False  # a press begins anew
+        if cells is None or self._is_narrow or state.fraction < 1.0 or state.stage < 0 or state.scene is None:
+            return
+        if not holds_force(state.scene, state.stage):
+            self._is_narrow = warn_if_narrow(cells, self.pad, stacklevel=3)
 
     def _frame(
         self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
