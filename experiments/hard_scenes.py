@@ -216,7 +216,7 @@ def folded(setup: Setup) -> Worst:
 
 def blocked(setup: Setup) -> Worst:
     """A ball driven through the pad into the bonded base: it stops, and the report says how much was left."""
-    mesh = ipc.domed_pad((12e-3, 12e-3), 3e-3, (math.inf, math.inf), (4, 4, 2), cut="alike")
+    mesh = ipc.domed_pad((12e-3, 12e-3), 3e-3, (math.inf, math.inf), (4, 4, 2))
     pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45), bonded=ipc.vertices_in_box(mesh, (-1, -1, -3e-3), (1, 1, -3e-3)))
     ball = ipc.KinematicBody("ball", ipc.icosphere(3e-3, 2), ipc.Pose((0, 0, 3.1e-3 + D_HAT)))
     world = world_of([pad, ball], setup, gravity=(0, 0, 0))
@@ -265,7 +265,7 @@ def mat_twist(setup: Setup) -> Worst:
 def random_presses(setup: Setup, count: int, seed: int = 0) -> Worst:
     """Presses, shears and twists of convex and concave objects, anywhere on a coarse pad, many at once."""
     rng = np.random.default_rng(seed)
-    mesh = ipc.domed_pad((12e-3, 12e-3), 4e-3, (math.inf, math.inf), (5, 5, 2), cut="alike")
+    mesh = ipc.domed_pad((12e-3, 12e-3), 4e-3, (math.inf, math.inf), (5, 5, 2))
     pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45), bonded=ipc.vertices_in_box(mesh, (-1, -1, -4e-3), (1, 1, -4e-3)))
     shapes = {
         "ball": ipc.icosphere(3e-3, 2),

@@ -67,14 +67,14 @@ def sheet(cells: int, size: float = 4 * SIZE) -> ipc.TriMesh:
 def cube(size: float = SIZE, cells: int = 1) -> ipc.TetMesh:
     """A cube about the z axis that stands on z = 0."""
     line = np.linspace(-size / 2, size / 2, cells + 1)
-    return ipc.box_mesh(line, line, line + size / 2, cut="alike")
+    return ipc.box_mesh(line, line, line + size / 2)
 
 
 def bar(width: float, height: float, length: float, cells: tuple[int, int, int]) -> ipc.TetMesh:
     """A box along x from −``length``/2 to ``length``/2, centred in y and z."""
     sides = (length, width, height)
     x, y, z = (np.linspace(-side / 2, side / 2, n + 1) for side, n in zip(sides, cells, strict=True))
-    return ipc.box_mesh(x, y, z, cut="alike")
+    return ipc.box_mesh(x, y, z)
 
 
 def moved(mesh: ipc.TetMesh, by: tuple[float, float, float], turn: NDArray | None = None) -> ipc.TetMesh:
@@ -100,7 +100,7 @@ def dented_ball(radius: float) -> ipc.TriMesh:
 def fork() -> ipc.TetMesh:
     """A slotted block of 20 mm: two arms, 4 mm apart, on a foot of 4 mm."""
     line = np.array([-0.01, -0.006, -0.002, 0.002, 0.006, 0.01])
-    mesh = ipc.box_mesh(line, [-0.004, 0.004], np.linspace(0, 0.02, 6), cut="alike")
+    mesh = ipc.box_mesh(line, [-0.004, 0.004], np.linspace(0, 0.02, 6))
     middle = mesh.vertices[mesh.tets].mean(axis=1)
     keep = ~((np.abs(middle[:, 0]) < 0.002) & (middle[:, 2] > 0.004))
     used, tets = np.unique(mesh.tets[keep], return_inverse=True)
