@@ -66,6 +66,7 @@ def test_the_scene_chooses_unless_the_caller_does():
 def test_no_object_no_force():
     sensor = TactileSensor(outputs=OUTPUTS, physics="ipc", pitch=0.5e-3, device="cpu")
     frame = sensor.press("none")
+    assert frame.wrench is not None and frame.traction is not None and frame.contact_area is not None and frame.height is not None
     assert not frame.wrench.any() and not frame.traction.any() and frame.contact_area[0] == 0.0
     assert np.array_equal(frame.height[0], sensor.grid.rest.astype(np.float32))
 
