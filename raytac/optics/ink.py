@@ -62,7 +62,8 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     for c, dotted in enumerate(inked_albedo(sensor, ink)):
         level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
         share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
-        linear: Any = dr.power(dr.maximum(level, 0) / 255, response.gamma) - black
-        dark: Any = dr.power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255
+        power: Any = dr.power  # typed as an object in Dr.Jit's stubs
+        linear = power(dr.maximum(level, 0) / 255, response.gamma) - black
+        dark = power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255
         found.append(dr.select(ink > 0, dark, level))
     return found

@@ -129,7 +129,7 @@ class Recorder(BlockJacobi):
 
     blocks: np.ndarray | None = None
 
-    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+    def update(self, system: Any, contacts: Any, rows: int, active: wp.array) -> None:
         if self.blocks is None:
             self.blocks = system.blocks.numpy()[0].copy()
         super().update(system, contacts, rows, active)
@@ -325,6 +325,7 @@ def test_cuda_agrees_and_can_be_captured(batch: int, patches: int, rng: np.rando
     with wp.ScopedCapture(device=device) as capture:
         preconditioner.update(there.system, there.contacts, there.contacts.row.shape[1], mask)
         preconditioner.apply(r_device, mask, z)
+    assert capture.graph is not None
     for _ in range(2):
         wp.capture_launch(capture.graph)
     np.testing.assert_allclose(z.numpy()[:, here.free].reshape(batch, -1), expected, rtol=0, atol=1e-4 * np.abs(expected).max())
