@@ -55,20 +55,20 @@ class Args(CommonOptions):
 class RestAlone(RestInverse):
     """The rest inverse without the contacts of the moment."""
 
-    def update(self, system: linear.SystemView, contacts: linear.Contacts, rows: int, active: wp.array) -> None:
+    def update(self, system: Any, contacts: Any, rows: int, active: wp.array) -> None:
         self.jacobi.update(system, contacts, rows, active)
 
 
 @wp.kernel
 def fill_blocks(
-    system: linear.SystemView,
+    system: linear.SystemView,  # pyright: ignore[reportGeneralTypeIssues]
     contact: wp.array2d(dtype=wp.mat33d),  # pyright: ignore[reportInvalidTypeForm]
     row_start: wp.array(dtype=wp.int32),  # pyright: ignore[reportInvalidTypeForm]
     count: wp.int32,
     values: wp.array(dtype=wp.mat33d),  # pyright: ignore[reportInvalidTypeForm]
 ):
     """The matrix on the unknowns with the contacts' diagonal blocks, one environment after the other; identity on bonded nodes."""
-    env, i = wp.tid()
+    env, i = wp.tid()  # pyright: ignore[reportGeneralTypeIssues, reportAssignmentType]
     k = system.row_base[i]
     for s in range(system.row_length[i]):
         block = wp.mat33d()
@@ -92,7 +92,8 @@ class Fsai:
         self.batch, self.lanes, self.device, count = batch, lanes, device, len(layout.node_rest)
         self.blocks = len(layout.col)
         self.row_start = wp.array(layout.row_start, dtype=wp.int32, device=device)
-        self.matrix = bsr_zeros(batch * count, batch * count, block_type=wp.mat33d, device=device)
+        block_type: Any = wp.mat33d
+        self.matrix: Any = bsr_zeros(batch * count, batch * count, block_type=block_type, device=device)
         shift = np.arange(batch)[:, None]
         offsets = np.concatenate([(layout.row_start[:-1] + shift * self.blocks).ravel(), [batch * self.blocks]])
         self.matrix.offsets = wp.array(offsets, dtype=wp.int32, device=device)
@@ -102,7 +103,7 @@ class Fsai:
         self.contact = wp.zeros((batch, count), dtype=wp.mat33d, device=device)
         self.factor: Any = None
 
-    def update(self, system: linear.SystemView, contacts: linear.Contacts, rows: int, active: wp.array) -> None:
+    def update(self, system: Any, contacts: Any, rows: int, active: wp.array) -> None:
         from warp.optim.linear import FSAI
 
         self.contact.zero_()
@@ -131,6 +132,7 @@ def time_calls(call: Callable[[], None], device: wp.Device) -> float:
             for _ in range(repeats):
                 call()
         graph = capture.graph
+        assert graph is not None
         wp.capture_launch(graph)
     times = []
     for _ in range(9):
