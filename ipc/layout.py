@@ -146,6 +146,12 @@ def _affine_parts(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
         local = np.linalg.solve((corners[1:] - corners[0]).T, (points - corners[0]).T).T
         return np.concatenate([1 - local.sum(axis=1, keepdims=True), local], axis=1)
 
+    directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).tolist()
+    sides = {tuple(side) for side in directed}
+    if len(sides) < len(directed) or any((b, a) not in sides for a, b in sides):
+        raise IpcError(
+            f"{body.name}: the surface of an affine body must be closed and orientable, every edge shared by two triangles"
+        )
     apex = np.broadcast_to(middle, (len(f), 1, 3))
     cells = np.concatenate([apex, v[f]], axis=1)
     volumes = np.linalg.det(cells[:, 1:] - cells[:, :1]) / 6

@@ -213,3 +213,9 @@ def test_fast_ball_does_not_tunnel() -> None:
         assert report.min_gap[0] > 0 and report.min_det[0] > 0 and not report.failed[0]
         lowest = min(lowest, world.positions("ball")[0, :, 2].min())
     assert -2e-3 < lowest < 0, f"lowest point {lowest:.3g} m"
+
+
+def test_an_open_affine_surface_is_refused() -> None:
+    box = ipc.box_surface((0.02, 0.02, 0.02))
+    with pytest.raises(ipc.IpcError, match="closed"):
+        ipc.World([ipc.AffineBody("box", ipc.TriMesh(box.vertices, box.faces[:-2]))], device="cpu")
