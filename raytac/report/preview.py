@@ -225,7 +225,7 @@ def _shear_panel(axes: Axes, data: PreviewData) -> None:
     _map_axes(axes, data, _traction_title("shear", data))
     shear = 1e-3 * data.traction[..., :2]
     size = np.hypot(shear[..., 0], shear[..., 1])
-    largest = max(float(size.max()), 1e-3)
+    largest = max(float(size.max()), 0.1)
     _colour_bar(axes, axes.imshow(size, extent=_grid_extent_mm(data.grid), cmap="magma", vmin=0.0, vmax=largest))
     step = max(len(data.grid.y) // 24, 1)
     nodes = np.meshgrid(np.arange(step // 2, len(data.grid.y), step), np.arange(step // 2, len(data.grid.x), step), indexing="ij")
