@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+import raytac
 from raytac.cli import main
 from raytac.frame import TactileFrame
 from raytac.io.exr import read_exr
@@ -19,6 +20,7 @@ from raytac.specs import load_sensor
 ROOT = Path(__file__).parents[1]
 LAYERS = ("red", "green", "blue")
 SIZE = (160, 120)
+FILES = {"rgb.png", "frame.exr", "height.npy", "traction.npy", "preview.png", "metrics.json"}
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_file_is_there(folder: Path) -> None:
-    assert {path.name for path in folder.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    assert {path.name for path in folder.iterdir()} == FILES
     preview = read_png(folder / "preview.png")
     assert preview.shape[1] > 1000 and preview.std() > 20
 
@@ -100,7 +102,7 @@ def test_another_sensor_needs_no_python(tmp_path: Path) -> None:
     out = tmp_path / "dome"
     command = ["press", "sphere", "--sensor", "gelsight_dome", "--resolution", size, "--device", "cpu", "--out", str(out)]
     assert main(command) == 0
-    assert {path.name for path in out.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    assert {path.name for path in out.iterdir()} == FILES
     sensor = load_sensor("gelsight_dome")
     channels, header = read_exr(out / "frame.exr")
     assert header["sensor"] == "gelsight_dome" and header["layers"].split() == [f"led_{name}" for name in sensor.lights.layers]
@@ -118,7 +120,9 @@ def test_another_sensor_needs_no_python(tmp_path: Path) -> None:
 
 
 def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)
+    assert len(snippets) == 2
+    snippet = snippets[0]
     monkeypatch.chdir(tmp_path)  # shipped scenes are found from anywhere
     # A process has one device, and the other tests of this one use the CPU.
     assert "outputs=(" in snippet
@@ -129,3 +133,17 @@ def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert frame.rgb is not None and frame.rgb.shape == (1, 240, 320, 3) and frame.rgb.dtype == np.uint8
     assert frame.depth is not None and frame.depth.shape == (1, 240, 320) and frame.depth.dtype == np.float32
     assert frame.force is not None and frame.force.shape == (1, 3)
+
+
+def test_the_readmes_soft_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    snippet = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)[1]
+    monkeypatch.chdir(tmp_path)
+    assert "outputs=(" in snippet
+    names: dict[str, object] = {"raytac": raytac}
+    exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
+    frame = names["frame"]
+    assert isinstance(frame, TactileFrame)
+    assert frame.wrench is not None and frame.wrench[0, 2] < -1.0
+    assert frame.traction is not None and frame.traction[0, ..., 2].min() < -1e4
+    assert frame.markers is not None and frame.markers.displacement_px.shape == (1, 63, 2)
+    assert np.nanmax(np.abs(frame.markers.displacement_px)) > 0.5
