@@ -8,7 +8,7 @@ elastic foundation, one contact is made and put among MuJoCo's own:
 - place: the overlap's centroid, so that a flat face that tilts is pushed back by the edge that sinks in;
 - normal: the gel's there. Its line goes through the centre of a ball wherever on the dome the ball lies;
 - stiffness: F(δ) / δ of the load law of this body at this place, by ``solref`` in direct form;
-- friction: Coulomb's; about the normal 3π/16 μ a with a the radius of contact (a Hertz contact that slips as a whole, as in a press); against
+- friction: Coulomb's; about the normal 3π/16 μ a with a the contact's radius (Hertz contact that slips as a whole, as in a press); against
   rolling 3/16 α a (J. A. Greenwood, H. Minshall, D. Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259,
   1961) with α the share of energy that the gel loses.
 
