@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -147,10 +147,22 @@ class SoftPad:
             yield self._state(-1, "start", 1.0)
             for index, stage in enumerate(self.scene.trajectory):
                 self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
-                before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
-                for step in range(1, steps_per_stage + 1):
-                    self._advance(stage, step / steps_per_stage, *before)
-                    yield self._state(index, stage.kind, step / steps_per_stage)
+                yield from self._through(index, stage, steps_per_stage)
+
+    def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[SoftState]:
+        """States along one more stage, from wherever the pad is now; as ``RigidPad.follow``.
+
+        Raises:
+            InputError: ``steps`` below 1, or a stage deeper than any of the scene's: there the object's surface was left out.
+            SpecError: a scene without object, or a stage that no pad can follow.
+        """
+        if steps < 1:
+            raise InputError("steps", value=steps, rule="must be a whole number >= 1")
+        if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
+            rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"
+            raise InputError("stage", value=stage, rule=rule)
+        check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
+        yield from self._through(-1, stage, steps)
 
     def peak(self, states: Iterable[SoftState]) -> SoftState:
         """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
@@ -203,6 +215,13 @@ class SoftPad:
         self._last: SoftReading | None = None
         self._stiffness = np.full(batch, np.nan)
         self._failed: np.ndarray = self._lost.copy()
+
+    def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[SoftState]:
+        """``steps`` states through a stage; ``index``: its number in the scene, −1 if it is none of the scene's."""
+        before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
+        for step in range(1, steps + 1):
+            self._advance(stage, step / steps, *before)
+            yield self._state(index, stage.kind, step / steps)
 
     def _advance(
         self, stage: StageSpec, fraction: float, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, force: np.ndarray
@@ -393,14 +412,17 @@ class SoftPad:
             return None
         return self._places.case(self._kept - self._depth, self._shear, self._twist)
 
-    def _body(self):
+    @property
+    def _deepest(self) -> float:
+        """Depth that the object's surface was made for [m]; a force may go as deep as the pad."""
         deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
-        if self._depths is not None:
-            deepest = max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+        return deepest if self._depths is None else max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+
+    def _body(self):
         settings = {
             "weight": self._weight,
             "edge_length": 0.75 * float(np.diff(self.mesh.coat.lines_x).mean()),
-            "lowest": deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
+            "lowest": self._deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
             "sag": _SAG * self.mesh.d_hat,
         }
         try:
