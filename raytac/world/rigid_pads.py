@@ -37,6 +37,7 @@ from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import pose, world_from_site
 from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedBody, ComposedScene
+from raytac.world.state import Controller, is_lost
 
 __all__ = ["RigidPads", "Touch"]
 
@@ -121,20 +122,32 @@ class RigidPads:
         self._contact = mujoco.MjContact()
         self._force = np.empty(6)
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
+        self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int]) -> None:
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
         """Forget what environments went through."""
         for b in envs:
             self._laws[b] = {}
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
 
-    def renew(self, b: int) -> None:
-        """Ask for the load laws of an environment anew, once a control step: they hold while bodies hardly roll or slide on the pad."""
-        self._laws[b] = {}
+    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
+        scene = self.composed.scene
+        for b, (data, controller) in enumerate(zip(datas, controllers, strict=True)):
+            if failed[b]:
+                continue
+            self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
+            for _ in range(round(scene.control_timestep / scene.timestep)):
+                self._step(data, b, controller)
+                if is_lost(data):
+                    failed[b] = True
+                    break
+            else:
+                mujoco.mj_kinematics(self.model, data)  # so that poses are those of the end of the step
 
-    def step(self, data: mujoco.MjData, b: int, control) -> None:
-        """One step of MuJoCo with the pads' contacts; ``control`` (data) writes the controls when the state is up to date."""
+    def _step(self, data: mujoco.MjData, b: int, control: Controller) -> None:
+        """One step of MuJoCo with the pads' contacts."""
         model = self.model
         mujoco.mj_step1(model, data)
         touching = self._add_contacts(data, b)
@@ -144,7 +157,7 @@ class RigidPads:
             mujoco.mj_island(model, data)
             mujoco.mj_projectConstraint(model, data)
             mujoco.mj_referenceConstraint(model, data)
-        control(data)
+        control(data, float(data.time))
         mujoco.mj_step2(model, data)
         self._read_forces(data, b, touching)
 
