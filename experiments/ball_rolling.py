@@ -34,6 +34,8 @@ class Args(CommonOptions):
     """Task scene with one arm, one sensor and a body named ball."""
     goals_mm: tuple[tuple[float, float], ...] = ((10.0, 0.0), (10.0, 10.0), (-8.0, 10.0), (0.0, 0.0))
     """Places that the ball is rolled to, from where it starts [mm], world x and y."""
+    optics: str | None = None
+    """How images are made; if not given, by the table without shadows with the rigid pad, by fast ray tracing with the simulated one."""
     resolution: str = "320x240"
     """Of the tactile image [px]."""
     steps: int = 3000
@@ -41,7 +43,7 @@ class Args(CommonOptions):
     picture_every: float = 0.1
     """Time between two pictures of the film [s]."""
     quick: bool = False
-    """One short stroke and small images: enough to see that all works."""
+    """One short stroke and small images by Phong's model: enough to see that all works."""
 
 
 @dataclass
@@ -71,7 +73,7 @@ def main(args: Args) -> None:
             raise RaytacError(f"--physics {name}: must be one of {', '.join(OPTICS)}")
     out = args.out if args.out is not None else Path("runs") / "ball_rolling"
     if args.quick:
-        args = replace(args, goals_mm=((2.0, 1.0),), resolution="64x48", steps=400)
+        args = replace(args, goals_mm=((2.0, 1.0),), optics="phong", resolution="64x48", steps=150)
     metrics: dict[str, Metric] = {"experiment": "ball_rolling", "seed": args.seed}
     with result_folder(out) as folder:
         for name in args.physics:
@@ -92,19 +94,23 @@ def main(args: Args) -> None:
 
 OPTICS = {"rigid": "taxim", "ipc": "raytrace"}
 """How the image is made: by the table with the rigid pad, by fast ray tracing with the simulated one."""
+PITCH = 1e-4
+"""Spacing of the nodes of the gel's surface [m]: a ball needs no finer ones."""
 MARKERS = {"rigid": "fots", "ipc": "surface"}
 
 
 def make_world(args: Args, physics: str) -> TactileWorld:
+    optics = OPTICS[physics] if args.optics is None else args.optics
     return TactileWorld(
         args.scene,
         physics=physics,
         outputs=("rgb", "wrench"),
-        optics=OPTICS[physics],
+        optics=optics,
         markers=MARKERS[physics],
         resolution=parse_resolution(args.resolution),
         device=args.device,
         seed=args.seed,
+        sensor_options={"pitch": PITCH, **({"optics_options": {"shadow": False}} if optics == "taxim" else {})},
     )
 
 
