@@ -15,7 +15,8 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from raytac.errors import SpecError
+import ipc
+from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
@@ -28,7 +29,6 @@ from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
 from raytac.robots.pose import pose, world_from_site
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
-from raytac.world.coupling import Coupling
 from raytac.world.state import Controller, is_lost
 
 __all__ = ["SoftPads"]
@@ -91,7 +91,9 @@ class SoftPads:
             num_envs=len(datas),
             device=device,
         )
-        self._coupling = None if coupling == "one_way" else Coupling(self.model, [*self._links, *(b.index for b in self._led)])
+        if coupling == "two_way":
+            raise InputError("coupling", value=coupling, rule="is not there yet for simulated pads", choices=("one_way",))
+        self._coupling = None
         self._last_cases = self._pad_poses(datas)
         self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
         self._traction: dict[str, CoatTraction] = {}
@@ -128,6 +130,11 @@ class SoftPads:
                     failed[b] = not self._ahead(data, b, controllers[b])
             reports.append(self._follow(datas, failed))
         self.report = _joined(reports)
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Names of all that the solver has a surface of."""
+        return (*self.soft.pads, *(name for name, body in self.soft.bodies.items() if not isinstance(body.solid, ipc.HalfSpace)))
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
@@ -265,7 +272,7 @@ def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
 def _inside(part: Part, at: np.ndarray) -> np.ndarray:
     """Whether points (n, 3), part frame, lie in a part or within ``_TOUCH`` of it."""
     if part.kind == "plane":
-        return at[:, 2] <= _TOUCH
+        return np.asarray(at[:, 2] <= _TOUCH)
     if part.kind == "box":
         return (np.abs(at) <= np.asarray(part.size) + _TOUCH).all(axis=1)
     if part.kind == "sphere":

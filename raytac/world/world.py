@@ -220,6 +220,25 @@ class TactileWorld:
             frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
         return frames
 
+    def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of a body or of a simulated pad as it is: vertices (B, n, 3) [m], world frame, and faces (F, 3).
+
+        Raises ``InputError`` for a name that is not there, or a half-space, which has no end.
+        """
+        if self.physics == "ipc" and name in self._pads.meshes:  # type: ignore[union-attr]
+            return self._pads.soft.mesh(name)  # type: ignore[union-attr]
+        body = self.composed.bodies.get(name)
+        if body is None or body.spec.kind == "plane":
+            there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
+            there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
+            rule = "must be the name of a body or a simulated pad, and no half-space"
+            raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
+        from raytac.physics.part_surface import object_surface
+
+        surface = object_surface(body.parts)
+        poses = self.state().world_from_body[name]
+        return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
+
     def _controllers(self, control: Control) -> list[Controller]:
         if isinstance(control, np.ndarray):
             values = np.asarray(control, float)
