@@ -9,13 +9,14 @@ import numpy as np
 
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.coat_surface import CoatPlaces, CoatSurface
+from raytac.gel.fine_contact import FineContact, FineGrid
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.part import Part, mesh_part
 from raytac.gel.product import sandwich
-from raytac.gel.spline import hat_matrix
 from raytac.gel.standoff import ContactFit, StandOff
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.physics.pad_compliance import coat_compliance
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
@@ -24,6 +25,8 @@ __all__ = ["SoftReader", "SoftReading"]
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
+_FINE = 0.1e-3
+"""Spacing of the grid on which the contact is found [m]."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,9 @@ class SoftReader:
         self._surface = CoatSurface(mesh.coat, gelpad)
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
         self._rest = grid.rest.astype(np.float32)
-        lines = (mesh.coat.lines_y, grid.y), (mesh.coat.lines_x, grid.x)
-        self._hat_y, self._hat_x = (hat_matrix(at, to).astype(np.float32) for at, to in lines)
+        self._gelpad = gelpad
+        self._fine_pad = make_grid(gelpad, max(_FINE, *grid.pitch))
+        self._fine: tuple[FineContact, FineGrid] | None = None
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._stand_off = StandOff(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
         corners = mesh.coat.rest[mesh.coat.faces]
@@ -79,14 +83,17 @@ class SoftReader:
             coat[b, :, 2] += fit.shift
             height[b] = self._heights(places, coat[b])
             if not np.isfinite(fit.clearance):
-                undersides[b] = self._underside(contact, poses[b], 0.0, b)
+                undersides[b] = self._underside(contact, poses[b], 0.0, b, self.grid)
                 continue
             clearance[b] = fit.clearance
             poses[b, 2, 3] -= fit.clearance
             load = np.maximum(-forces[b, :, 2], 0.0)
-            under = undersides[b] = self._underside(contact, poses[b], fit.clearance, b)
-            borne = sandwich(self._hat_y, load.reshape(self.mesh.coat.shape), self._hat_x.T)
-            height[b], touched[b] = self._stand_off.close(height[b], under, borne)
+            contact_here, to_grid = self._fine_contact()
+            near = self._underside(contact, poses[b], fit.clearance, b, self._fine_pad)
+            upwards = coat[b, :, 2] - fit.shift - self.mesh.coat.rest[:, 2]
+            shape = contact_here.solve(places, upwards, load, near - self._fine_pad.rest)
+            under = undersides[b] = self._underside(contact, poses[b], fit.clearance, b, self.grid)
+            height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
             centre[b] = load @ coat[b, :, :2] / load.sum()
         deformed = DeformedCoat(self.mesh.coat, coat)
         surface = GelSurface(self.grid, height, touched, centre, poses, deformed)
@@ -113,10 +120,18 @@ class SoftReader:
         rise = self._surface.rise(places, coat[:, 2] - self.mesh.coat.rest[:, 2])
         return self._rest + sandwich(self._rows, rise, self._columns)
 
-    def _underside(self, contact: SoftContact, shown: np.ndarray, clearance: float, b: int) -> np.ndarray:
-        """Underside of the shown object over the grid [m], (Ny, Nx)."""
+    def _fine_contact(self) -> tuple[FineContact, FineGrid]:
+        """What finds the contact, and what takes it to the grid; made at the first contact, since the mesh's compliance takes a while."""
+        if self._fine is None:
+            found, continued = (coat_compliance(self.mesh, self._gelpad, rollers=rollers) for rollers in (False, True))
+            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found, continued)
+            self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y)
+        return self._fine
+
+    def _underside(self, contact: SoftContact, shown: np.ndarray, clearance: float, b: int, grid: PadGrid) -> np.ndarray:
+        """Underside of the shown object over a grid [m], (Ny, Nx)."""
         parts, pose = self._object(contact, shown, b)
         if parts is self.parts:
-            return object_height(parts, pose[None], self.grid.x, self.grid.y, below=float(self.grid.rest.max()))[0]
+            return object_height(parts, pose[None], grid.x, grid.y, below=float(grid.rest.max()))[0]
         pose[2, 3] = -clearance
-        return object_height(parts, pose[None], self.grid.x, self.grid.y)[0]
+        return object_height(parts, pose[None], grid.x, grid.y)[0]
