@@ -151,7 +151,7 @@ class FineContact:
         pressure = np.zeros(overlap.shape, np.float32)
         near = overlap > -_REACH
         if near.any():
-            rows, columns = (_span(near.any(axis=k)) for k in (1, 0))
+            rows, columns = (_span(np.asarray(near.any(axis=k))) for k in (1, 0))
             window = _Window(self, rows, columns)
             pressure[rows, columns] = window.press(overlap[rows, columns].astype(np.float32), start[rows, columns])
         everywhere = _Window(self, slice(None), slice(None))

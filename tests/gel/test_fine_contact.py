@@ -1,4 +1,4 @@
-"""The contact below the mesh's cells: the layer's compliance, the complementarity, and what comes back of a coat that needs no correction."""
+"""The contact below the mesh's cells: compliance of layer and mesh, complementarity, and what is left of the mesh."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def pressed(fine, under, still=True):
 
 def test_contact_is_complementary(fine):
     """Pressure where the coat lies on the object and nowhere else, never a pull, and nothing reaches in."""
-    contact, grid, _ = fine
+    _, grid, _ = fine
     under = ball(grid, 0.6e-3)
     shape, height = pressed(fine, under)
     gap = under - height
@@ -115,7 +115,7 @@ def test_contact_is_complementary(fine):
 
 def test_a_linear_solution_of_the_mesh_is_exchanged_wholly(fine):
     """If the solver's coat is the mesh's linear response, the shown one does not depend on the mesh: it is the layer's."""
-    contact, grid, _ = fine
+    _, grid, _ = fine
     shape, height = pressed(fine, ball(grid, 0.6e-3))
     assert np.abs(shape.rise).max() < 1e-9
     flipped = np.abs(height - height[::-1]).max(), np.abs(height - height[:, ::-1]).max()
@@ -128,7 +128,7 @@ def test_a_linear_solution_of_the_mesh_is_exchanged_wholly(fine):
 
 
 def test_laying_closes_gaps_under_pressure_only(fine):
-    contact, grid, to_grid = fine
+    _, grid, to_grid = fine
     under = ball(grid, 0.6e-3)
     shape, height = pressed(fine, under)
     lifted = height - 2e-6
