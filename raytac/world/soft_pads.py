@@ -274,7 +274,7 @@ def _inside(part: Part, at: np.ndarray) -> np.ndarray:
     if part.kind == "plane":
         return np.asarray(at[:, 2] <= _TOUCH)
     if part.kind == "box":
-        return (np.abs(at) <= np.asarray(part.size) + _TOUCH).all(axis=1)
+        return np.all(np.abs(at) <= np.asarray(part.size) + _TOUCH, axis=1)
     if part.kind == "sphere":
         return np.linalg.norm(at, axis=1) <= part.size[0] + _TOUCH
     return (np.hypot(at[:, 0], at[:, 1]) <= part.size[0] + _TOUCH) & (np.abs(at[:, 2]) <= part.size[1] + _TOUCH)
