@@ -51,7 +51,8 @@ class SceneReport:
 
     failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
     min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. substeps: parts of the step.
+    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
+    end [J]. substeps: parts of the step.
     """
 
     failed: np.ndarray
@@ -60,6 +61,8 @@ class SceneReport:
     min_det: np.ndarray
     blocked: np.ndarray
     newton: np.ndarray
+    elastic: np.ndarray
+    barrier: np.ndarray
     substeps: int
 
 
@@ -212,7 +215,15 @@ class SoftScene:
         report = self.world.step(dt)
         self._failed = report.failed
         return SceneReport(
-            report.failed, report.converged, report.min_gap, report.min_det, report.blocked, report.newton, substeps=1
+            report.failed,
+            report.converged,
+            report.min_gap,
+            report.min_det,
+            report.blocked,
+            report.newton,
+            report.elastic,
+            report.barrier,
+            substeps=1,
         )
 
     # --- reading ---------------------------------------------------------------------------------------------------------------
@@ -548,5 +559,7 @@ def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
         np.minimum(one.min_det, two.min_det),
         np.maximum(one.blocked, two.blocked),
         one.newton + two.newton,
+        two.elastic,
+        two.barrier,
         one.substeps + two.substeps,
     )
