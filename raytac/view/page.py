@@ -57,6 +57,9 @@ class Page:
         def command(event: GuiEvent[Any]) -> None:
             if event.target.value != "Pause":
                 self._held.clear()
+            if event.target.value == "Reset":
+                for scale in self._scales.values():
+                    scale.reset()
             acts[event.target.value]()
 
         self._transport.on_click(command)
