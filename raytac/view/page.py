@@ -96,11 +96,15 @@ class Page:
             with gui.add_folder("Controls"):
                 for control in self._session.controls:
                     start = min(max(0.0, control.low), control.high)
-                    self._sliders[control.name] = gui.add_slider(control.label, control.low, control.high, control.step, start)
+                    self._sliders[control.name] = gui.add_slider(
+                        control.label, control.low, control.high, control.step, start, hint=control.hint or None
+                    )
         with gui.add_folder("Coat"):
             self._quantity = gui.add_dropdown("colour", tuple(self._labels))
             self._legend = gui.add_html("")
-            self._see_through = gui.add_checkbox("see-through objects", True, visible=self._view.has_hiding)
+            self._see_through = gui.add_checkbox(
+                "see through", True, visible=self._view.has_hiding, hint="Let the coat be seen through objects"
+            )
         self._view.see_through(True)
         self._quantity.on_update(lambda _: self._redraw())
         self._see_through.on_update(lambda _: self._view.see_through(self._see_through.value))
@@ -117,7 +121,9 @@ class Page:
                 blank = np.full((3, 4, 3), 230, np.uint8)
                 self._images[pad.name] = gui.add_image(blank, label=pad.name, format="jpeg", jpeg_quality=92, visible=False)
                 self._wrenches[pad.name] = gui.add_html("")
-            self._arrows = gui.add_checkbox(f"markers: ways × {ARROW_SCALE:g}", True, visible=False)
+            self._arrows = gui.add_checkbox(
+                f"arrows × {ARROW_SCALE:g}", True, visible=False, hint="Where the markers went, so many times as long"
+            )
         self._arrows.on_update(lambda _: self._redraw())
         panel.dock_left()
         panel.set_width(380)

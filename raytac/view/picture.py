@@ -8,7 +8,7 @@ from raytac.view.session import PadView
 
 __all__ = ["ARROW_SCALE", "picture"]
 
-ARROW_SCALE = 4.0
+ARROW_SCALE = 2.0
 """Length of a drawn arrow over the marker's way, so that tenths of a pixel are seen."""
 _LEAST_WIDTH = 480
 """Images are enlarged by a whole factor to at least this width [px], so that arrows are crisp."""

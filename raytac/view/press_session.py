@@ -30,7 +30,7 @@ _NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twi
 """A control is there when it is this close, in its unit."""
 _DEEPEST = 0.4
 """Share of the pad's thickness that the depth slider reaches, more if the scene goes deeper."""
-_STRONGEST, _FARTHEST, _WIDEST = 10.0, 2.0, 30.0
+_STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
 """Ends of the sliders for force [N], shear [mm] and twist [degrees]."""
 _STATES = {"rigid": 20, "ipc": 10}
 """States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
@@ -95,10 +95,9 @@ class PressSession:
         for name, value in targets.items():
             control = next(c for c in self.controls if c.name == name)
             self._held.pop(control.instead_of, None)
-            self._held.pop(name, None)
             self._held[name] = value
-        # What was moved now comes first, then what was asked for before and is not reached yet.
-        ways = [self._way(name) for name in reversed(self._held)]
+        # In the order of a press, whatever the order of the hands: an object that is sheared before it is pressed feels nothing.
+        ways = [self._way(control.name) for control in self.controls if control.name in self._held]
         self._states = chain.from_iterable(self._pad.follow(stage, steps) for stage, steps in ways if stage is not None)
 
     def advance(self) -> bool:
@@ -127,8 +126,18 @@ class PressSession:
         thickness = 1e3 * self._sensor.spec.gelpad.thickness
         deepest = max([_DEEPEST * thickness, *(1e3 * (stage.depth or 0.0) for stage in scene.trajectory)])
         return (
-            Control("depth", "depth [mm], 0 lifts off", 0.0, round(deepest, 2), 0.01, instead_of="force"),
-            Control("force", "force [N], held", 0.0, _STRONGEST, 0.05, instead_of="depth"),
+            Control(
+                "depth",
+                "depth [mm]",
+                0.0,
+                round(deepest, 2),
+                0.01,
+                "Below first touch; 0 lifts the object off",
+                instead_of="force",
+            ),
+            Control(
+                "force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear and twist", instead_of="depth"
+            ),
             Control("shear_x", "shear x [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("shear_y", "shear y [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),
@@ -195,7 +204,7 @@ class PressSession:
         """Edges of the simulated pad's own mesh over the smooth coat."""
         if not isinstance(self._pad, SoftPad):
             return ()
-        return (Lines("coat_mesh", self._coat_edges(self._pad.mesh.coat.rest), (235, 240, 245)),)
+        return (Lines("coat_mesh", self._coat_edges(self._pad.mesh.coat.rest), (205, 212, 222), 0.8),)
 
     def _coat_edges(self, vertices: np.ndarray) -> np.ndarray:
         rows, columns = self._pad.mesh.coat.shape  # type: ignore[union-attr]

@@ -48,6 +48,8 @@ class Control:
     low: float
     high: float
     step: float
+    hint: str = ""
+    """A sentence that the page shows on hovering."""
     instead_of: str = ""
     """Name of another control that this one takes over from when it is moved, as a force does from a depth; empty is none."""
 

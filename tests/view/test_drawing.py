@@ -12,7 +12,7 @@ from raytac.gel.pad import make_grid
 from raytac.specs import load_sensor
 from raytac.view.colours import ColourScale, legend_html
 from raytac.view.glb import coloured_glb, vertex_normals
-from raytac.view.picture import picture
+from raytac.view.picture import ARROW_SCALE, picture
 from raytac.view.sensor_view import grid_faces, sensor_lines, sensor_solids, strided
 from raytac.view.session import QUANTITIES, PadView
 
@@ -98,4 +98,4 @@ def test_arrows_go_over_the_image_only_where_markers_moved_and_are_wanted():
     near = [np.abs(inked - at[::-1]).max(axis=1) < 2.0 for at in rest]
     along = (inked[:, 1] > 20.0) & (inked[:, 1] < 33.0) & (np.abs(inked[:, 0] - 30.0) < 2.0)
     assert near[0].any() and near[1].any() and not near[2].any()
-    assert inked[along][:, 1].max() == pytest.approx(32.0, abs=0.5)  # 3 px, four times as long
+    assert inked[along][:, 1].max() == pytest.approx(20.0 + 3.0 * ARROW_SCALE, abs=0.5)

@@ -93,7 +93,7 @@ def test_what_is_shown_can_be_chosen(open_page):
     client.until(lambda: at(client, 1.0))
     client.set("colour", "normal traction [kPa]")
     client.until(lambda: "<div>normal traction [kPa]</div>" in client.texts(), "the legend")
-    client.set("see-through objects", False)
+    client.set("see through", False)
     client.until(lambda: client.nodes["/solids/block"]["opacity"] is None, "an opaque object")
 
 

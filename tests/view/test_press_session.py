@@ -125,7 +125,7 @@ def test_targets_out_of_reach_are_refused_and_leave_all_as_it_was(rigid):
 def test_a_force_that_no_depth_bears_is_an_error_and_the_session_goes_on():
     soft = replace(SENSOR, gelpad=replace(SENSOR.gelpad, youngs_modulus=1e3))
     press = PressSession(TactileSensor(soft, physics="rigid", outputs=("wrench",), pitch=0.2e-3), SCENE)
-    press.drive({"force": 10.0})
+    press.drive({"force": 20.0})
     with pytest.raises(RaytacError, match="deeper than the pad"):
         while press.advance():
             pass

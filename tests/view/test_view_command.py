@@ -36,7 +36,7 @@ def test_it_serves_until_ctrl_c(tmp_path):
         client = PageClient(int(found[1]))
         client.until(lambda: "sphere · gelsight_mini · rigid+phong" in client.texts(), "the title", 60.0)
         client.until(lambda: "paused" in client.texts(), "the first image", 60.0)
-        client.set("depth [mm], 0 lifts off", 0.5)
+        client.set("depth [mm]", 0.5)
         client.until(lambda: "held by the sliders" in client.texts() and "0.500 mm" in client.texts(), "the press", 60.0)
         client.close()
         running.send_signal(signal.SIGINT)
