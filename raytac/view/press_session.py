@@ -15,6 +15,7 @@ from raytac.gel.part import Part
 from raytac.physics.contact_state import ContactState
 from raytac.physics.part_surface import object_surface
 from raytac.physics.soft import SoftPad
+from raytac.physics.soft_bodies import OBJECT, PAD
 from raytac.sensor import TactileSensor
 from raytac.sensor.contact_width import LEAST_CELLS
 from raytac.specs import PressScene, validate_press
@@ -189,6 +190,9 @@ class PressSession:
     def _object_solids(self) -> tuple[Solid, ...]:
         if not self._pad.parts:
             return ()
+        soft = self._soft_object()
+        if soft is not None:
+            return (Solid("object", *soft, _OBJECT_COLOUR, hides_pads=True),)
         closed = [part for part in self._pad.parts if part.kind != "plane"]
         shapes = []
         if closed:
@@ -199,6 +203,14 @@ class PressSession:
                 Solid(f"object_plane_{k}", *_square(part, 2.0 * max(self._sensor.spec.gelpad.size)), _OBJECT_COLOUR, 0.5)
             )
         return tuple(shapes)
+
+    def _soft_object(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Surface of an object that deforms as it is now: vertices in the pad frame (V, 3) [m] and faces; None for a rigid one."""
+        solver = self._pad.solver if isinstance(self._pad, SoftPad) else None
+        if solver is None or not solver.body.is_soft:
+            return None
+        vertices, faces = solver.scene.mesh(OBJECT, PAD)
+        return vertices[0], faces
 
     def _coat_lines(self) -> tuple[Lines, ...]:
         """Edges of the simulated pad's own mesh over the smooth coat."""
@@ -219,9 +231,9 @@ class PressSession:
         if isinstance(self._pad, SoftPad):
             if surface.coat is not None:
                 reshaped["coat_mesh"] = self._coat_edges(surface.coat.positions[0])
-            soft = None if self._pad.solver is None else self._pad.solver.soft_object()
+            soft = self._soft_object()
             if soft is not None:
-                reshaped["object"], poses["object"] = soft[0][0], np.eye(4)
+                reshaped["object"], poses["object"] = soft[0], np.eye(4)
         warning = ""
         if frame.contact_cells is not None and frame.contact_cells[0] < LEAST_CELLS:
             cells = frame.contact_cells[0]
