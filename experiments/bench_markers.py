@@ -25,6 +25,7 @@ from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
+from raytac.markers.calibration import PUBLISHED
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
 from raytac.physics.rigid import RigidPad
 from raytac.physics.soft_mesh import pad_mesh
@@ -85,6 +86,9 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
 def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Args) -> tuple[list[float], str]:
     """Times of frames per environment [ms], after warming up, and the device."""
     envs = surfaces[0].batch
+    if model == PUBLISHED:
+        assert sensor.marker_motion is not None
+        model, sensor = "fots", replace(sensor, marker_motion=replace(sensor.marker_motion, punch=None))
     tracker = MarkerTracker(sensor, model, surfaces[0].grid, num_envs=envs, device=args.device)
     count = max(10, args.frames // envs)
     times = []
@@ -112,7 +116,7 @@ def main(args: Args) -> int:
     metrics: dict[str, Metric] = {}
     for envs in counts:
         surfaces = pressed(sensor, envs)
-        for model in MARKER_MODELS:
+        for model in (*MARKER_MODELS, PUBLISHED):
             times, device = measure(model, sensor, surfaces, args)
             key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
             metrics |= {

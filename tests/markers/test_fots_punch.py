@@ -67,7 +67,9 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
             g = t * math.sqrt(max(1 - t * t, 0.0))
             fade = math.exp(-(r - radius) / punch.reach)
             hat = x / max(np.hypot(*x), 1e-12)
-            shears += 2 / math.pi * fade * ((math.asin(t) - punch.anisotropy * g) * way + 2 * punch.anisotropy * g * hat * (hat @ way))
+            shears += (
+                2 / math.pi * fade * ((math.asin(t) - punch.anisotropy * g) * way + 2 * punch.anisotropy * g * hat * (hat @ way))
+            )
             es += 2 / math.pi * fade * math.asin(t)
             widest = 9 * math.pi / 32 / 1.5 * most / radius
             theta = min(max(theta, -widest), widest)
