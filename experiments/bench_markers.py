@@ -111,7 +111,7 @@ def main(args: Args) -> int:
         return 2
     sensor = load_sensor(args.sensor)
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
-        motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 2.0))
+        motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
         sensor = replace(sensor, marker_motion=motion)
     metrics: dict[str, Metric] = {}
     for envs in counts:

@@ -177,14 +177,21 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     active, shear, twist, ellipse, mean = (data.contacts[k] for k in (0, 2, 3, 4, 5))
     edge = np.sqrt(np.sqrt(np.maximum(ellipse[..., 0] * ellipse[..., 2] - ellipse[..., 1] ** 2, 0)))
     way = np.maximum(np.linalg.norm(shear, axis=-1), edge * np.abs(twist) / TWIST_SLIP)
-    slip_most = float((way[active] / mean[active]).max())
+    slip_most = float((way[active] / (mean * edge)[active]).max())
     dragged_rows = [rows for rows in (rows_of("shear"), rows_of("twist")) if len(rows)]
 
     def as_punch(x: np.ndarray) -> FotsConstants:
         return replace(found, punch=PunchSpec(_share(x[0]), 5e-3 * math.exp(x[1]), slip_most * _share(x[2])))
 
     if dragged_rows:
-        x, _ = pattern_search(lambda x: sum(error(as_punch(x), rows) for rows in dragged_rows), np.array([0.0, 0.0, 1.0]))
+
+        def cost(x: np.ndarray) -> float:
+            return sum(error(as_punch(x), rows) for rows in dragged_rows)
+
+        # Where nothing slips, slip does not matter: a coarse look finds where it begins to.
+        slips = np.linspace(-5.0, 3.0, 9)
+        begin = min(slips, key=lambda at: cost(np.array([0.0, 0.0, at])))
+        x, _ = pattern_search(cost, np.array([0.0, 0.0, begin]))
         found = as_punch(x)
     gain, stiffness, friction = _fit_force_field(data)
     return MarkerMotionSpec(

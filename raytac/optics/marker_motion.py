@@ -20,7 +20,8 @@ distance from G_c (``_outside`` has both for an ellipse), t = A / r and g(t) = t
     twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
 
 On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
-of mean indentation h̄ sticks up to |Δs| = c h̄ and |Δθ| A = ``TWIST_SLIP`` c h̄, and slips beyond.
+of mean indentation h̄ sticks up to |Δs| = c h̄ A and |Δθ| A = ``TWIST_SLIP`` c h̄ A, and slips beyond: by Coulomb, where 8 G A Δs / (2 − ν)
+reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G).
 """
 
 from __future__ import annotations
@@ -213,12 +214,14 @@ def _gaussian(mi: Any, place: Any, row: list[Any], ls: Any, smax: Any, lt: Any, 
 def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: Any) -> tuple[Any, Any, Any, Any]:
     """(e, Δd) of the shear and of the twist of one contact, of a disc that sticks."""
     a, b, c = row
-    most = slip * c.y
+    radius = dr.sqrt(dr.sqrt(dr.maximum(b.z * c.x - b.w * b.w, 1e-24)))
+    most = slip * c.y * radius
     way = _at_most(mi.Vector2f(a.w, b.x), most)
     out = place - (mi.Point2f(a.y, a.z) - way)
-    square, beyond = _outside(out, b.z, b.w, c.x)
-    radius, r2 = dr.sqrt(square), square + beyond
-    asin, g = dr.atan2(radius, dr.sqrt(beyond)), dr.sqrt(square * beyond) / r2
+    beyond = _outside(out, b.z, b.w, c.x)
+    r2 = radius * radius + beyond
+    root = dr.sqrt(beyond)
+    asin, g = dr.atan2(radius, root), radius * root / r2
     share = 2 / math.pi * a.x
     fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
     along = dr.dot(out, way) / dr.maximum(dr.squared_norm(out), 1e-18) * out
@@ -228,19 +231,18 @@ def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: An
     return share * fade * asin, sheared, wt, wt * _turned(mi, out, dr.clip(b.y, -widest, widest))
 
 
-def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> tuple[Any, Any]:
-    """(A², r² − A²) of a place ``out`` from the centre of the ellipse xᵀ T⁻¹ x = 1; 0 for the second inside.
+def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> Any:
+    """r² − A² of a place ``out`` from the centre of the ellipse xᵀ T⁻¹ x = 1 with A² = √det T; 0 inside.
 
-    A² = √det T, and r² − A² is the λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the place, the equipotentials of an
-    elliptic disc: ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
+    The λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the place, which are the equipotentials of an elliptic disc:
+    ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
     """
-    det = xx * yy - xy * xy
     b = dr.squared_norm(out) - xx - yy
-    c = det - (yy * out.x * out.x - 2 * xy * out.x * out.y + xx * out.y * out.y)
+    c = xx * yy - xy * xy - (yy * out.x * out.x - 2 * xy * out.x * out.y + xx * out.y * out.y)
     root = dr.sqrt(dr.maximum(b * b - 4 * c, 0))
     # The same root twice, without cancellation on either side of b = 0.
     beyond = dr.select(b > 0, 0.5 * (b + root), -2 * c / dr.maximum(root - b, 1e-18))
-    return dr.sqrt(dr.maximum(det, 1e-24)), dr.select(c < 0, beyond, 0)
+    return dr.select(c < 0, beyond, 0)
 
 
 def _at_most(way: Any, most: Any) -> Any:

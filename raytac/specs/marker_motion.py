@@ -21,7 +21,7 @@ class PunchSpec:
     reach: float
     """ℓ: length over which what a half-space would do fades in a pad of finite thickness [m]."""
     slip: float
-    """c: the contact sticks up to a shear of c times its mean indentation [-]."""
+    """c: the contact sticks up to a shear of c times its mean indentation times its radius [1/m]."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
     "punch": {
         "anisotropy": Number("[0, 1]"),
         "reach_mm": Number("(0, 1000]"),
-        "slip": Number("[0, 1000]"),
+        "slip_per_mm": Number("[0, 1000]"),
     },
     "force_field": {
         "gain": Number("[0, 100]"),
@@ -112,7 +112,7 @@ def marker_motion_text(motion: MarkerMotionSpec) -> str:
         else {
             "anisotropy": (punch.anisotropy, "kappa: nu / (2 - nu) on a half-space"),
             "reach_mm": (punch.reach * 1e3, "length over which the half-space's motion fades in the pad"),
-            "slip": (punch.slip, "shear that sticks, by mean indentation"),
+            "slip_per_mm": (punch.slip * 1e-3, "shear that sticks, by mean indentation times radius"),
         },
         "force_field": {
             "gain": (motion.field_gain, "displacement by penetration along a wall's normal"),

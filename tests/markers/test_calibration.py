@@ -52,7 +52,7 @@ def test_the_fit_finds_the_constants_again(sensor: SensorSpec, frames: list[Pres
 
 def test_the_fit_finds_the_punch_again(sensor: SensorSpec, grid: PadGrid) -> None:
     """Markers that move around a punch, some of them past its slip; Gaussians do not fit them."""
-    punch = PunchSpec(0.6, 6e-3, 1.5)
+    punch = PunchSpec(0.6, 6e-3, 700.0)
     moved = replace(sensor, marker_motion=replace(MOTION, punch=punch))
     frames = fots_presses(moved, grid)
     fitted = replace(sensor, marker_motion=fit_motion(ProbeData.of(sensor, frames), device="cpu"))
@@ -86,7 +86,7 @@ def test_the_tracker_at_the_probes_gives_what_the_fit_saw(sensor: SensorSpec, gr
 
 def test_the_file_of_a_fit_is_read_back(tmp_path) -> None:
     path = tmp_path / "made.toml"
-    for made in (MOTION, replace(MOTION, punch=PunchSpec(0.7, 6.25e-3, 2.0))):
+    for made in (MOTION, replace(MOTION, punch=PunchSpec(0.7, 6.25e-3, 1300.0))):
         path.write_text(marker_motion_text(made))
         again = load_marker_motion(path)
         for name in made.__dataclass_fields__:

@@ -16,9 +16,9 @@ from raytac.specs import PunchSpec, SensorSpec
 from tests.markers.pads import MOTION, fots_presses
 
 NU = 0.48
-HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e6)
+HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e9)
 """An elastic half-space on which nothing slips."""
-PAD = PunchSpec(0.7, 6e-3, 2.0)
+PAD = PunchSpec(0.7, 6e-3, 1e3)
 PLACES = np.random.default_rng(0).uniform(-8e-3, 8e-3, (200, 2))
 
 
@@ -50,7 +50,8 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
         shears, twists, es, et = np.zeros(2), np.zeros(2), 0.0, 0.0
         for gx, gy, sx, sy, theta, xx, xy, yy, mean in contacts:
             shape = np.array([[xx, xy], [xy, yy]])
-            way, most = np.array([sx, sy]), punch.slip * mean
+            radius = np.linalg.det(shape) ** 0.25
+            way, most = np.array([sx, sy]), punch.slip * mean * radius
             if np.hypot(*way) > most:
                 way = way * most / np.hypot(*way)
             x = np.array([mx, my]) - (np.array([gx, gy]) - way)
@@ -61,7 +62,6 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
                     low = middle
                 else:
                     high = middle
-            radius = np.linalg.det(shape) ** 0.25
             r = math.sqrt(radius**2 + low)
             t = radius / r
             g = t * math.sqrt(max(1 - t * t, 0.0))
@@ -108,7 +108,7 @@ def test_under_the_contact_the_skin_is_the_object(grid: PadGrid) -> None:
     """Shear: as far as the object; twist: a rotation, no linear cross product, at 0.5 rad."""
     inside = PLACES[np.linalg.norm(PLACES, axis=1) < 3e-3]
     assert len(inside) > 10
-    still = PunchSpec(0.7, 6e-3, 100.0)
+    still = PunchSpec(0.7, 6e-3, 1e5)
     way = (3e-4, -2e-4)
     np.testing.assert_allclose(moved(grid, still, [disc(3.4e-3, way=way)], inside), np.tile(way, (len(inside), 1)), atol=1e-9)
     c, s = math.cos(0.5), math.sin(0.5)
@@ -166,7 +166,7 @@ def test_no_load_moves_nothing(punch: PunchSpec | None, grid: PadGrid) -> None:
 
 
 def test_it_stops_where_it_slips(grid: PadGrid) -> None:
-    """Way up to c h̄, and half of that at half the indentation; a spin likewise."""
+    """Way up to c h̄ A, and half of that at half the indentation; a spin likewise."""
     centre = np.zeros((1, 2))
     for mean, most in ((3e-4, 6e-4), (1.5e-4, 3e-4)):
         for way, followed in ((0.5 * most, 0.5 * most), (most, most), (2 * most, most)):
