@@ -227,9 +227,20 @@ class World:
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
-    def step(self) -> StepReport:
-        """Advance every environment that has not failed by ``settings.dt``."""
+    def step(self, dt: float | None = None) -> StepReport:
+        """Advance every environment that has not failed by ``dt`` [s]; None: by ``settings.dt``.
+
+        On CUDA every new ``dt`` costs a recording; take few different ones.
+
+        Raises:
+            IpcError: ``dt`` is not positive, or differs from ``settings.dt`` with BDF2, whose formulas want equal steps.
+        """
+        if dt is not None and not 0.0 < dt < np.inf:
+            raise IpcError(f"dt = {dt}: it must be positive")
+        if dt is not None and dt != self.settings.dt and self.settings.integrator == "bdf2":
+            raise IpcError(f"dt = {dt}: with BDF2 every step is as long as settings.dt = {self.settings.dt}")
         pot, alive = self._potential, ~self._failed
+        pot.set_dt(dt or self.settings.dt)
         if not self._told:
             pot.goal_p.assign(self._goal_p)
             pot.goal_q.assign(self._goal_q)
@@ -415,6 +426,18 @@ class World:
             gap=_host(found.gap)[env, :n].copy(),
             force=_host(found.force)[env, :n].copy(),
         )
+
+    def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
+        """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+        body = self._index(name)
+        found = self._potential.collision.contacts
+        count, pair = _host(found.count), _host(found.pair)
+        there = np.zeros((self.num_envs, len(self.layout.pairs)), bool)
+        env, k = np.nonzero(np.arange(pair.shape[1]) < count[:, None])
+        there[env, pair[env, k]] = True
+        mine = np.flatnonzero((self.layout.pairs == body).any(axis=1) & there.any(axis=0))
+        other = self.layout.pairs[mine].sum(axis=1) - body
+        return {self.layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}
 
     # --- state -----------------------------------------------------------------------------------------------------------------
 

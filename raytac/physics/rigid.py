@@ -26,7 +26,7 @@ from raytac.physics.press_plan import (
     scene_parts,
 )
 from raytac.physics.rig import PressRig
-from raytac.specs.press import DYNAMICS, PressScene
+from raytac.specs.press import DYNAMICS, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CLEARANCE", "ContactState", "RigidPad"]
@@ -100,6 +100,8 @@ class RigidPad:
         self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
         self._rotation = rotation_matrix(scene.object.quaternion)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
+        self._environments: list[_Environment] = []
+        """Where the last state left the object; empty before the first, and without an object."""
         check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
 
     def run(self, steps_per_stage: int = 1) -> Iterator[ContactState]:
@@ -116,15 +118,27 @@ class RigidPad:
         """
         if steps_per_stage < 1:
             raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
-        environments = [self._start(b) for b in range(self.num_envs)] if self.parts else []
-        yield self._state(-1, "start", 1.0, environments)
+        self._environments = [self._start(b) for b in range(self.num_envs)] if self.parts else []
+        yield self._state(-1, "start", 1.0)
         for index, stage in enumerate(self.scene.trajectory):
-            before = [replace(e) for e in environments]
-            for step in range(1, steps_per_stage + 1):
-                for b, (e, old) in enumerate(zip(environments, before, strict=True)):
-                    if not e.failed:
-                        self._advance(e, old, index, b, step / steps_per_stage, steps_per_stage)
-                yield self._state(index, stage.kind, step / steps_per_stage, environments)
+            yield from self._through(index, stage, steps_per_stage)
+
+    def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[ContactState]:
+        """States along one more stage, from wherever the pad is now: for a loop in which somebody else decides where to go next.
+
+        A pad that was not run yet starts above the gel. The states are of no stage of the scene (their ``stage`` is −1). Nothing moves
+        before the first state is asked for; who stops asking leaves the pad on the way, and may follow another stage from there.
+
+        Raises:
+            InputError: ``steps`` below 1, or a stage that presses deeper than the pad or takes the object off it.
+            SpecError: a scene without object, or a stage that no pad can follow.
+        """
+        if steps < 1:
+            raise InputError("steps", value=steps, rule="must be a whole number >= 1")
+        check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
+        if not self._environments:
+            self._environments = [self._start(b) for b in range(self.num_envs)]
+        yield from self._through(-1, stage, steps)
 
     def peak(self, states: Iterable[ContactState]) -> ContactState:
         """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
@@ -169,6 +183,15 @@ class RigidPad:
         height = object_height(self.parts, pad_from_object, self.grid.x, self.grid.y, below=highest)
         return self._surround.surface(height, pad_from_object if self.parts else None)
 
+    def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[ContactState]:
+        """``steps`` states through a stage; ``index``: its number in the scene, −1 if it is none of the scene's."""
+        before = [replace(e) for e in self._environments]
+        for step in range(1, steps + 1):
+            for b, (e, old) in enumerate(zip(self._environments, before, strict=True)):
+                if not e.failed:
+                    self._advance(e, old, index, stage, b, step / steps, steps)
+            yield self._state(index, stage.kind, step / steps)
+
     def _start(self, b: int) -> _Environment:
         x, y = np.asarray(self.scene.object.position[:2]) + self._offsets[b]
         if not np.isfinite([x, y]).all() or (self._depths is not None and not np.isfinite(self._depths[b])):
@@ -187,9 +210,10 @@ class RigidPad:
     def _rig(self, stiffest: float) -> PressRig:
         return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
 
-    def _stage_error(self, index: int, error: InputError) -> SpecError:
-        """``error`` of a stage, under the file and key that asked for it, in the unit of the file."""
-        stage = self.scene.trajectory[index]
+    def _stage_error(self, index: int, stage: StageSpec, error: InputError) -> InputError | SpecError:
+        """``error`` of a stage, under the file and key that asked for it, in the unit of the file; as it is if no file did."""
+        if index < 0:
+            return error
         if stage.kind == "shear":
             name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
         elif stage.kind == "twist":
@@ -212,22 +236,25 @@ class RigidPad:
             self._touches[key] = float(pose[2, 3]), LoadLaw(gap, pitch[0] * pitch[1], self.sensor.gelpad)
         return self._touches[key]
 
-    def _advance(self, e: _Environment, old: _Environment, index: int, b: int, fraction: float, steps: int) -> None:
-        """Bring one environment from where it was before stage ``index`` to ``fraction`` of it."""
+    def _advance(
+        self, e: _Environment, old: _Environment, index: int, stage: StageSpec, b: int, fraction: float, steps: int
+    ) -> None:
+        """Bring one environment from where it was before a stage to ``fraction`` of it."""
         assert old.shear is not None
-        stage = self.scene.trajectory[index]
         previous_force = e.force
-        if stage.kind == "shear":
-            e.shear = old.shear + fraction * (np.asarray(stage.shear, float) - old.shear)
-        elif stage.kind == "twist":
-            e.twist = old.twist + fraction * (stage.twist - old.twist)
-        elif stage.kind == "indent":
-            e.by_force = stage.force is not None
         assert e.shear is not None
+        shear, twist = e.shear, e.twist
+        if stage.kind == "shear":
+            shear = old.shear + fraction * (np.asarray(stage.shear, float) - old.shear)
+        elif stage.kind == "twist":
+            twist = old.twist + fraction * (stage.twist - old.twist)
         try:
-            touch, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
+            touch, law = self._touch(e.origin[0] + shear[0], e.origin[1] + shear[1], twist)
         except InputError as error:
-            raise self._stage_error(index, error) from error
+            raise self._stage_error(index, stage, error) from error
+        e.shear, e.twist = shear, twist
+        if stage.kind == "indent":
+            e.by_force = stage.force is not None
         e.rig.place(e.origin, touch)
         lift = e.origin[2] - touch
         if stage.kind == "release":
@@ -241,7 +268,7 @@ class RigidPad:
             try:
                 law.depth_at(target)
             except InputError as error:
-                raise self._stage_error(index, error) from error
+                raise self._stage_error(index, stage, error) from error
             e.rig.joints = np.array([*e.shear, -max(e.depth, lift), e.twist])
             settled = e.rig.load(previous_force, target, stage.duration / steps, law.secant_stiffness)
             e.failed = not settled
@@ -270,8 +297,8 @@ class RigidPad:
         if abs(angle) > widest:
             e.stuck_twist = e.twist - np.sign(angle) * widest
 
-    def _state(self, stage: int, kind: str, fraction: float, environments: list[_Environment]) -> ContactState:
-        batch = self.num_envs
+    def _state(self, stage: int, kind: str, fraction: float) -> ContactState:
+        batch, environments = self.num_envs, self._environments
         pose, case = np.tile(np.eye(4), (2, batch, 1, 1))
         depth, force, torque, area = np.zeros((4, batch))
         shear = np.zeros((batch, 2))

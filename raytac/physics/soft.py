@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -22,6 +22,7 @@ from raytac.physics.press_plan import (
     per_environment,
     scene_parts,
 )
+from raytac.physics.soft_approach import STEP, TURN
 from raytac.physics.soft_bodies import object_body
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_mesh import PadMesh, pad_mesh
@@ -30,12 +31,8 @@ from raytac.physics.soft_reading import SoftReader, SoftReading
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["STEP", "SoftPad", "SoftState"]
+__all__ = ["SoftPad", "SoftState"]
 
-STEP = 1e-4
-"""Longest way of the object in one step of the solver [m]."""
-_TURN = 0.035
-"""Largest turn in one step [rad]: 0.1 mm at 3 mm from the axis."""
 _LIFT = 3.0
 """A release may go in steps so many times as long."""
 _CLOSE = 1e-6
@@ -111,7 +108,7 @@ class SoftPad:
         self._offsets = per_environment("offsets", offsets, (num_envs, 2))
         self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
         check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
-        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, self.parts)
+        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
         self._bar = tqdm(disable=True)
@@ -125,7 +122,7 @@ class SoftPad:
         self._forget()
         if self.parts:
             self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, self._offsets, self._lost)
-            self.solver = SoftContact(self.mesh, sensor.gelpad, self._body(), self._poses(), device)
+            self.solver = SoftContact(sensor, self.mesh, self._body(), self._poses(), device)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -150,10 +147,22 @@ class SoftPad:
             yield self._state(-1, "start", 1.0)
             for index, stage in enumerate(self.scene.trajectory):
                 self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
-                before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
-                for step in range(1, steps_per_stage + 1):
-                    self._advance(stage, step / steps_per_stage, *before)
-                    yield self._state(index, stage.kind, step / steps_per_stage)
+                yield from self._through(index, stage, steps_per_stage)
+
+    def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[SoftState]:
+        """States along one more stage, from wherever the pad is now; as ``RigidPad.follow``.
+
+        Raises:
+            InputError: ``steps`` below 1, or a stage deeper than any of the scene's: there the object's surface was left out.
+            SpecError: a scene without object, or a stage that no pad can follow.
+        """
+        if steps < 1:
+            raise InputError("steps", value=steps, rule="must be a whole number >= 1")
+        if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
+            rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"
+            raise InputError("stage", value=stage, rule=rule)
+        check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
+        yield from self._through(-1, stage, steps)
 
     def peak(self, states: Iterable[SoftState]) -> SoftState:
         """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
@@ -207,6 +216,13 @@ class SoftPad:
         self._stiffness = np.full(batch, np.nan)
         self._failed: np.ndarray = self._lost.copy()
 
+    def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[SoftState]:
+        """``steps`` states through a stage; ``index``: its number in the scene, −1 if it is none of the scene's."""
+        before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
+        for step in range(1, steps + 1):
+            self._advance(stage, step / steps, *before)
+            yield self._state(index, stage.kind, step / steps)
+
     def _advance(
         self, stage: StageSpec, fraction: float, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, force: np.ndarray
     ) -> None:
@@ -242,7 +258,7 @@ class SoftPad:
         short = np.clip(way, 0.0, self.mesh.d_hat) if is_last else 0.0
         self._go(depth - short, self._shear, self._twist)
         if is_last:
-            clearance = self._reader.clearance(self.solver, self._poses())
+            clearance = self._reader.clearance(self.solver.seen(self._poses()))
             self._kept = np.where(np.isfinite(clearance) & ~self._failed, clearance, self._kept)
             self._depth = depth
             self._step()
@@ -253,7 +269,7 @@ class SoftPad:
     def _go(self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0) -> None:
         """Drive straight to a place in steps short enough; a force that is kept is kept on the way."""
         begun = np.maximum(self._depth, -self.mesh.d_hat) if stretch == 1.0 else self._depth
-        ways = np.abs(depth - begun), np.linalg.norm(shear - self._shear, axis=1), np.abs(twist - self._twist) * (STEP / _TURN)
+        ways = np.abs(depth - begun), np.linalg.norm(shear - self._shear, axis=1), np.abs(twist - self._twist) * (STEP / TURN)
         steps = max(int(np.ceil(max(way.max() for way in ways) / (STEP * stretch) - 1e-9)), 1)
         old_shear, old_twist = self._shear, self._twist
         for step in range(1, steps + 1):
@@ -278,7 +294,7 @@ class SoftPad:
         """Correct until the coat, not the barrier's shell, is at the depth."""
         assert self.solver is not None
         for _ in range(_REFINEMENTS):
-            clearance = self._reader.clearance(self.solver, self._poses())
+            clearance = self._reader.clearance(self.solver.seen(self._poses()))
             off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
             if np.abs(off).max() < _CLOSE:
                 return
@@ -349,15 +365,13 @@ class SoftPad:
             rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
             coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
             surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
-            reading = SoftReading(
-                surface, np.zeros_like(coat.positions), np.full(batch, np.nan), poses, np.full(rest.shape, np.inf)
-            )
+            reading = SoftReading(surface, np.zeros_like(coat.positions), np.full(batch, np.nan), (), np.full(rest.shape, np.inf))
             failed = np.zeros(batch, bool)
             return SoftState(
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
             )
         failed: np.ndarray = self._failed.copy()
-        reading = self._reader.read(self.solver, self._poses(), failed)
+        reading = self._reader.read(self.solver.seen(self._poses()), failed)
         self._last = reading
         surface, forces = reading.surface, reading.forces
         assert surface.coat is not None
@@ -366,7 +380,7 @@ class SoftPad:
         torque = (arm[:, :, 0] * forces[:, :, 1] - arm[:, :, 1] * forces[:, :, 0]).sum(axis=1)
         cell = self.grid.pitch[0] * self.grid.pitch[1]
         area = np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
-        depth = np.where(failed, np.nan, self._places.origin[:, 2] - reading.poses[:, 2, 3])
+        depth = np.where(failed, np.nan, self._places.origin[:, 2] - reading.poses[0][:, 2, 3])
         case = self._case()
         case = np.tile(np.eye(4), (batch, 1, 1)) if case is None else case
         case[failed] = np.nan
@@ -374,7 +388,7 @@ class SoftPad:
             stage,
             kind,
             fraction,
-            reading.poses,
+            reading.poses[0],
             case,
             depth,
             -total[:, 2],
@@ -398,14 +412,17 @@ class SoftPad:
             return None
         return self._places.case(self._kept - self._depth, self._shear, self._twist)
 
-    def _body(self):
+    @property
+    def _deepest(self) -> float:
+        """Depth that the object's surface was made for [m]; a force may go as deep as the pad."""
         deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
-        if self._depths is not None:
-            deepest = max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+        return deepest if self._depths is None else max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+
+    def _body(self):
         settings = {
             "weight": self._weight,
             "edge_length": 0.75 * float(np.diff(self.mesh.coat.lines_x).mean()),
-            "lowest": deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
+            "lowest": self._deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
             "sag": _SAG * self.mesh.d_hat,
         }
         try:

@@ -18,6 +18,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.optics.base import OPTICAL_OUTPUTS
+from raytac.physics.pad_reading import PadReading
 from raytac.sensor.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.imaging import Imaging
 from raytac.sensor.options import (
@@ -32,7 +33,7 @@ from raytac.sensor.options import (
     sensor_spec,
     warn_of_other_shape,
 )
-from raytac.sensor.pad import load_pad, pad_forces, state_surface
+from raytac.sensor.pad import load_pad, pad_forces, reading_forces, state_surface
 from raytac.specs import PressScene, SensorSpec, validate_press
 from raytac.specs.press import PADS
 
@@ -246,8 +247,8 @@ class TactileSensor:
             self._tracker.reset()
         return self._pad
 
-    def update(self, state: ContactState | GelSurface) -> TactileFrame:
-        """Frame of a gel surface, or of a state of the physics that ``load`` or ``press`` set up.
+    def update(self, state: ContactState | GelSurface | PadReading) -> TactileFrame:
+        """Frame of a gel surface, of a state of the physics that ``load`` or ``press`` set up, or of what a world's pad reads.
 
         With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
 
@@ -258,6 +259,9 @@ class TactileSensor:
         if isinstance(state, GelSurface):
             surface, force, area, failed = state, None, None, None
             forces: dict[str, Any] = {}
+        elif isinstance(state, PadReading):
+            surface, force, area, failed = state.surface, state.force, None, state.failed
+            forces = reading_forces(state, self.outputs)
         else:
             surface, failed = state_surface(self._pad, state), state.failed
             assert self._pad is not None

@@ -21,8 +21,11 @@ from raytac.specs.sensor import (
 )
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.sensor_file import load_lights, load_sensor, with_lights
+from raytac.specs.task import BodySpec, MountSpec, RobotSpec, TaskScene
+from raytac.specs.task_file import load_task
 
 __all__ = [
+    "BodySpec",
     "CameraSpec",
     "CaseSpec",
     "CoatSpec",
@@ -31,19 +34,23 @@ __all__ = [
     "LightsSpec",
     "MarkerMotionSpec",
     "MarkerSpec",
+    "MountSpec",
     "ObjectSpec",
     "PressScene",
     "PunchSpec",
     "RefractionSpec",
     "ResponseSpec",
+    "RobotSpec",
     "SensorSpec",
     "StageSpec",
+    "TaskScene",
     "available",
     "load_lights",
     "load_marker_motion",
     "load_mesh",
     "load_press",
     "load_sensor",
+    "load_task",
     "validate_press",
     "validate_sensor",
     "with_lights",

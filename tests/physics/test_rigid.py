@@ -338,3 +338,34 @@ def test_impossible_scenes_are_refused() -> None:
         object_parts(ObjectSpec("sphere", {"radius": -1.0}, (0.0, 0.0, 0.0), IDENTITY, 0.1))
     with pytest.raises(InputError, match="offsets"):
         press(scene_of("sphere"), num_envs=2, offsets=np.zeros((3, 2)))
+
+
+def test_stages_that_are_followed_one_by_one_are_those_of_the_scene():
+    stages = (
+        StageSpec("indent", depth=0.6e-3),
+        StageSpec("shear", shear=(0.4e-3, 0.0)),
+        StageSpec("twist", twist=0.2),
+        StageSpec("release"),
+    )
+    whole = RigidPad(sensor_with(), scene_of("sphere", *stages), pitch=PITCH)
+    followed = RigidPad(sensor_with(), scene_of("sphere"), pitch=PITCH)
+    for ran, stage in zip(list(whole.run(2))[2::2], stages, strict=True):
+        state = list(followed.follow(stage, 2))[-1]
+        assert (state.stage, state.kind, state.fraction) == (-1, ran.kind, 1.0)
+        for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque"):
+            np.testing.assert_array_equal(getattr(state, name), getattr(ran, name))
+
+
+def test_a_stage_may_be_left_on_the_way_and_one_that_fails_leaves_the_object_where_it_was():
+    pad = RigidPad(sensor_with(), scene_of("sphere", StageSpec("indent", depth=0.6e-3)), pitch=PITCH)
+    half = next(pad.follow(StageSpec("indent", depth=0.8e-3), 2))
+    assert half.depth[0] == pytest.approx(0.4e-3)
+    with pytest.raises(InputError, match="no part of the object"):
+        list(pad.follow(StageSpec("shear", shear=(1.0, 0.0))))
+    state = next(pad.follow(StageSpec("shear", shear=(0.1e-3, 0.0))))
+    assert state.depth[0] == pytest.approx(0.4e-3, abs=1e-5) and state.shear_force[0, 0] > 0.0
+    assert state.pad_from_object[0, 0, 3] - half.pad_from_object[0, 0, 3] == pytest.approx(0.1e-3)
+    with pytest.raises(SpecError, match="thickness"):
+        list(pad.follow(StageSpec("indent", depth=1.0)))
+    with pytest.raises(InputError, match="steps"):
+        list(pad.follow(StageSpec("release"), 0))

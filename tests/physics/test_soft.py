@@ -327,3 +327,23 @@ def test_an_object_that_overlaps_the_pad_at_the_start_is_named(tmp_path):
     scene = PressScene("cap", spec, (indent(0.4e-3),))
     with pytest.raises(RaytacError, match=r"overlaps the pad where it starts"):
         soft(scene)
+
+
+def test_stages_that_are_followed_one_by_one_are_those_of_the_scene():
+    stages = indent(0.3e-3), StageSpec("shear", shear=(0.1e-3, 0.0)), StageSpec("release")
+    pad = soft(press(*stages))
+    ran = list(pad.run())[1:]
+    pad.reset()
+    for state, stage in zip(ran, stages, strict=True):
+        (followed,) = pad.follow(stage)
+        assert (followed.stage, followed.kind) == (-1, state.kind)
+        assert followed.pad_from_object == pytest.approx(state.pad_from_object, abs=1e-9)
+        assert followed.normal_force == pytest.approx(state.normal_force, rel=1e-5, abs=1e-9)
+
+
+def test_a_stage_deeper_than_the_surface_that_was_made_is_refused():
+    pad = soft(press(indent(0.3e-3)))
+    with pytest.raises(InputError, match=r"deepest stage, 0\.3 mm"):
+        next(pad.follow(indent(0.4e-3)))
+    with pytest.raises(InputError, match="deepest"):
+        next(pad.follow(indent(force=1.0)))
