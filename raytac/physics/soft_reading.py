@@ -9,13 +9,14 @@ import numpy as np
 
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.coat_surface import CoatPlaces, CoatSurface
+from raytac.gel.fine_contact import FineContact, FineGrid
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.part import Part, mesh_part
 from raytac.gel.product import sandwich
-from raytac.gel.spline import hat_matrix
 from raytac.gel.standoff import ContactFit, StandOff
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.physics.pad_compliance import coat_compliance
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
@@ -23,6 +24,8 @@ __all__ = ["SeenObject", "SeenPad", "SoftReader", "SoftReading"]
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
+_FINE = 0.1e-3
+"""Spacing of the grid on which the contact is found [m]."""
 _BEHIND = 1e-3
 """An underside so far below the coat [m] is that of an object beside or behind the pad: no contact overlaps by that much."""
 
@@ -87,8 +90,9 @@ class SoftReader:
         self._surface = CoatSurface(mesh.coat, gelpad)
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
         self._rest = grid.rest.astype(np.float32)
-        lines = (mesh.coat.lines_y, grid.y), (mesh.coat.lines_x, grid.x)
-        self._hat_y, self._hat_x = (hat_matrix(at, to).astype(np.float32) for at, to in lines)
+        self._gelpad = gelpad
+        self._fine_pad = make_grid(gelpad, max(_FINE, *grid.pitch))
+        self._fine: tuple[FineContact, FineGrid] | None = None
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._stand_off = StandOff(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
         corners = mesh.coat.rest[mesh.coat.faces]
@@ -118,15 +122,19 @@ class SoftReader:
             coat[b, :, 2] += fit.shift
             height[b] = self._heights(places, coat[b])
             if not np.isfinite(fit.clearance):
-                undersides[b] = self._underside(seen, b)
+                undersides[b] = self._underside(seen, b, self.grid)
                 continue
             clearance[b] = fit.clearance
             for pose in poses:
                 pose[b, 2, 3] -= fit.clearance
             load = np.maximum(-forces[b, :, 2], 0.0)
-            under = undersides[b] = self._underside(seen, b, fit.clearance, height[b])
-            borne = sandwich(self._hat_y, load.reshape(self.mesh.coat.shape), self._hat_x.T)
-            height[b], touched[b] = self._stand_off.close(height[b], under, borne)
+            fine, to_grid = self._fine_contact()
+            upwards = seen.coat[b, :, 2] - self.mesh.coat.rest[:, 2]
+            smooth = self._surface.rise(places, upwards)
+            near = self._underside(seen, b, self._fine_pad, fit.clearance, fine.here.lattice(smooth) + self._fine_pad.rest)
+            shape = fine.solve(places, upwards, load, near - self._fine_pad.rest)
+            under = undersides[b] = self._underside(seen, b, self.grid, fit.clearance, height[b])
+            height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
             centre[b] = load @ coat[b, :, :2] / load.sum()
         deformed = DeformedCoat(self.mesh.coat, coat)
         surface = GelSurface(self.grid, height, touched, centre, _touched_pose(seen, poses), deformed)
@@ -154,17 +162,27 @@ class SoftReader:
         rise = self._surface.rise(places, coat[:, 2] - self.mesh.coat.rest[:, 2])
         return self._rest + sandwich(self._rows, rise, self._columns)
 
-    def _underside(self, seen: SeenPad, b: int, clearance: float = 0.0, height: np.ndarray | None = None) -> np.ndarray:
-        """Underside of the shown objects over the grid [m], (Ny, Nx); without what is far below ``height``, the smooth coat."""
-        under = np.full(self.grid.shape, np.inf)
-        highest = float(self.grid.rest.max())
+    def _fine_contact(self) -> tuple[FineContact, FineGrid]:
+        """What finds the contact, and what takes it to the grid; made at the first contact, since the mesh's compliance takes a while."""
+        if self._fine is None:
+            found, continued = (coat_compliance(self.mesh, self._gelpad, rollers=rollers) for rollers in (False, True))
+            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found, continued)
+            self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y)
+        return self._fine
+
+    def _underside(
+        self, seen: SeenPad, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Underside of the shown objects over a grid [m], (Ny, Nx); without what is far below the ``smooth`` coat there, if it is given."""
+        under = np.full(grid.shape, np.inf)
+        highest = float(grid.rest.max())
         for thing in seen.objects:
             if thing.counts(b):
                 parts, pose = thing.shape(b, clearance)
                 below = highest if thing.surface is None else np.inf
-                np.minimum(under, object_height(parts, pose[None], self.grid.x, self.grid.y, below=below)[0], out=under)
-        if len(seen.objects) > 1 and height is not None:
-            under[under < height - _BEHIND] = np.inf
+                np.minimum(under, object_height(parts, pose[None], grid.x, grid.y, below=below)[0], out=under)
+        if len(seen.objects) > 1 and smooth is not None:
+            under[under < smooth - _BEHIND] = np.inf
         return under
 
 
