@@ -65,6 +65,8 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    pitch: float
+    """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     physics: str
     """How the gel deforms: as asked for, else as the scene that was loaded last asks, else ``rigid``."""
 
@@ -132,8 +134,8 @@ class TactileSensor:
         self.resolution = size if size is not None else self.spec.camera.resolution
         warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.num_envs = device, num_envs
-        self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
-        self.grid = make_grid(self.spec.gelpad, self._pitch)
+        self.pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
+        self.grid = make_grid(self.spec.gelpad, self.pitch)
         self._level: str | PadMesh = pad or PADS[0]
         self.markers, self._marker_perturbation = markers, marker_perturbation
         if markers is not None:
@@ -236,7 +238,7 @@ class TactileSensor:
             physics=self.physics,
             level=self._level,
             device=self.device,
-            pitch=self._pitch,
+            pitch=self.pitch,
             num_envs=self.num_envs,
             seed=self.seed,
             offsets=offsets,

@@ -20,6 +20,7 @@ MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,7 @@ from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import pose, world_from_site
 from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedBody, ComposedScene
+from raytac.world.state import Controller, is_lost
 
 __all__ = ["RigidPads", "Touch"]
 
@@ -87,15 +89,12 @@ class _Pad:
         least = float(gap.min())
         if not least < 0.0:
             return None
-        overlap = np.maximum(-gap, 0.0)
-        total = float(overlap.sum())
-        columns, rows = overlap.sum(axis=0), overlap.sum(axis=1)
-        touched = overlap > 0.0
-        z = float((overlap[touched] * under[touched]).sum()) / total
-        centre = np.array([columns @ grid.x / total, rows @ grid.y / total, z])
-        slope = (overlap * self.slope_x).sum() / total, (overlap * self.slope_y).sum() / total
-        normal = np.array([-slope[0], -slope[1], 1.0])
-        return Touch(-_refined(gap, least), centre, normal / np.linalg.norm(normal), gap)
+        j, i = (gap < 0.0).nonzero()
+        share = gap[j, i]
+        share = share / share.sum()
+        centre = np.array([share @ grid.x[i], share @ grid.y[j], share @ under[j, i]])
+        normal = np.array([-(share @ self.slope_x[j, i]), -(share @ self.slope_y[j, i]), 1.0])
+        return Touch(-_refined(gap, least), centre, normal / math.sqrt(normal @ normal), gap)
 
     def law(self, touch: Touch) -> LoadLaw:
         """Load law of the body that touches, at this place and angle."""
@@ -121,20 +120,33 @@ class RigidPads:
         self._contact = mujoco.MjContact()
         self._force = np.empty(6)
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
+        self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int]) -> None:
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
         """Forget what environments went through."""
         for b in envs:
             self._laws[b] = {}
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
 
-    def renew(self, b: int) -> None:
-        """Ask for the load laws of an environment anew, once a control step: they hold while bodies hardly roll or slide on the pad."""
-        self._laws[b] = {}
+    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
+        scene = self.composed.scene
+        for b, (data, controller) in enumerate(zip(datas, controllers, strict=True)):
+            if failed[b]:
+                continue
+            self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
+            for _ in range(round(scene.control_timestep / scene.timestep)):
+                touching = self._step(data, b, controller)
+                if is_lost(data):
+                    failed[b] = True
+                    break
+            else:
+                self._read_forces(data, b, touching)
+                mujoco.mj_kinematics(self.model, data)  # so that poses are those of the end of the step
 
-    def step(self, data: mujoco.MjData, b: int, control) -> None:
-        """One step of MuJoCo with the pads' contacts; ``control`` (data) writes the controls when the state is up to date."""
+    def _step(self, data: mujoco.MjData, b: int, control: Controller) -> list[tuple[str, int]]:
+        """One step of MuJoCo with the pads' contacts, which are returned: sensor and index of the contact."""
         model = self.model
         mujoco.mj_step1(model, data)
         touching = self._add_contacts(data, b)
@@ -144,9 +156,9 @@ class RigidPads:
             mujoco.mj_island(model, data)
             mujoco.mj_projectConstraint(model, data)
             mujoco.mj_referenceConstraint(model, data)
-        control(data)
+        control(data, float(data.time))
         mujoco.mj_step2(model, data)
-        self._read_forces(data, b, touching)
+        return touching
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
@@ -233,7 +245,7 @@ class RigidPads:
         contact.pos[:] = rotation @ touch.centre + data.site_xpos[pad.site]
         contact.dist, contact.includemargin, contact.dim, contact.exclude = -touch.depth, 0.0, 6, 0
         natural = law.secant_stiffness(touch.depth) * compliance
-        loss = float(np.clip((_RATE / step) ** 2 / natural, 1e-3, 0.5))  # 1 − d
+        loss = min(max((_RATE / step) ** 2 / natural, 1e-3), 0.5)  # 1 − d
         stiffness = natural * loss
         contact.solimp[:] = 1.0 - loss, 1.0 - loss, 1e-3, 0.5, 2.0
         contact.solref[:] = -stiffness, -2.0 * stiffness**0.5
@@ -260,7 +272,7 @@ class RigidPads:
             site = self.pads[name].site
             # Place and force are of the start of this step, the site's too until the next step's kinematics.
             rotation, origin = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
-            torque = torque + np.cross(contact.pos - origin, force)
+            torque = torque + _cross(contact.pos - origin, force)
             self._wrench[name][b] += np.concatenate([force @ rotation, torque @ rotation])
 
 
@@ -279,8 +291,14 @@ def _relative(world_from_pad: np.ndarray, data: mujoco.MjData, body: int) -> np.
 def _frame(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Rows of a right-handed frame whose first is ``normal`` and whose second is near ``along``, (9,)."""
     second = along - (along @ normal) * normal
-    second = second / np.linalg.norm(second)
-    return np.concatenate([normal, second, np.cross(normal, second)])
+    second = second / math.sqrt(second @ second)
+    return np.concatenate([normal, second, _cross(normal, second)])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of two vectors; NumPy's own takes twenty times as long for one pair."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _refined(gap: np.ndarray, least: float) -> float:

@@ -11,7 +11,10 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-__all__ = ["Control", "Controller", "WorldState"]
+__all__ = ["Control", "Controller", "WorldState", "is_lost"]
+
+_LARGEST_SPEED = 1e4
+"""Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
 
 Controller = Callable[[mujoco.MjData, float], None]
 """Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
@@ -38,3 +41,8 @@ class WorldState:
     """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
     report: dict[str, np.ndarray] = field(default_factory=dict)
     """What the pads' solver says of this step, each (B,); empty with the rigid pad."""
+
+
+def is_lost(data: mujoco.MjData) -> bool:
+    """Whether a state of MuJoCo is beyond use: a number is not finite, or a joint runs away."""
+    return not ((np.abs(data.qvel) < _LARGEST_SPEED).all() and np.isfinite(data.qpos).all())

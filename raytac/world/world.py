@@ -5,16 +5,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.markers.contacts import chosen_envs
+from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.pose import pose
@@ -27,10 +29,11 @@ from raytac.world.compose import compose
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.state import Control, Controller, WorldState
 
+if TYPE_CHECKING:
+    from raytac.world.soft_pads import SoftPads
+
 __all__ = ["TactileWorld"]
 
-_LARGEST_SPEED = 1e4
-"""Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
 _OVERLAP = 1e-4
 """How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
 
@@ -111,15 +114,25 @@ class TactileWorld:
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.arm: Arm | None = self.composed.arm
         self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
-        self._pads = self._make_pads()
         self._failed = np.zeros(num_envs, bool)
-        self.reset()
+        self._start_over(range(num_envs))
+        self._pads = self._make_pads()
         self._check_start()
 
-    def _make_pads(self) -> RigidPads:
+    def _make_pads(self) -> RigidPads | SoftPads:
         if self.physics == "rigid":
             return RigidPads(self.composed, self.num_envs)
-        raise InputError("physics", value=self.physics, rule="is not there yet for worlds", choices=("rigid",))
+        check_solver("physics='ipc'")
+        from raytac.world.soft_pads import SoftPads
+
+        return SoftPads(
+            self.composed,
+            self.data,
+            level=self.pad,
+            coupling=self.coupling,
+            pitch=self.sensors[self.sensor_names[0]].pitch,
+            device=resolve_device(self.device, ray_tracing=False),
+        )
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -140,17 +153,21 @@ class TactileWorld:
         Raises ``InputError`` for an environment that does not exist.
         """
         chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
-        for b in chosen:
+        self._start_over(chosen)
+        self._pads.reset(chosen, self.data)
+        for sensor in self._sensors.values():
+            if sensor.markers is not None:
+                sensor.reset_markers(chosen)
+        return self.state()
+
+    def _start_over(self, envs: Iterable[int]) -> None:
+        """MuJoCo's part of a reset."""
+        for b in envs:
             data = self.data[b]
             mujoco.mj_resetData(self.model, data)
             data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
             mujoco.mj_forward(self.model, data)
             self._failed[b] = False
-        self._pads.reset(chosen)
-        for sensor in self._sensors.values():
-            if sensor.markers is not None:
-                sensor.reset_markers(chosen)
-        return self.state()
 
     def step(self, control: Control | None = None) -> WorldState:
         """Advance every environment by ``scene.control_timestep``.
@@ -161,19 +178,7 @@ class TactileWorld:
         Raises:
             InputError: controls of the wrong shape or number, or not finite.
         """
-        steps = round(self.scene.control_timestep / self.scene.timestep)
-        controllers = self._controllers(self.hold if control is None else control)
-        for b, (data, controller) in enumerate(zip(self.data, controllers, strict=True)):
-            if self._failed[b]:
-                continue
-            self._pads.renew(b)
-            for _ in range(steps):
-                self._pads.step(data, b, lambda d, c=controller: c(d, float(d.time)))
-                if not (np.abs(data.qvel) < _LARGEST_SPEED).all() or not np.isfinite(data.qpos).all():
-                    self._failed[b] = True
-                    break
-            else:
-                mujoco.mj_kinematics(self.model, data)  # so that poses are those of the end of the step
+        self._pads.advance(self.data, self._controllers(self.hold if control is None else control), self._failed)
         return self.state()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
@@ -193,7 +198,9 @@ class TactileWorld:
         }
         joints = None if arm is None else _stack([d.qpos[arm.qpos] for d in self.data], lost)
         wrench = {name: np.where(lost[:, None], np.nan, self._pads.wrench(name)) for name in self.sensor_names}
-        return WorldState(np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy())
+        return WorldState(
+            np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
+        )
 
     def observe(self, sensors: Sequence[str] | None = None) -> dict[str, TactileFrame]:
         """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
@@ -212,6 +219,25 @@ class TactileWorld:
             sensor = self.sensors[name]
             frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
         return frames
+
+    def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of a body or of a simulated pad as it is: vertices (B, n, 3) [m], world frame, and faces (F, 3).
+
+        Raises ``InputError`` for a name that is not there, or a half-space, which has no end.
+        """
+        if self.physics == "ipc" and name in self._pads.meshes:  # type: ignore[union-attr]
+            return self._pads.soft.mesh(name)  # type: ignore[union-attr]
+        body = self.composed.bodies.get(name)
+        if body is None or body.spec.kind == "plane":
+            there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
+            there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
+            rule = "must be the name of a body or a simulated pad, and no half-space"
+            raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
+        from raytac.physics.part_surface import object_surface
+
+        surface = object_surface(body.parts)
+        poses = self.state().world_from_body[name]
+        return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
 
     def _controllers(self, control: Control) -> list[Controller]:
         if isinstance(control, np.ndarray):
