@@ -157,7 +157,7 @@ def draw(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSens
             shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
         figure.colorbar(shown, ax=list(line[2:4]), shrink=0.85, pad=0.01)
         off = dents[0] - dents[1]
-        shown = axis = line[4].imshow(off, extent=extent, cmap="PuOr", vmin=-DIFFERENCE_MM, vmax=DIFFERENCE_MM)
+        shown = line[4].imshow(off, extent=extent, cmap="PuOr", vmin=-DIFFERENCE_MM, vmax=DIFFERENCE_MM)
         figure.colorbar(shown, ax=line[4], shrink=0.85, pad=0.02)
         for axis in line:
             axis.set(xlim=(left, right), ylim=(bottom, top), xticks=(-5, 0, 5), yticks=(-5, 0, 5))
