@@ -117,6 +117,8 @@ class RigidPads:
         self._friction = [body.spec.friction for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
+        self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
+        """Body that each pad showed deepest last; −1: none."""
         self._contact = mujoco.MjContact()
         self._force = np.empty(6)
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
@@ -126,8 +128,8 @@ class RigidPads:
         """Forget what environments went through."""
         for b in envs:
             self._laws[b] = {}
-            for wrench in self._wrench.values():
-                wrench[b] = 0.0
+            for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
+                wrench[b], pressed[b] = 0.0, -1
 
     def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
@@ -187,7 +189,7 @@ class RigidPads:
                 height[b] = np.nan
                 continue
             world_from_pad = world_from_site(data, pad.site)
-            deepest = 0.0
+            deepest, pressed = 0.0, -1
             for i, body in enumerate(self.bodies):
                 pad_from_body = _relative(world_from_pad, data, body.index)
                 if not self._is_near(pad, pad_from_body, i):
@@ -195,8 +197,12 @@ class RigidPads:
                 under = object_height(body.parts, pad_from_body[None], grid.x, grid.y, below=highest)[0]
                 depth = float((grid.rest - under).max())
                 if depth > deepest:
-                    deepest, poses[b] = depth, pad_from_body
+                    deepest, pressed, poses[b] = depth, i, pad_from_body
                 np.minimum(height[b], under, out=height[b])
+            # From one body to another is no motion of either.
+            if pressed != self._pressed[name][b] and self._pressed[name][b] >= 0:
+                poses[b] = np.nan
+            self._pressed[name][b] = pressed
         surface = self._shown[name][1].surface(height, poses)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
         return PadReading(surface, wrench, failed.copy(), lambda: _traction(surface, wrench))
