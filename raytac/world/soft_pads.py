@@ -136,7 +136,12 @@ class SoftPads:
             since += 1
             cases, led = self._now(datas, failed)
             # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
-            early = self._coupling is not None and since < interval and step < steps and not self.soft.is_small(cases, led)
+            early = (
+                self._coupling is not None
+                and since < interval
+                and step < steps
+                and not self.soft.is_small(cases, led, since * scene.timestep)
+            )
             if since == interval or step == steps or early:
                 reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
                 since = 0
