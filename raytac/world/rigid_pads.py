@@ -81,19 +81,27 @@ class _Pad:
         self.highest = float(self.coarse.rest.max())
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
 
-    def touch(self, parts: Sequence, pad_from_body: np.ndarray) -> Touch | None:
-        """How a body at a pose (4, 4) overlaps the resting pad; None where it does not."""
+    def touch(self, parts: Sequence, pad_from_body: np.ndarray, radius: float) -> Touch | None:
+        """How a body at a pose (4, 4) overlaps the resting pad; None where it does not. ``radius`` [m] of a ball that holds the body."""
         grid = self.coarse
-        under = object_height(parts, pad_from_body[None], grid.x, grid.y, below=self.highest)[0]
-        gap = under - grid.rest
+        columns, rows = (
+            slice(*np.searchsorted(line, (at - radius, at + radius)))
+            for line, at in zip((grid.x, grid.y), pad_from_body[:2, 3], strict=True)
+        )
+        x, y = grid.x[columns], grid.y[rows]
+        if len(x) < 2 or len(y) < 2:
+            return None
+        under = object_height(parts, pad_from_body[None], x, y, below=self.highest)[0]
+        gap = under - grid.rest[rows, columns]
         least = float(gap.min())
         if not least < 0.0:
             return None
         j, i = (gap < 0.0).nonzero()
         share = gap[j, i]
         share = share / share.sum()
-        centre = np.array([share @ grid.x[i], share @ grid.y[j], share @ under[j, i]])
-        normal = np.array([-(share @ self.slope_x[j, i]), -(share @ self.slope_y[j, i]), 1.0])
+        centre = np.array([share @ x[i], share @ y[j], share @ under[j, i]])
+        slope = share @ self.slope_x[rows, columns][j, i], share @ self.slope_y[rows, columns][j, i]
+        normal = np.array([-slope[0], -slope[1], 1.0])
         return Touch(-_refined(gap, least), centre, normal / math.sqrt(normal @ normal), gap)
 
     def law(self, touch: Touch) -> LoadLaw:
@@ -217,7 +225,8 @@ class RigidPads:
 
     def _touch(self, data: mujoco.MjData, pad: _Pad, i: int) -> Touch | None:
         pad_from_body = _relative(world_from_site(data, pad.site), data, self.bodies[i].index)
-        return pad.touch(self.bodies[i].parts, pad_from_body) if self._is_near(pad, pad_from_body, i) else None
+        near = self._is_near(pad, pad_from_body, i)
+        return pad.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
 
     def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]]:
         """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact)."""
