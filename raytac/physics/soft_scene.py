@@ -17,6 +17,7 @@ from raytac.physics.soft_approach import STEP, TURN, Mover, allowed_share
 from raytac.physics.soft_bodies import SceneBody, pad_body
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_reading import SeenObject, SeenPad, SoftReader, SoftReading
+from raytac.physics.soft_stiffness import pad_stiffness
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CREEP", "MOST_SUBSTEPS", "ScenePad", "SceneReport", "SceneState", "SoftScene"]
@@ -50,7 +51,8 @@ class SceneReport:
 
     failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
     min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. substeps: parts of the step.
+    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
+    end [J]. substeps: parts of the step.
     """
 
     failed: np.ndarray
@@ -59,6 +61,8 @@ class SceneReport:
     min_det: np.ndarray
     blocked: np.ndarray
     newton: np.ndarray
+    elastic: np.ndarray
+    barrier: np.ndarray
     substeps: int
 
 
@@ -124,6 +128,7 @@ class SoftScene:
         self.pads = {pad.name: pad for pad in pads}
         self.bodies = {body.name: body for body in bodies}
         self._check_names(pads, bodies)
+        self.gravity = np.asarray(gravity, float)
         self.num_envs = num_envs or _batch(world_from_pad, 4, world_from_body)
         self._start = self._poses("world_from_pad", world_from_pad, len(pads)), self._of_bodies(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
@@ -143,7 +148,7 @@ class SoftScene:
         try:
             self.world = ipc.World([*gels, *placed], self.settings, self.num_envs, device, mu, ignored)
             if settings is None:
-                self.world.set_gravity(gravity)
+                self.world.set_gravity(self.gravity)
             if self.num_envs > 1:
                 self._spread(*self._start, np.ones(self.num_envs, bool))
         except ipc.OverlapError as error:
@@ -158,8 +163,18 @@ class SoftScene:
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
-    def step(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None) -> SceneReport:
-        """Advance by ``dt``: cases go to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), driven bodies to their poses; others stay.
+    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None) -> bool:
+        """Whether the way to these poses (as for ``step``) is one that ``step`` would make in one go."""
+        cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
+        goals = self._target[1] | self._named(driven or {})
+        return self._part(0, self._target, (cases, goals))[0] == MOST_SUBSTEPS
+
+    def step(
+        self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
+    ) -> SceneReport:
+        """Advance by ``dt`` [s] (None: the scene's).
+
+        Cases go to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), driven bodies to their poses; others stay.
 
         Where two bodies are near, their relative way in one go is at most ``STEP`` and ``TURN``: the step is then cut into halves, quarters
         and so on of its time, and poses between are interpolated. Far from everything a pad may go any way at once.
@@ -185,7 +200,7 @@ class SoftScene:
             share = done / MOST_SUBSTEPS
             at = np.stack([between(begun[0][:, k], cases[:, k], share) for k in range(len(self.pads))], axis=1)
             there = {name: between(begun[1][name], goal, share) for name, goal in goals.items()}
-            found = self.advance(at, there, self.settings.dt * part / MOST_SUBSTEPS)
+            found = self.advance(at, there, (dt or self.settings.dt) * part / MOST_SUBSTEPS)
             total = found if total is None else _joined(total, found)
         assert total is not None
         return total
@@ -200,7 +215,15 @@ class SoftScene:
         report = self.world.step(dt)
         self._failed = report.failed
         return SceneReport(
-            report.failed, report.converged, report.min_gap, report.min_det, report.blocked, report.newton, substeps=1
+            report.failed,
+            report.converged,
+            report.min_gap,
+            report.min_det,
+            report.blocked,
+            report.newton,
+            report.elastic,
+            report.barrier,
+            substeps=1,
         )
 
     # --- reading ---------------------------------------------------------------------------------------------------------------
@@ -221,6 +244,18 @@ class SoftScene:
     def body_wrench(self, name: str) -> np.ndarray:
         """Force [N] of what touches a body and its torque [N m] about the body's origin, world axes, shape (B, 6)."""
         return self._contact_wrench(self._body(name).name)
+
+    def stiffness(self, pad: str) -> np.ndarray:
+        """Bound of the stiffness of what touches a pad, (B, 6, 6), world axes, about the place where it presses: see ``pad_stiffness``."""
+        mine = self._pad(pad)
+        bodies = self.world.layout.names.index(pad)
+        first, last = self.world.layout.vert_start[bodies : bodies + 2]
+        loaded = np.linalg.norm(self.world.contact_forces(pad), axis=2) > 0.0
+        areas = (loaded * self.world.layout.vert_area[first:last]).sum(axis=1)
+        turn = np.zeros((self.num_envs, 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = self.world.frame(pad)[0]
+        local = np.stack([pad_stiffness(mine.sensor.gelpad, float(area)) for area in areas])
+        return turn @ local @ np.swapaxes(turn, 1, 2)
 
     def pose(self, name: str) -> np.ndarray:
         """``world_from_body`` or ``world_from_pad`` (B, 4, 4) as it is; of a free soft body, the rigid motion that fits it best."""
@@ -263,12 +298,12 @@ class SoftScene:
         """Grid that a pad's surface is read on."""
         return make_grid(self._pad(pad).sensor.gelpad, self._pad(pad).pitch)
 
-    def reading(self, pad: str) -> SoftReading:
-        """What a pad shows: surface, contact, forces on its coat; NaN in environments that failed."""
+    def reading(self, pad: str, grid: PadGrid | None = None) -> SoftReading:
+        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed."""
         mine = self._pad(pad)
-        if pad not in self._readers:
+        if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(mine.mesh, d_hat=self.world.d_hat)
-            self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, self.grid(pad))
+            self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
         return self._readers[pad].read(self.seen(pad), self._failed)
 
     def seen(self, pad: str) -> SeenPad:
@@ -524,5 +559,7 @@ def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
         np.minimum(one.min_det, two.min_det),
         np.maximum(one.blocked, two.blocked),
         one.newton + two.newton,
+        two.elastic,
+        two.barrier,
         one.substeps + two.substeps,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from raytac.specs.files import available
-from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion
+from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec, load_marker_motion
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.press_file import load_press, validate_press
@@ -37,6 +37,7 @@ __all__ = [
     "MountSpec",
     "ObjectSpec",
     "PressScene",
+    "PunchSpec",
     "RefractionSpec",
     "ResponseSpec",
     "RobotSpec",

@@ -26,6 +26,7 @@ ANY: Final = -1
 
 _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "m_per_unit": (1.0, 1.0, "m per file unit"),
+    "per_mm": (1e3, 1.0, "1/mm"),
     "per_mm2": (1e6, 1.0, "1/mm²"),
     "per_mm3": (1e9, 1.0, "1/mm³"),
     "w_per_sr": (1.0, 1.0, "W/sr"),
