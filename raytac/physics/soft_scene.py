@@ -163,11 +163,11 @@ class SoftScene:
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
-    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None) -> bool:
-        """Whether the way to these poses (as for ``step``) is one that ``step`` would make in one go."""
+    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
+        """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
         cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
         goals = self._target[1] | self._named(driven or {})
-        return self._part(0, self._target, (cases, goals))[0] == MOST_SUBSTEPS
+        return self._part(0, (cases, goals), dt or self.settings.dt)[0] == MOST_SUBSTEPS
 
     def step(
         self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
@@ -189,7 +189,7 @@ class SoftScene:
         before: SceneState | None = None
         done, total = 0, None
         while done < MOST_SUBSTEPS:
-            part, pair = self._part(done, begun, (cases, goals))
+            part, pair = self._part(done, (cases, goals), dt or self.settings.dt)
             if part == 0:
                 if before is not None:
                     self.restore(before)
@@ -361,9 +361,9 @@ class SoftScene:
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
 
-    def _part(self, done: int, begun: tuple, goals: tuple) -> tuple[int, tuple[str, str] | None]:
+    def _part(self, done: int, goals: tuple, dt: float) -> tuple[int, tuple[str, str] | None]:
         """Sixty-fourths of the step that may be made next, a power of two that ``done`` is a multiple of; 0 if that is too few."""
-        movers = self._movers(begun, goals, 1.0 - done / MOST_SUBSTEPS)
+        movers = self._movers(goals, dt * (1.0 - done / MOST_SUBSTEPS))
         pairs = [(a, b) for a, b in self._pairs() if not _still(movers[a], movers[b])]
         share, pair = allowed_share(movers, pairs, _REACH * self.world.d_hat)
         room = (MOST_SUBSTEPS - done) * share
@@ -385,7 +385,7 @@ class SoftScene:
             ]
         return found
 
-    def _movers(self, begun: tuple, goals: tuple, left: float) -> dict[str, Mover]:
+    def _movers(self, goals: tuple, left: float) -> dict[str, Mover]:
         found = {}
         for k, (name, pad) in enumerate(self.pads.items()):
             rest = pad.mesh.tets.vertices
@@ -412,7 +412,7 @@ class SoftScene:
         if body.is_driven:
             return Mover(start, goals[name], low, high)
         end = start.copy()
-        end[:, :3, 3] += self.settings.dt * left * self.velocity(name)
+        end[:, :3, 3] += left * self.velocity(name)
         return Mover(start, end, low, high)
 
     def _refuse(self, pair: tuple[str, str] | None, begun: tuple, goals: tuple) -> None:
