@@ -206,7 +206,7 @@ class SoftPads:
         if self._coupling is not None:
             answers = soft_answers(self.soft, self._felt)
             for b in alive:
-                self._coupling.update(datas[b], int(b), *answers[b])
+                self._coupling.update(datas[b], b, *answers[b])
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
