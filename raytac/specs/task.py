@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from raytac.specs.sensor import Vec3
+from raytac.specs.sensor import SensorSpec, Vec3
 
 __all__ = [
     "COUPLINGS",
@@ -59,8 +59,8 @@ class RobotSpec:
 
     model: str
     """One of ``ROBOTS``, or the absolute path of an MJCF file."""
-    sensor: str = "gelsight_mini"
-    """Every sensor on it: name or path of a sensor file."""
+    sensor: str | SensorSpec = "gelsight_mini"
+    """Every sensor on it: name or path of a sensor file, or a specification."""
     joints: tuple[float, ...] | None = None
     """Where an arm's joints start [rad]; None: the Panda's READY, another robot's own start."""
     opening: float | None = None

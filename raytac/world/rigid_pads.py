@@ -21,7 +21,7 @@ MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad c
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -132,8 +132,8 @@ class RigidPads:
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
         self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
-        """Forget what environments went through."""
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+        """Forget what environments went through; where bodies start, MuJoCo knows."""
         for b in envs:
             self._laws[b] = {}
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
