@@ -104,6 +104,11 @@ class TactileObserver:
         """A sensor that gives what is observed; ``options`` of ``TactileSensor`` go before those of the settings."""
         return TactileSensor(self.sensor, **{**self.sensor_options(), **options})
 
+    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
+        """Start the streams of environments anew, each from a seed; ``reset`` then draws from them."""
+        if self._drift is not None:
+            self._drift.reseed(envs, seeds)
+
     def reset(self, envs: np.ndarray | Sequence[int] | None = None) -> None:
         """Begin anew in environments (a mask (B,), a list, or None for all): stacks are empty, cameras are drawn anew.
 
@@ -116,12 +121,15 @@ class TactileObserver:
             self._drift.reset(chosen)
             self._rest = None
 
-    def observe(self, frame: TactileFrame, sensor: TactileSensor | None = None) -> dict[str, np.ndarray]:
+    def observe(
+        self, frame: TactileFrame, sensor: TactileSensor | None = None, envs: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
         """Arrays (B, …) by modality, as ``arrays`` say; each its own memory.
 
         Args:
             frame: of a sensor that was made with ``sensor_options``.
             sensor: that sensor; needed for the image at rest, with ``difference``.
+            envs: mask (B,) of environments whose frame is new; the others keep what they observed last. None is all.
 
         An environment that failed keeps what it observed last, or zeros if that was nothing: its frame holds nothing of use.
 
@@ -133,11 +141,12 @@ class TactileObserver:
         if batch != self.num_envs:
             raise InputError("frame", value=batch, rule=f"must have {self.num_envs} environments, as this observer")
         failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
+        kept = failed if envs is None else failed | ~envs
         found = {name: getattr(self, f"_{name}")(frame, sensor) for name in self.settings.modalities}
         for name, values in found.items():
             self._check_finite(name, values, failed)
-        made = {name: self._stacked(name, np.ascontiguousarray(values), failed) for name, values in found.items()}
-        self._fresh &= failed
+        made = {name: self._stacked(name, values, kept) for name, values in found.items()}
+        self._fresh &= kept
         return made
 
     # --- modalities ------------------------------------------------------------------------------------------------------------
@@ -216,20 +225,20 @@ class TactileObserver:
                 f"frame ({name})", value=values[env].reshape(-1)[~np.isfinite(values[env].reshape(-1))][:3], rule=rule
             )
 
-    def _stacked(self, name: str, now: np.ndarray, failed: np.ndarray) -> np.ndarray:
+    def _stacked(self, name: str, now: np.ndarray, kept: np.ndarray) -> np.ndarray:
         spec, count = self.arrays[name], self.settings.stack
         if name not in self._last:
             self._last[name] = np.zeros((self.num_envs, *spec.shape), spec.dtype)
         last = self._last[name]
-        sound, begun = ~failed, self._fresh & ~failed
+        new, begun = ~kept, self._fresh & ~kept
         if count == 1:
-            last[sound] = now[sound]
+            last[new] = now[new]
         elif name == "rgb":
             # Channels are images of three, oldest first.
-            last[sound] = np.concatenate([last[sound][..., 3:], now[sound]], axis=-1)
+            last[new] = np.concatenate([last[new][..., 3:], now[new]], axis=-1)
             last[begun] = np.tile(now[begun], (1, 1, 1, count))
         else:
-            last[sound] = np.concatenate([last[sound][:, 1:], now[sound][:, None]], axis=1)
+            last[new] = np.concatenate([last[new][:, 1:], now[new][:, None]], axis=1)
             last[begun] = now[begun][:, None]
         return last.copy()
 

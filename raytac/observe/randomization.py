@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -101,9 +102,14 @@ class CameraDrift:
 
     def __init__(self, sensor: SensorSpec, randomization: Randomization, num_envs: int, seed: int) -> None:
         self._settings, self._gamma = randomization, sensor.response.gamma
-        self._streams = [np.random.default_rng((seed, 0xCA3, b)) for b in range(num_envs)]
+        self._streams = [np.random.default_rng((seed + b, 0xCA3)) for b in range(num_envs)]
         self._curves = np.empty((num_envs, 3, 256), np.float32)
         self.reset(range(num_envs))
+
+    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
+        """Start the streams of environments anew, each from a seed."""
+        for b, seed in zip(envs, seeds, strict=True):
+            self._streams[b] = np.random.default_rng((seed, 0xCA3))
 
     def reset(self, envs: range | list[int]) -> None:
         """Draw cameras of environments anew."""

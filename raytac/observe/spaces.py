@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from raytac.errors import BackendError
+from raytac.errors import BackendError, InputError
 from raytac.gel.pad import grid_pitch, make_grid
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.specs.sensor import SensorSpec
@@ -35,8 +35,6 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
     Raises:
         InputError: markers are asked for and the sensor has none, or an image is too large.
     """
-    from raytac.errors import InputError
-
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
         raise InputError("modalities", value="markers", rule=f"needs a sensor with markers; {sensor.name} has none")

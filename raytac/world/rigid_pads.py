@@ -122,7 +122,7 @@ class RigidPads:
         self._radius = [_radius(body) for body in self.bodies]
         self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
         # A body's friction against gel; None is the gel's own.
-        self._friction = [body.spec.friction for body in self.bodies]
+        self._friction = [body.spec.friction_on_gel for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
         self._pressed = {name: np.full(num_envs, -1) for name in self.pads}

@@ -248,12 +248,12 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
     body = scene.bodies[index]
     parts = object_parts(body)
     if body.kind == "plane":
-        return scene_body(body.name, (), "half_space", friction=body.friction)
+        return scene_body(body.name, (), "half_space", friction=body.friction_on_gel)
     if body.dynamics == "fixed" or (body.dynamics == "free" and body.owner == "mujoco"):
-        return scene_body(body.name, parts, "kinematic", friction=body.friction)
+        return scene_body(body.name, parts, "kinematic", friction=body.friction_on_gel)
     if body.dynamics == "free":
         density = body.density if body.mass is None else body.mass / _volume(parts)
-        return scene_body(body.name, parts, "affine", density=density, friction=body.friction)
+        return scene_body(body.name, parts, "affine", density=density, friction=body.friction_on_gel)
     held = None if body.held_by is None else _holder(scene, index)
     low, high = _extent(parts)
     return scene_body(
@@ -265,7 +265,7 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
         poisson_ratio=body.poisson_ratio,
         cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
         held=held,
-        friction=body.friction,
+        friction=body.friction_on_gel,
     )
 
 
