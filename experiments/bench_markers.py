@@ -25,11 +25,12 @@ from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
+from raytac.markers.calibration import PUBLISHED
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
 from raytac.physics.rigid import RigidPad
 from raytac.physics.soft_mesh import pad_mesh
 from raytac.report.machine import machine
-from raytac.specs import MarkerMotionSpec, SensorSpec, load_sensor
+from raytac.specs import MarkerMotionSpec, PunchSpec, SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
 NAMES = {"surface": "surface_markers"}
@@ -85,6 +86,9 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
 def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Args) -> tuple[list[float], str]:
     """Times of frames per environment [ms], after warming up, and the device."""
     envs = surfaces[0].batch
+    if model == PUBLISHED:
+        assert sensor.marker_motion is not None
+        model, sensor = "fots", replace(sensor, marker_motion=replace(sensor.marker_motion, punch=None))
     tracker = MarkerTracker(sensor, model, surfaces[0].grid, num_envs=envs, device=args.device)
     count = max(10, args.frames // envs)
     times = []
@@ -107,12 +111,12 @@ def main(args: Args) -> int:
         return 2
     sensor = load_sensor(args.sensor)
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
-        motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 2e-3, 0.2, 5.0, 1.0, "for timing")
+        motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
         sensor = replace(sensor, marker_motion=motion)
     metrics: dict[str, Metric] = {}
     for envs in counts:
         surfaces = pressed(sensor, envs)
-        for model in MARKER_MODELS:
+        for model in (*MARKER_MODELS, PUBLISHED):
             times, device = measure(model, sensor, surfaces, args)
             key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
             metrics |= {

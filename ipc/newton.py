@@ -54,7 +54,7 @@ class Newton:
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
-        self._graphs: dict[str, Any] = {}
+        self._graphs: dict[tuple[str, float], Any] = {}
         self._recording = False
         self.timers: dict[str, float] = {}
 
@@ -78,7 +78,8 @@ class Newton:
         if not (self.device.is_cuda and self.settings.cuda_graph):
             body()
             return
-        if name not in self._graphs:
+        key = name, self.potential.dt  # a recording holds the length of its step
+        if key not in self._graphs:
             wp.load_module("ipc", device=self.device, recursive=True)
             self._recording = True
             try:
@@ -86,8 +87,8 @@ class Newton:
                     body()
             finally:
                 self._recording = False
-            self._graphs[name] = capture.graph
-        wp.capture_launch(self._graphs[name])
+            self._graphs[key] = capture.graph
+        wp.capture_launch(self._graphs[key])
 
     # --- the step --------------------------------------------------------------------------------------------------------------
 
@@ -138,7 +139,7 @@ class Newton:
         wp.copy(pot.y_start, pot.y)
         pot.place_nodes(pot.xw)
         second = int(settings.integrator == "bdf2")
-        inputs = [settings.dt, second, pot.second_order]
+        inputs = [pot.dt, second, pot.second_order]
         pot.launch(control.scale_inertia, self.batch, inputs, [pot.inertia_scale])
         pot.aim()
         pot.aim_inertia(pot.R, pot.t)
@@ -171,7 +172,7 @@ class Newton:
             wp.capture_if(f.travel, pot.push_ahead, mask=d.travelling)
         self._solve()
         pot.size_of_step(d.active, d.size)
-        ctl.launch(control.judge_direction, settings.dt)
+        ctl.launch(control.judge_direction, pot.dt)
         with self._stage("travel"):
             wp.capture_if(f.travel, self._travel)
         wp.capture_if(f.plain, self._line_search)
@@ -282,7 +283,7 @@ class Newton:
     def _end(self) -> None:
         """Velocities, and frames where the next step begins; environments that failed go back to where they were."""
         pot, ctl = self.potential, self.control
-        d, dt = ctl.decisions, self.settings.dt
+        d, dt = ctl.decisions, pot.dt
         with self._stage("end"):
             pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.taken], [pot.y])
             pot.place_nodes(pot.xw1)

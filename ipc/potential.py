@@ -67,9 +67,10 @@ class Potential:
         self.row_start, self.col = ints(layout.row_start), ints(layout.col)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
-        drag = np.zeros(len(layout.col))
-        drag[diagonal] = layout.node_damping / settings.dt
-        self.mass, self.drag = floats(layout.mass), floats(drag)
+        self.dt = settings.dt
+        self._damping = np.zeros(len(layout.col))
+        self._damping[diagonal] = layout.node_damping
+        self.mass, self.drag = floats(layout.mass), floats(self._damping / self.dt)
         self.inertia = floats(layout.mass * (1.0 + layout.node_drive[rows]))
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
         self.driven = bool((layout.node_aim >= 0).any())
@@ -130,7 +131,13 @@ class Potential:
     @property
     def friction_eps(self) -> float:
         """ε = ε_v h [m]."""
-        return self.settings.friction_velocity * self.settings.dt
+        return self.settings.friction_velocity * self.dt
+
+    def set_dt(self, dt: float) -> None:
+        """Let the next steps be ``dt`` [s] long."""
+        if dt != self.dt:
+            self.dt = dt
+            self.drag.assign(self._damping / dt)
 
     # --- places ----------------------------------------------------------------------------------------------------------------
 
@@ -159,7 +166,7 @@ class Potential:
 
     def aim(self) -> None:
         """x̃ from the start of the step."""
-        inputs = [self.xw, self.v, self.xw_before, self.v_before, self.second_order, self.acceleration, self.settings.dt]
+        inputs = [self.xw, self.v, self.xw_before, self.v_before, self.second_order, self.acceleration, self.dt]
         self.launch(dynamics.predict, self.xw.shape, inputs, [self.target])
         if self.driven:
             self.launch(dynamics.aim_bodies, self.xw.shape, [self.goal_q, self.goal_p, *self.drive], [self.target])

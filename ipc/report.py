@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ContactPairs", "StepReport", "Wrench"]
+__all__ = ["ContactPairs", "RigidMotion", "StepReport", "Wrench"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,3 +86,22 @@ class Wrench:
 
     force: Floats
     torque: Floats
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """A body as if it moved as a whole, world frame.
+
+    Attributes:
+        mass: [kg].
+        centre: centre of mass [m], shape (B, 3).
+        inertia: about it [kg m²], shape (B, 3, 3).
+        velocity: of the centre of mass [m/s], shape (B, 3).
+        spin: angular velocity with the same angular momentum [rad/s], shape (B, 3).
+    """
+
+    mass: float
+    centre: Floats
+    inertia: Floats
+    velocity: Floats
+    spin: Floats

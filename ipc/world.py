@@ -16,7 +16,7 @@ from ipc.layout import build_layout, rotation_matrix
 from ipc.newton import Newton
 from ipc.overlap import find_overlap
 from ipc.potential import Potential
-from ipc.report import ContactPairs, StepReport, Wrench
+from ipc.report import ContactPairs, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
 
 __all__ = ["State", "World"]
@@ -227,9 +227,20 @@ class World:
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
-    def step(self) -> StepReport:
-        """Advance every environment that has not failed by ``settings.dt``."""
+    def step(self, dt: float | None = None) -> StepReport:
+        """Advance every environment that has not failed by ``dt`` [s]; None: by ``settings.dt``.
+
+        On CUDA every new ``dt`` costs a recording; take few different ones.
+
+        Raises:
+            IpcError: ``dt`` is not positive, or differs from ``settings.dt`` with BDF2, whose formulas want equal steps.
+        """
+        if dt is not None and not 0.0 < dt < np.inf:
+            raise IpcError(f"dt = {dt}: it must be positive")
+        if dt is not None and dt != self.settings.dt and self.settings.integrator == "bdf2":
+            raise IpcError(f"dt = {dt}: with BDF2 every step is as long as settings.dt = {self.settings.dt}")
         pot, alive = self._potential, ~self._failed
+        pot.set_dt(dt or self.settings.dt)
         if not self._told:
             pot.goal_p.assign(self._goal_p)
             pot.goal_q.assign(self._goal_q)
@@ -415,6 +426,67 @@ class World:
             gap=_host(found.gap)[env, :n].copy(),
             force=_host(found.force)[env, :n].copy(),
         )
+
+    def pressing(self) -> dict[tuple[str, str], tuple[Floats, Floats]]:
+        """Normal forces at the end of the last step by pair of bodies: their sum on the first body [N] and where they act in the mean [m].
+
+        World frame, (B, 3) each; NaN for the place where a pair does not touch. Pairs that nowhere touch are not in it.
+        """
+        contacts, x = self._potential.collision.contacts, _host(self._potential.x)
+        count, pair, verts = _host(contacts.count), _host(contacts.pair), _host(contacts.verts)
+        coef, normal, size = _host(contacts.coef), _host(contacts.normal), _host(contacts.force)
+        env, k = np.nonzero(np.arange(pair.shape[1]) < count[:, None])
+        vertices, weights, which = verts[env, k], coef[env, k], pair[env, k]
+        weights = np.where((weights > 0.0) & (vertices >= 0), weights, 0.0)  # of the closest point on one side
+        points = np.einsum("cn,cni->ci", weights, x[env[:, None], np.maximum(vertices, 0)]) / weights.sum(axis=1, keepdims=True)
+        owner = self.layout.vert_body[vertices[:, 0]]  # the normal is the way out for the body of the first vertex
+        sign = np.where(owner == self.layout.pairs[which, 0], 1.0, -1.0)
+        forces = (sign * size[env, k])[:, None] * normal[env, k]
+        found = {}
+        for p in np.unique(which):
+            mine = which == p
+            total, place, weight = np.zeros((self.num_envs, 3)), np.zeros((self.num_envs, 3)), np.zeros(self.num_envs)
+            np.add.at(total, env[mine], forces[mine])
+            np.add.at(place, env[mine], size[env, k][mine, None] * points[mine])
+            np.add.at(weight, env[mine], size[env, k][mine])
+            with np.errstate(invalid="ignore", divide="ignore"):
+                found[tuple(self.layout.names[b] for b in self.layout.pairs[p])] = total, place / weight[:, None]
+        return found
+
+    def rigid_motion(self, name: str) -> RigidMotion:
+        """Mass, centre, inertia and velocities of a soft or affine body as if it moved as a whole at this instant; world frame."""
+        body = self._index(name)
+        first, last = self.layout.node_start[body : body + 2]
+        if first == last:
+            raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
+        row, end = self.layout.row_start[[first, last]]
+        rows = np.repeat(np.arange(last - first), np.diff(self.layout.row_start[first : last + 1]))
+        mass = np.zeros((last - first, last - first))
+        mass[rows, self.layout.col[row:end] - first] = self.layout.mass[row:end]
+        pot = self._potential
+        R, t, nodes = _host(pot.R)[:, body], _host(pot.t)[:, body], slice(first, last)
+        x = np.einsum("bij,bnj->bni", R, _host(pot.y)[:, nodes]) + t[:, None]
+        v, share = _host(pot.v)[:, nodes], mass.sum(axis=0)
+        total = float(share.sum())
+        centre, velocity = (np.einsum("n,bni->bi", share / total, a) for a in (x, v))
+        arm = x - centre[:, None]
+        second = np.einsum("bni,nm,bmj->bij", arm, mass, arm)
+        inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+        momentum = np.cross(arm, np.einsum("nm,bmi->bni", mass, v - velocity[:, None])).sum(axis=1)
+        spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
+        return RigidMotion(total, centre, inertia, velocity, spin)
+
+    def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
+        """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+        body = self._index(name)
+        found = self._potential.collision.contacts
+        count, pair = _host(found.count), _host(found.pair)
+        there = np.zeros((self.num_envs, len(self.layout.pairs)), bool)
+        env, k = np.nonzero(np.arange(pair.shape[1]) < count[:, None])
+        there[env, pair[env, k]] = True
+        mine = np.flatnonzero((self.layout.pairs == body).any(axis=1) & there.any(axis=0))
+        other = self.layout.pairs[mine].sum(axis=1) - body
+        return {self.layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}
 
     # --- state -----------------------------------------------------------------------------------------------------------------
 

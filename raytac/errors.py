@@ -6,7 +6,16 @@ import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["AssetError", "BackendError", "CalibrationError", "InputError", "MeshError", "RaytacError", "SpecError"]
+__all__ = [
+    "AssetError",
+    "BackendError",
+    "CalibrationError",
+    "InputError",
+    "MeshError",
+    "OverlapError",
+    "RaytacError",
+    "SpecError",
+]
 
 
 class RaytacError(Exception):
@@ -34,6 +43,10 @@ class InputError(RaytacError, ValueError):
         self.rule = rule
         self.choices = tuple(choices)
         super().__init__(f"{name} = {short_repr(value)}: {rule}{_choices_text(value, self.choices)}")
+
+
+class OverlapError(RaytacError, ValueError):
+    """Bodies of a simulation overlap where they are to be put; the message names the surfaces."""
 
 
 class SpecError(RaytacError, ValueError):

@@ -14,6 +14,7 @@ from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare import CompareArgs
 from raytac.cli.doctor import DoctorArgs
 from raytac.cli.press import PressArgs
+from raytac.cli.view import ViewArgs
 from raytac.errors import RaytacError
 
 __all__ = ["main"]
@@ -23,6 +24,7 @@ _Command = (
     | Annotated[BakeArgs, tyro.conf.subcommand("bake")]
     | Annotated[CalibrateArgs, tyro.conf.subcommand("calibrate")]
     | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
+    | Annotated[ViewArgs, tyro.conf.subcommand("view")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
 _DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."

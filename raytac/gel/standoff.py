@@ -21,10 +21,6 @@ _SAG = 3.0
 that is κ cell²/6, and a vertex was seen to lie up to 0.35 κ cell² below the facets around it (ball of 3.2 mm on cells of 1 mm)."""
 _SLACK = 1.0 / 64.0
 """Further allowance, as a share of the cell."""
-_FADING, _OPEN = 4.0, 12.0
-"""Gaps, in units of d̂, from which on their closing fades, and of which nothing is closed."""
-_TOUCHING = 0.5
-"""Gap, in units of d̂, up to which a place counts as touching: a tenth of d̂ is left of it."""
 _CUT = 0.5e-3
 """Height above the object's lowest point [m] up to which its underside counts in that mean; beyond the object it counts as so high."""
 
@@ -51,15 +47,14 @@ class StandOff:
        it that much higher: the coat, not the barrier's shell, is at the commanded depth.
     2. *Vertices* (``fit``): each vertex in contact moves by the mean of what is left of c around it, in three passes, fading out at
        the rim. Vertices out of contact stay where the solver put them.
-    3. *Nodes* (``close``): what is left of small gaps is closed, g → g³/(1 + g²) with g = c/d̂ (and 0 for g < 0, where the smooth coat
-       reaches into the object). In contact the coat so takes the object's own shape, as a coat without facets would; no node moves
-       by more than d̂/2 that the object does not push. All the rest of the surface is the solver's.
+
+    The height that is shown in and around the contact comes from ``FineContact``; these two say where the object is, and move the mesh.
     """
 
     def __init__(self, surface: CoatSurface, rest: np.ndarray, x: np.ndarray, y: np.ndarray, d_hat: float) -> None:
         """Samples at ``x`` (Nx,) and ``y`` (Ny,) [m], where the coat at rest has the height ``rest`` (Ny, Nx) [m]."""
         self.x, self.y, self.rest = x, y, rest
-        self._surface, self._d_hat = surface, d_hat
+        self._surface = surface
         self._rows, self._columns = (m.astype(np.float32) for m in surface.matrices(x, y))
         mesh = surface.mesh
         self._hat_y, self._hat_x = (
@@ -102,39 +97,15 @@ class StandOff:
             counted = (near | (there & (gap < 0.0))).astype(np.float32)
             share = sandwich(self._hat_y.T, counted, self._hat_x)
             mean = sandwich(self._hat_y.T, counted * gap, self._hat_x) / np.maximum(share, 1e-6)
-            shift += (np.clip(share / self._everywhere / _COVERED, 0.0, 1.0) * mean).ravel()
+            shift += (np.clip(share / np.maximum(self._everywhere, 1e-6) / _COVERED, 0.0, 1.0) * mean).ravel()
         return ContactFit(clearance, shift)
-
-    def close(self, height: np.ndarray, underside: np.ndarray, borne: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The coat with its last gaps in contact closed, and where it touches; all over one grid, shape (Ny, Nx).
-
-        Args:
-            height: smooth coat [m].
-            underside: z of the object, lowered by the clearance [m]; not finite where it is not.
-            borne: pressure or load, any unit, 0 where there is none; touching needs some.
-        """
-        gap = np.where(np.isfinite(underside), underside, np.inf) - height
-        closed = self._d_hat * _closed(gap / self._d_hat)
-        return (height + closed).astype(np.float32), (borne > 0.0) & (gap <= _TOUCHING * self._d_hat)
 
     def _bulge(self, underside: np.ndarray, there: np.ndarray) -> np.ndarray:
         """How far the object lies below its mean over a cell around [m], (Ny, Nx), 0 where it lies above."""
         highest = underside[there].min() + _CUT
         cut = np.minimum(np.where(there, underside, highest), highest).astype(np.float32)
-        mean = sandwich(self._hat_y.T, cut, self._hat_x) / self._everywhere
+        mean = sandwich(self._hat_y.T, cut, self._hat_x) / np.maximum(self._everywhere, 1e-6)
         return np.maximum(sandwich(self._hat_y, mean, self._hat_x.T) - cut, 0.0)
-
-
-def _closed(gap: np.ndarray) -> np.ndarray:
-    """How much of a gap is closed, both in units of d̂: g / (1 + g²), all of it for g <= 0, none beyond ``_OPEN``.
-
-    What is left, g³/(1 + g²), has a slope between 0 and 9/8 and two continuous derivatives: a passage that is narrower, or steeper, would
-    draw a ring around the contact. At most half of d̂ is closed.
-    """
-    near, far = _FADING, _OPEN
-    t = np.clip((np.minimum(gap, far) - near) / (far - near), 0.0, 1.0)
-    g = np.minimum(gap, far)
-    return np.where(g <= 0.0, g, g / (1.0 + g * g) * (1.0 - t**3 * (10.0 + t * (6.0 * t - 15.0))))
 
 
 def _cell_length(lines: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -17,14 +17,16 @@ from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.pattern import marker_centres
 from raytac.markers.surface import SurfaceMarkers
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
-from raytac.specs.marker_motion import MarkerMotionSpec
+from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
 if TYPE_CHECKING:
     from raytac.optics.marker_motion import FotsConstants
 
-__all__ = ["ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
+__all__ = ["PUBLISHED", "ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
 
+PUBLISHED = "fots_published"
+"""Name in tables of errors of ``fots`` without the sensor's ``punch``: Gaussians with one λ for all contacts, as published."""
 PROBE_PITCH = 1e-3
 """Spacing of the markers that errors are averaged over [m]: a grid over the view, whatever the sensor's own pattern."""
 _MARGIN = 0.4e-3
@@ -48,7 +50,7 @@ class ProbeData:
     """Frames of many presses under the probes: N frames under load, P probes.
 
     ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth`` [m], (N, ny, nx), and
-    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: (active, centre, shear, twist, radius) as in ``Contacts``, (N, K, …);
+    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: (active, centre, shear, twist, ellipse, depth) as in ``Contacts``, (N, K, …);
     ``force``: (penetration (N, P), wall (N, P, 2), way (N, P, 2)) that the force field reads.
     """
 
@@ -58,7 +60,7 @@ class ProbeData:
     loads: np.ndarray
     depth: np.ndarray
     boxes: np.ndarray
-    contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    contacts: tuple[np.ndarray, ...]
     force: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     @classmethod
@@ -98,7 +100,7 @@ class ProbeData:
             loads=np.array([row[1] for row in rows]),
             depth=np.stack([row[2] for row in rows]),
             boxes=np.stack([row[3] for row in rows]),
-            contacts=(padded("active"), padded("centre"), padded("shear"), padded("twist"), padded("radius")),
+            contacts=tuple(padded(name) for name in ("active", "centre", "shear", "twist", "ellipse", "depth")),
             force=(np.stack([r[5] for r in rows]), np.stack([r[6] for r in rows]), np.stack([r[7] for r in rows])),
         )
 
@@ -126,21 +128,21 @@ def pattern_search(
     return point, best
 
 
-def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto") -> MarkerMotionSpec:
+def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     """Constants that make FOTS and the force field closest to surface tracking: least mean distance, each kind of load weighing alike.
 
-    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation kept. A cap is no
-    more than the largest motion in the data: beyond it nobody knows. With ``published``, one λ_s and λ_t hold for contacts of all sizes;
-    else they are those of the mean contact in the data, and scale.
+    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation kept; these once as
+    published and once as a punch (``PunchSpec``), whose three constants shear and twist share. A cap is no more than the largest motion
+    in the data: beyond it nobody knows.
     """
-    from raytac.optics.marker_motion import FotsConstants, FotsKernel
+    from raytac.optics.marker_motion import TWIST_SLIP, FotsConstants, FotsKernel
 
     kernel = FotsKernel(data.cells.x, data.cells.y, device=device)
 
     def error(constants: FotsConstants, rows: np.ndarray) -> float:
         markers = np.broadcast_to(data.markers, (len(rows), *data.markers.shape))
         contacts = tuple(part[rows] for part in data.contacts)
-        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], contacts, constants)  # type: ignore[arg-type]
+        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], contacts, constants)
         return float(np.linalg.norm(moved - data.truth[rows], axis=-1).mean())
 
     def rows_of(load: str) -> np.ndarray:
@@ -148,8 +150,7 @@ def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto"
 
     shear_most = float(np.linalg.norm(data.contacts[2], axis=-1).max())
     twist_most = float(np.abs(data.contacts[3]).max())
-    radius = 0.0 if published else float(data.contacts[4][data.contacts[0]].mean())
-    found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6), radius)
+    found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6))
     starts = (found.dilate_gain, found.dilate_lambda)
 
     def dilation(x: np.ndarray) -> FotsConstants:
@@ -169,11 +170,29 @@ def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto"
             continue
 
         def dragged(x: np.ndarray, name: str = name, most: float = most, kept: FotsConstants = found) -> FotsConstants:
-            share = 1.0 / (1.0 + math.exp(-x[1]))  # in (0, 1)
-            return replace(kept, **{f"{name}_lambda": 2.5e5 * math.exp(x[0]), f"{name}_max": most * share})
+            return replace(kept, **{f"{name}_lambda": 2.5e5 * math.exp(x[0]), f"{name}_max": most * _share(x[1])})
 
         x, _ = pattern_search(lambda x, rows=rows, dragged=dragged: error(dragged(x), rows), np.array([0.0, 2.0]))
         found = dragged(x)
+    active, shear, twist, ellipse, mean = (data.contacts[k] for k in (0, 2, 3, 4, 5))
+    edge = np.sqrt(np.sqrt(np.maximum(ellipse[..., 0] * ellipse[..., 2] - ellipse[..., 1] ** 2, 0)))
+    way = np.maximum(np.linalg.norm(shear, axis=-1), edge * np.abs(twist) / TWIST_SLIP)
+    slip_most = float((way[active] / (mean * edge)[active]).max())
+    dragged_rows = [rows for rows in (rows_of("shear"), rows_of("twist")) if len(rows)]
+
+    def as_punch(x: np.ndarray) -> FotsConstants:
+        return replace(found, punch=PunchSpec(_share(x[0]), 5e-3 * math.exp(x[1]), slip_most * _share(x[2])))
+
+    if dragged_rows:
+
+        def cost(x: np.ndarray) -> float:
+            return sum(error(as_punch(x), rows) for rows in dragged_rows)
+
+        # Where nothing slips, slip does not matter: a coarse look finds where it begins to.
+        slips = np.linspace(-5.0, 3.0, 9)
+        begin = min(slips, key=lambda at: cost(np.array([0.0, 0.0, at])))
+        x, _ = pattern_search(cost, np.array([0.0, 0.0, begin]))
+        found = as_punch(x)
     gain, stiffness, friction = _fit_force_field(data)
     return MarkerMotionSpec(
         dilate_gain=found.dilate_gain,
@@ -182,12 +201,17 @@ def fit_motion(data: ProbeData, *, published: bool = False, device: str = "auto"
         shear_max=found.shear_max,
         twist_lambda=found.twist_lambda,
         twist_max=found.twist_max,
-        contact_radius=found.contact_radius,
         field_gain=gain,
         field_shear=stiffness,
         field_friction=friction,
+        punch=found.punch,
         provenance="",
     )
+
+
+def _share(x: float) -> float:
+    """A number in (0, 1) for any x."""
+    return 1.0 / (1.0 + math.exp(-x))
 
 
 def _fit_force_field(data: ProbeData) -> tuple[float, float, float]:
@@ -238,15 +262,19 @@ def model_errors(
 ) -> tuple[list[ModelError], dict[str, float]]:
     """Errors of every model by kind of load, and the median time of a frame of every model [ms] at the probes.
 
-    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested.
+    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: of ``MARKER_MODELS`` or
+    ``PUBLISHED``.
     """
     probed = probe_sensor(sensor)
+    motion = sensor.marker_motion
+    published = probed if motion is None else replace(probed, marker_motion=replace(motion, punch=None))
     moved: dict[str, list[np.ndarray]] = {}
     pixels: dict[str, list[np.ndarray]] = {}
     times: dict[str, list[float]] = {}
     loads = [frame.load for frame in frames if frame.load in LOADS]
     for model in dict.fromkeys(("surface", *models)):
-        tracker = MarkerTracker(probed, model, grid, device=device)
+        as_published = model == PUBLISHED
+        tracker = MarkerTracker(published if as_published else probed, "fots" if as_published else model, grid, device=device)
         for _, group in groupby(frames, key=lambda frame: frame.press.name):
             tracker.reset()
             for frame in group:

@@ -123,6 +123,8 @@ class Contacts:
     contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then; ``radius`` [m], (B, K): of a disc with the area of all
     cells that the contact touches. That is more than the contact's own: for a disc of radius R by cells whose nodes span a × b, on
     average π radius² = π R² + 2 R (a + b) + a b (Steiner), about R + (a + b)/π, so 0.2 mm for cells of 0.4 mm.
+    ``ellipse`` [m²], (B, K, 3): T_xx, T_xy, T_yy of xᵀ T⁻¹ x = 1, the ellipse of that area whose axes have the directions and the ratio
+    of the cells' second moments; a disc of that radius has T = radius² 1. ``depth`` [m], (B, K): mean indentation over those cells.
     """
 
     active: np.ndarray
@@ -130,15 +132,19 @@ class Contacts:
     shear: np.ndarray
     twist: np.ndarray
     radius: np.ndarray
+    ellipse: np.ndarray
+    depth: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Contact:
-    """One contact: centre and radius as in ``Contacts`` [m], shear [m] and twist [rad]."""
+    """One contact, as in ``Contacts``: centre, radius, ellipse and depth, then what the object did to it."""
 
     x: float
     y: float
     radius: float
+    ellipse: tuple[float, float, float]
+    depth: float
     shear_x: float = 0.0
     shear_y: float = 0.0
     twist: float = 0.0
@@ -185,11 +191,13 @@ class ContactTracker:
             [_followed(one, before, move) for one in now] for now, before, move in zip(found, self._contacts, motion, strict=True)
         ]
         count = max(1, max(len(one) for one in self._contacts))
-        table = np.zeros((self.batch, count, 7))
+        table = np.zeros((self.batch, count, 11))
         for b, contacts in enumerate(self._contacts):
             for k, c in enumerate(contacts):
-                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist, c.radius
-        return Contacts(table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5], table[..., 6])
+                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist, c.radius, *c.ellipse, c.depth
+        return Contacts(
+            table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5], table[..., 6], table[..., 7:10], table[..., 10]
+        )
 
     def _motion(self, pose: np.ndarray | None) -> list[tuple[float, ...] | None]:
         """D of every environment as (xx, xy, x, yx, yy, y, turn) of the plane z = 0; None where this or the last pose is not known."""
@@ -233,9 +241,8 @@ def _followed(now: _Contact, before: list[_Contact], motion: tuple[float, ...] |
     if nearest is None or least > max(now.radius, nearest[0].radius) + _REACH:
         return now
     c, carried = nearest
-    return _Contact(
-        now.x, now.y, now.radius, c.shear_x + carried[0] - c.x, c.shear_y + carried[1] - c.y, c.twist + turn
-    )  # fmt: skip
+    shear_x, shear_y = c.shear_x + carried[0] - c.x, c.shear_y + carried[1] - c.y
+    return _Contact(now.x, now.y, now.radius, now.ellipse, now.depth, shear_x, shear_y, c.twist + turn)
 
 
 def _find(samples: ContactSamples) -> list[list[_Contact]]:
@@ -257,16 +264,30 @@ def _find(samples: ContactSamples) -> list[list[_Contact]]:
     line = row * (nx + 1)
     total, along = (sums.take(line + stop, axis=1) - sums.take(line + start, axis=1)).tolist()
     rows, starts, stops, y = row.tolist(), start.tolist(), stop.tolist(), cells.y[r0:r1].tolist()
+    # Second moments are taken about the box's corner, in cells: whole numbers, so that nothing cancels.
     pieces: dict[int, list[float]] = {}
     for i, number in enumerate(join_runs(rows, starts, stops, ny)):
         piece = pieces.get(number)
         if piece is None:
-            piece = pieces[number] = [0.0, 0.0, 0.0, 0.0]
+            piece = pieces[number] = [0.0] * 9
+        line, length = rows[i] % ny, stops[i] - starts[i]
+        middle = 0.5 * (starts[i] + stops[i])
         piece[0] += total[i]
         piece[1] += along[i]
-        piece[2] += total[i] * y[rows[i] % ny]
-        piece[3] += stops[i] - starts[i]
-    area = cells.area
-    for number, (w, wx, wy, count) in pieces.items():
-        found[rows[number] // ny].append(_Contact(wx / w, wy / w, math.sqrt(count * area / math.pi)))
+        piece[2] += total[i] * y[line]
+        piece[3] += length
+        piece[4] += length * middle
+        piece[5] += length * line
+        piece[6] += length * (middle * middle + length * length / 12.0)
+        piece[7] += length * middle * line
+        piece[8] += length * line * line
+    dx, dy = (pitch * nodes for pitch, nodes in zip(cells.grid.pitch, cells.nodes, strict=True))
+    for number, (w, wx, wy, count, mx, my, mxx, mxy, myy) in pieces.items():
+        area = count * dx * dy / math.pi
+        mx, my = mx / count, my / count
+        xx, xy, yy = mxx / count - mx * mx, mxy / count - mx * my, myy / count - my * my + 1.0 / 12.0
+        xx, xy, yy = xx * dx * dx, xy * dx * dy, yy * dy * dy
+        scale = area / math.sqrt(xx * yy - xy * xy)
+        ellipse = scale * xx, scale * xy, scale * yy
+        found[rows[number] // ny].append(_Contact(wx / w, wy / w, math.sqrt(area), ellipse, w / count))
     return found

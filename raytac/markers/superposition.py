@@ -6,8 +6,9 @@ With C the compliance of the coat's vertices and A those in contact:
 
     C_AA f = u_A,    u = C_·A f,
 
-u_A: down to the object along z, along x and y with the object since first touch (it sticks). A vertex that the object would have to pull
-is let go, and the rest solved again.
+u_A: down to the object along z, along x and y with the object since first touch. A vertex that the object would have to pull is let go. One
+that would need more than Coulomb's μ |f_z| to be taken along slides: it keeps only its z, and f_xy = μ |f_z| the way it was pulled. Each
+time the rest is solved again.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from raytac.specs.sensor import SensorSpec
 __all__ = ["SuperpositionMarkers"]
 
 _ROUNDS = 8
-"""How often vertices under tension are let go; those that are left then keep it."""
+"""How often vertices under tension are let go, or slide; those that are left then keep their load."""
 _LEVEL = "coarse"
 """Pad whose unit-load fields are used."""
 
@@ -42,6 +43,7 @@ class SuperpositionMarkers:
         mesh = pad_mesh(sensor.gelpad, _LEVEL)
         self.coat = mesh.coat
         self._compliance = cached_compliance(mesh, sensor.gelpad)
+        self._friction = sensor.gelpad.friction
         self._bound: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def displacement(
@@ -64,16 +66,35 @@ class SuperpositionMarkers:
 
     def _superpose(self, wanted: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Displacement of all vertices (V, 3) that takes the ``held`` ones where ``wanted`` (V, 3) says."""
-        held = held.copy()
+        held, slides = held.copy(), np.zeros(len(held), bool)
+        pull = np.zeros((len(held), 2))
+        """Direction of what takes a sliding vertex along."""
         for _ in range(_ROUNDS):
             at = np.flatnonzero(held)
             dof = (3 * at[:, None] + np.arange(3)).ravel()
-            load = np.linalg.solve(self._compliance[np.ix_(dof, dof)].astype(float), wanted[at].ravel())
-            pulled = load.reshape(-1, 3)[:, 2] > 0
-            if not pulled.any() or pulled.all():
+            load = self._load(dof, wanted[at], slides[at], pull[at])
+            pulled = load[:, 2] > 0
+            along = np.linalg.norm(load[:, :2], axis=1)
+            loose = ~pulled & ~slides[at] & (along > self._friction * -load[:, 2])
+            if pulled.all() or not (pulled | loose).any():
                 break
             held[at[pulled]] = False
-        return (self._compliance[:, dof] @ load).reshape(-1, 3)
+            slides[at[loose]] = True
+            pull[at[loose]] = load[loose, :2] / along[loose, None]
+        return (self._compliance[:, dof] @ load.ravel()).reshape(-1, 3)
+
+    def _load(self, dof: np.ndarray, wanted: np.ndarray, slides: np.ndarray, pull: np.ndarray) -> np.ndarray:
+        """Loads [N] (A, 3) on the vertices of ``dof`` (3 A): what takes them where ``wanted`` (A, 3) says, or friction where they slide."""
+        matrix, right = self._compliance[np.ix_(dof, dof)].astype(float), wanted.copy()
+        # The unit of these rows is that of the others, so that the matrix stays well-conditioned.
+        unit = float(np.trace(matrix)) / len(dof)
+        right[slides, :2] = 0.0
+        for k in np.flatnonzero(slides):
+            for axis in range(2):
+                matrix[3 * k + axis] = 0.0
+                matrix[3 * k + axis, 3 * k + axis] = unit
+                matrix[3 * k + axis, 3 * k + 2] = unit * self._friction * pull[k, axis]
+        return np.linalg.solve(matrix, right.ravel()).reshape(-1, 3)
 
     def _bind(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         one = rest[:1] if rest.strides[0] == 0 else rest

@@ -1,4 +1,4 @@
-"""FOTS' marker motion on the device: sums of Gaussians over the contact, for all markers of all environments at once.
+"""FOTS' marker motion on the device: dilation, shear and twist of the contact, for all markers of all environments at once.
 
 Zhao, Qian, Duan and Luo, FOTS, RA-L 2024 (arXiv 2404.19217), in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
 contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
@@ -7,17 +7,27 @@ contact points C_i of depth Δh_i and contacts c that the object has dragged by 
     shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                        e_c = exp(−λ_s ‖M − G_c‖²)
     twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)      e_c = exp(−λ_t ‖M − G_c‖²)
 
-With a contact radius R_0 > 0, λ_s and λ_t of a contact of radius R_c are those given times (R_0 / R_c)²: a wide contact drags its
-surroundings along farther than a narrow one. R_0 = 0 is the published form, one λ for all.
-
 Both sides of a difference are taken on the same skin: G_c is where the skin under the contact's centre was at rest, that centre less the
 drag; the dilation, whose contact points are where they are now, sees the marker as it was dragged. w_c = e_c / max(1, Σ e_c): the
 published factor for one contact, and no more than one motion in all where contacts are close. a is the area of a sample and g the gain
 [1/m³] that the published sum over pixels hides in its unit of length.
+
+With ``FotsConstants.punch`` shear and twist are those around a disc that sticks to a half-space (Johnson, Contact Mechanics, 1985, §3.6
+and 3.9; Reissner and Sagoci 1944), faded by the pad's finite thickness. With x = M − G_c, x̂ its direction, A the disc's radius, r ≥ A its
+distance from G_c (``_outside`` has both for an ellipse), t = A / r and g(t) = t √(1 − t²):
+
+    shear    Δd_s = (2/π) F [(asin t − κ g) Δs + 2 κ g x̂ (x̂ · Δs)]      e_c = (2/π) F asin t      F = exp(−(r − A) / ℓ)
+    twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
+
+On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
+of mean indentation h̄ sticks up to |Δs| = c h̄ A and |Δθ| A = ``TWIST_SLIP`` c h̄ A, and slips beyond: by Coulomb, where 8 G A Δs / (2 − ν)
+reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,13 +36,17 @@ import numpy as np
 
 from raytac.optics.recording import no_collection
 from raytac.optics.variant import load_mitsuba
+from raytac.specs.marker_motion import PunchSpec
 
-__all__ = ["FotsConstants", "FotsKernel"]
+__all__ = ["TWIST_SLIP", "FotsConstants", "FotsKernel"]
 
 _NEGLIGIBLE = 16.0
 """A Gaussian's exponent beyond which it is left out: e⁻¹⁶ is what float32 cannot add to 1."""
-_ROW = 8
-"""Floats a contact: active, G_x, G_y, Δs_x, Δs_y, Δθ, radius and one unused, so that two packet gathers bring one."""
+_ROW = 12
+"""Floats a contact: active, G, Δs, Δθ, T_xx, T_xy, T_yy, h̄ and two unused, so that three packet gathers bring one."""
+TWIST_SLIP = 3 * math.pi / 16
+"""Way at the edge of a contact when it spins over the shear when it slides, both as far as it would stick: of a ball on incompressible
+rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so 9π/32 / (2 − ν)."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +59,8 @@ class FotsConstants:
     shear_max: float
     twist_lambda: float
     twist_max: float
-    contact_radius: float = 0.0
+    punch: PunchSpec | None = None
+    """In place of λ and caps of shear and twist."""
 
 
 class FotsKernel:
@@ -61,7 +76,7 @@ class FotsKernel:
         self.nx, self.ny = len(x), len(y)
         self._origin = float(x[0]), float(y[0])
         self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
-        self._frozen: dict[tuple[int, int], Any] = {}
+        self._frozen: dict[tuple[int, int, bool], Any] = {}
         self._markers: tuple[np.ndarray, np.ndarray, Any] | None = None
         self._numbers: tuple[FotsConstants, Any] | None = None
 
@@ -70,7 +85,7 @@ class FotsKernel:
         markers: np.ndarray,
         depth: np.ndarray,
         boxes: np.ndarray,
-        contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        contacts: tuple[np.ndarray, ...],
         constants: FotsConstants,
     ) -> np.ndarray:
         """Displacement [m] of markers at rest, shape (B, M, 2), float32.
@@ -79,7 +94,8 @@ class FotsKernel:
             markers: x, y at rest [m], (B, M, 2).
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
             boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
-            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad], radius (B, K) [m]).
+            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad], ellipse (B, K, 3) [m²], mean
+                indentation (B, K) [m]).
             constants: of the pad.
         """
         mi = self.mi
@@ -89,15 +105,17 @@ class FotsKernel:
         box, sample = batch * k * _ROW, batch * (k * _ROW + 4)
         end = sample + batch * self.nx * self.ny
         frame = np.zeros(end + -end % 4, dtype=np.float32)  # packet gathers want whole packets of four
-        active, centre, shear, twist, radius = contacts
+        active, centre, shear, twist, ellipse, mean = contacts
         filled = frame[:box].reshape(batch, k, _ROW)[:, : active.shape[1]]
-        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5], filled[..., 6] = active, centre, shear, twist, radius
+        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5] = active, centre, shear, twist
+        filled[..., 6:9], filled[..., 9] = ellipse, mean
         frame[box:sample].reshape(batch, 4)[:] = boxes
         frame[sample:end].reshape(batch, self.ny, self.nx)[:] = depth
         inputs = self._on_device(markers), mi.Float(frame), self._constants(constants)
-        key = batch, k
+        is_punch = constants.punch is not None
+        key = batch, k, is_punch
         if key not in self._frozen:
-            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, *arrays))
+            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays))
         with no_collection():
             moved = self._frozen[key](*inputs)
         return np.array(moved).reshape(batch, count, 2)
@@ -116,19 +134,20 @@ class FotsKernel:
 
     def _constants(self, constants: FotsConstants) -> Any:
         if self._numbers is None or self._numbers[0] != constants:
-            c = constants
-            values = [c.dilate_gain, c.dilate_lambda, c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max, c.contact_radius]
+            c, p = constants, constants.punch
+            drag = [p.anisotropy, p.reach, p.slip] if p else [c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max]
+            values = [c.dilate_gain, c.dilate_lambda, *drag]
             self._numbers = constants, self.mi.Float(np.array(values, dtype=np.float32))
         return self._numbers[1]
 
-    def _sums(self, batch: int, count: int, k: int, xy: Any, frame: Any, constants: Any) -> Any:
+    def _sums(self, batch: int, count: int, k: int, is_punch: bool, xy: Any, frame: Any, constants: Any) -> Any:
         """``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, nx), one after the other."""
         mi = self.mi
         i = dr.arange(mi.UInt32, batch * count)
         env = i // count
         place = dr.gather(mi.Point2f, xy, i)
-        gain, ld, ls, smax, lt, tmax, radius = (dr.gather(mi.Float, constants, n) for n in range(7))
-        drag = _drag(mi, env, place, frame, k, (ls, smax, lt, tmax, radius))
+        gain, ld, *others = (dr.gather(mi.Float, constants, n) for n in range(dr.width(constants)))
+        drag = _drag(mi, env, place, frame, k, others, _stuck if is_punch else _gaussian)
         box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // 4 + env)
         first = mi.Int32(env) * (self.nx * self.ny) + batch * (k * _ROW + 4)
         dilate = self._dilate(place + drag, frame, box, first, ld) * (gain * self._pitch[0] * self._pitch[1])
@@ -166,29 +185,72 @@ class FotsKernel:
         return mi.Vector2f(sx, sy)
 
 
-def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: tuple[Any, ...]) -> Any:
-    """Shear and twist of all contacts of a marker's pad."""
-    ls, smax, lt, tmax, radius = constants
+def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: list[Any], follow: Callable[..., Any]) -> Any:
+    """Shear and twist of all contacts of a marker's pad; ``follow`` gives those of one."""
 
     def more(n: Any, *sums: Any) -> Any:
         return n < k
 
     def add(n: Any, es: Any, shear: Any, et: Any, twist: Any) -> tuple[Any, ...]:
-        a = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n))
-        b = dr.gather(mi.Vector4f, contacts, 2 * (env * k + n) + 1)
-        way = mi.Vector2f(a.w, b.x)
-        way *= dr.minimum(1, smax / dr.maximum(dr.norm(way), 1e-12))
-        out = place - (mi.Point2f(a.y, a.z) - way)
-        ratio = radius / dr.maximum(b.z, 1e-5)
-        r2 = dr.squared_norm(out) * dr.select(radius > 0, ratio * ratio, 1)
-        ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
-        angle = dr.clip(b.y, -tmax, tmax)
-        s = dr.sin(angle)
-        half = dr.sin(0.5 * angle)
-        less = -2 * half * half  # cos − 1 without cancellation
-        turned = mi.Vector2f(less * out.x - s * out.y, s * out.x + less * out.y)
-        return n + 1, es + ws, shear + ws * way, et + wt, twist + wt * turned
+        row = [dr.gather(mi.Vector4f, contacts, _ROW // 4 * (env * k + n) + part) for part in range(_ROW // 4)]
+        ws, sheared, wt, turned = follow(mi, place, row, *constants)
+        return n + 1, es + ws, shear + sheared, et + wt, twist + turned
 
     start = (mi.UInt32(0), mi.Float(0), mi.Vector2f(0), mi.Float(0), mi.Vector2f(0))
     _, es, shear, et, twist = dr.while_loop(start, more, add, label="drag")
     return shear / dr.maximum(1, es) + twist / dr.maximum(1, et)
+
+
+def _gaussian(mi: Any, place: Any, row: list[Any], ls: Any, smax: Any, lt: Any, tmax: Any) -> tuple[Any, Any, Any, Any]:
+    """(e, Δd) of the shear and of the twist of one contact, as published."""
+    a, b, _ = row
+    way = _at_most(mi.Vector2f(a.w, b.x), smax)
+    out = place - (mi.Point2f(a.y, a.z) - way)
+    r2 = dr.squared_norm(out)
+    ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
+    return ws, ws * way, wt, wt * _turned(mi, out, dr.clip(b.y, -tmax, tmax))
+
+
+def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: Any) -> tuple[Any, Any, Any, Any]:
+    """(e, Δd) of the shear and of the twist of one contact, of a disc that sticks."""
+    a, b, c = row
+    radius = dr.sqrt(dr.sqrt(dr.maximum(b.z * c.x - b.w * b.w, 1e-24)))
+    most = slip * c.y * radius
+    way = _at_most(mi.Vector2f(a.w, b.x), most)
+    out = place - (mi.Point2f(a.y, a.z) - way)
+    beyond = _outside(out, b.z, b.w, c.x)
+    r2 = radius * radius + beyond
+    root = dr.sqrt(beyond)
+    asin, g = dr.atan2(radius, root), radius * root / r2
+    share = 2 / math.pi * a.x
+    fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
+    along = dr.dot(out, way) / dr.maximum(dr.squared_norm(out), 1e-18) * out
+    sheared = share * fade * ((asin - kappa * g) * way + 2 * kappa * g * along)
+    widest = TWIST_SLIP * most / radius
+    wt = share * (asin - g)
+    return share * fade * asin, sheared, wt, wt * _turned(mi, out, dr.clip(b.y, -widest, widest))
+
+
+def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> Any:
+    """r² − A² of a place ``out`` from the centre of the ellipse xᵀ T⁻¹ x = 1 with A² = √det T; 0 inside.
+
+    The λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the place, which are the equipotentials of an elliptic disc:
+    ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
+    """
+    b = dr.squared_norm(out) - xx - yy
+    c = xx * yy - xy * xy - (yy * out.x * out.x - 2 * xy * out.x * out.y + xx * out.y * out.y)
+    root = dr.sqrt(dr.maximum(b * b - 4 * c, 0))
+    # The same root twice, without cancellation on either side of b = 0.
+    beyond = dr.select(b > 0, 0.5 * (b + root), -2 * c / dr.maximum(root - b, 1e-18))
+    return dr.select(c < 0, beyond, 0)
+
+
+def _at_most(way: Any, most: Any) -> Any:
+    return way * dr.minimum(1, most / dr.maximum(dr.norm(way), 1e-12))
+
+
+def _turned(mi: Any, out: Any, angle: Any) -> Any:
+    """(R − 1) ``out``."""
+    s, half = dr.sin(angle), dr.sin(0.5 * angle)
+    less = -2 * half * half  # cos − 1 without cancellation
+    return mi.Vector2f(less * out.x - s * out.y, s * out.x + less * out.y)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -10,23 +11,35 @@ from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part, mesh_part, primitive
 from raytac.gel.relief import relief_part
 from raytac.physics.coin import coin_elevation
-from raytac.specs.press import ObjectSpec
 from raytac.specs.press_file import OBJECT_SCHEMA
 
-__all__ = ["object_parts"]
+__all__ = ["Shape", "object_parts"]
 
 
-def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
+class Shape(Protocol):
+    """What names a shape: the object of a press scene, or a body of a task scene."""
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def params(self) -> dict[str, float | int | str]: ...
+
+
+def object_parts(spec: Shape) -> tuple[Part, ...]:
     """Parts of the object, object frame [m]; empty for ``none``.
 
     The −z side looks at the pad when the quaternion is the identity. ``sphere``: centre at the origin. ``cylinder``: axis z,
-    centre at the origin (standing; turn it by 90° about y to lie along x). ``edge``: a cube about the origin with one edge down,
-    along x. ``cone``: rounded tip down at the origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying
-    flat. ``pins``: a plate with rows × columns (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0.
+    centre at the origin (standing; turn it by 90° about y to lie along x). ``box``: length along x, width along y, height along z,
+    centre at the origin. ``edge``: a cube about the origin with one edge down, along x. ``cone``: rounded tip down at the origin,
+    base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns (y × x)
+    of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes only).
     ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
     Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind, a missing or impossible length, or a model
     that MuJoCo refuses or that has no such body.
     """
+    if spec.kind == "plane":
+        return (primitive("plane"),)
     if spec.kind not in OBJECT_SCHEMA:
         raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=tuple(OBJECT_SCHEMA))
     if spec.kind == "none":
@@ -35,6 +48,8 @@ def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
         return (primitive("sphere", (_length(spec, "radius"),)),)
     if spec.kind == "cylinder":
         return (primitive("cylinder", (_length(spec, "radius"), 0.5 * _length(spec, "length"))),)
+    if spec.kind == "box":
+        return (primitive("box", tuple(0.5 * _length(spec, key) for key in ("length", "width", "height"))),)
     if spec.kind == "edge":
         c = math.sqrt(0.5)
         edge_down = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, c, -c, 0.0], [0.0, c, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -56,7 +71,7 @@ def object_parts(spec: ObjectSpec) -> tuple[Part, ...]:
     return (mesh_part(vertices, faces),)
 
 
-def _pins(spec: ObjectSpec) -> tuple[Part, ...]:
+def _pins(spec: Shape) -> tuple[Part, ...]:
     rows, columns = _count(spec, "rows"), _count(spec, "columns")
     pitch, radius, height = (_length(spec, key) for key in ("pitch", "pin_radius", "pin_height"))
     if max(rows, columns) > 1 and pitch < 2.0 * radius:
@@ -70,13 +85,13 @@ def _pins(spec: ObjectSpec) -> tuple[Part, ...]:
     return tuple(parts)
 
 
-def _coin(spec: ObjectSpec) -> tuple[Part, ...]:
+def _coin(spec: Shape) -> tuple[Part, ...]:
     radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
     body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
     return body, relief_part(coin_elevation(radius, relief), radius)
 
 
-def _mjcf(spec: ObjectSpec) -> tuple[Part, ...]:
+def _mjcf(spec: Shape) -> tuple[Part, ...]:
     from raytac.physics.geoms import body_parts, load_mjcf
 
     try:
@@ -96,14 +111,14 @@ def _shift(x: float, y: float, z: float) -> np.ndarray:
     return pose
 
 
-def _length(spec: ObjectSpec, key: str, *, zero: bool = False) -> float:
+def _length(spec: Shape, key: str, *, zero: bool = False) -> float:
     value = spec.params.get(key)
     if not isinstance(value, int | float) or not math.isfinite(value) or value < 0.0 or (value == 0.0 and not zero):
         raise SpecError(f"must be a length {'>=' if zero else '>'} 0 [m]", key=f"object.{key}", value=value)
     return float(value)
 
 
-def _count(spec: ObjectSpec, key: str) -> int:
+def _count(spec: Shape, key: str) -> int:
     value = spec.params.get(key)
     if not isinstance(value, int) or value < 1:
         raise SpecError("must be a whole number >= 1", key=f"object.{key}", value=value)

@@ -1,8 +1,9 @@
-"""The bodies of a soft press: the bonded pad, and an object that is driven, lies free, or is soft itself."""
+"""The bodies of the contact solver: bonded pads, and what touches them, driven, lying free, or soft."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,18 +15,127 @@ from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["OBJECT", "PAD", "object_body", "pad_body"]
+__all__ = ["BODY_KINDS", "OBJECT", "PAD", "SceneBody", "object_body", "pad_body", "scene_body"]
 
 PAD, OBJECT = "pad", "object"
-"""Names of the two bodies."""
+"""Names of the two bodies of a press."""
+BODY_KINDS = ("kinematic", "affine", "soft", "half_space")
+"""What ``scene_body`` makes."""
 _HELD = 0.2
 """Share of a soft object's height, from its top, that the drive holds."""
 
 
-def pad_body(mesh: PadMesh, gelpad: GelpadSpec) -> ipc.SoftBody:
+@dataclass(frozen=True)
+class SceneBody:
+    """One body of a ``SoftScene`` besides the pads."""
+
+    solid: ipc.KinematicBody | ipc.AffineBody | ipc.SoftBody | ipc.HalfSpace
+    parts: tuple[Part, ...] = ()
+    """Exact shape of a rigid one, body frame: what a pad in contact is shown to touch. A soft one is shown as its surface is."""
+    friction: float | None = None
+    """μ against pads and bodies; None: each pad's own against pads."""
+
+    @property
+    def name(self) -> str:
+        return self.solid.name
+
+    @property
+    def is_soft(self) -> bool:
+        return isinstance(self.solid, ipc.SoftBody)
+
+    @property
+    def is_driven(self) -> bool:
+        """Its frame goes where it is told; else it moves freely."""
+        if isinstance(self.solid, ipc.SoftBody):
+            return len(self.solid.bonded) > 0
+        return not isinstance(self.solid, ipc.AffineBody)
+
+
+def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
     """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(PAD, mesh.tets, material, bonded=mesh.bonded)
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded)
+
+
+def scene_body(
+    name: str,
+    parts: Sequence[Part],
+    kind: str,
+    *,
+    density: float = 1000.0,
+    youngs_modulus: float = 1e6,
+    poisson_ratio: float = 0.45,
+    cell: float = 2e-3,
+    held: Callable[[np.ndarray], np.ndarray] | None = None,
+    friction: float | None = None,
+    sag: float = SAG,
+) -> SceneBody:
+    """A body from its parts, body frame.
+
+    Args:
+        name: unique in its scene.
+        parts: shape. ``half_space`` takes none (the solid is z <= 0 of its frame) or one ``plane``.
+        kind: ``kinematic``: rigid, goes where it is told. ``affine``: near-rigid and free. ``soft``: neo-Hookean, free, or driven where
+            ``held``. ``half_space``: a table or wall.
+        density: of an affine or soft body [kg/m³].
+        youngs_modulus, poisson_ratio: of a soft body [Pa], [-].
+        cell: length of a soft body's tetrahedra [m]. A box is cut into a grid of mirrored cells; all else by pytetwild.
+        held: of a soft body: tells from vertices (n, 3) [m] which, (n,) bool, are fixed to the body's frame; None: none, it is free.
+        friction: see ``SceneBody``.
+        sag: how far facets may lie inside a curved part [m].
+
+    Raises:
+        InputError: an unknown kind, a surface that it cannot be made from, or ``held`` that names no vertex.
+    """
+    if kind not in BODY_KINDS:
+        raise InputError("kind", value=kind, rule=f"of body {name!r} must be a known kind of body", choices=BODY_KINDS)
+    parts = tuple(parts)
+    if friction is not None and not 0.0 <= friction < np.inf:
+        raise InputError("friction", value=friction, rule=f"of body {name!r} must be finite and >= 0")
+    try:
+        if kind == "half_space":
+            if len(parts) > 1 or (
+                parts and (parts[0].kind != "plane" or not np.array_equal(parts[0].object_from_part, np.eye(4)))
+            ):
+                rule = f"of half-space {name!r} must be one plane in the body's own axes"
+                raise InputError("parts", value=[part.kind for part in parts], rule=rule)
+            return SceneBody(ipc.HalfSpace(name), parts or (Part("plane"),), friction)
+        if kind == "soft":
+            return SceneBody(_soft(name, parts, density, youngs_modulus, poisson_ratio, cell, held), (), friction)
+        surface = object_surface(parts, sag)
+        if kind == "affine":
+            return SceneBody(ipc.AffineBody(name, surface, ipc.Stiff(density=density)), parts, friction)
+        return SceneBody(ipc.KinematicBody(name, surface), parts, friction)
+    except ipc.IpcError as error:
+        raise InputError("kind", value=kind, rule=f"cannot be made from the shape of {name!r}: {error}") from error
+
+
+def _soft(
+    name: str,
+    parts: tuple[Part, ...],
+    density: float,
+    youngs_modulus: float,
+    poisson_ratio: float,
+    cell: float,
+    held: Callable[[np.ndarray], np.ndarray] | None,
+) -> ipc.SoftBody:
+    if not 0.0 < cell < np.inf:
+        raise InputError("cell", value=cell, rule=f"of soft body {name!r} must be a length > 0 [m]")
+    if len(parts) == 1 and parts[0].kind == "box":
+        lines = [np.linspace(-half, half, 2 * max(round(half / cell), 1) + 1) for half in parts[0].size]
+        cut = ipc.box_mesh(*lines, cut="mirrored")
+        pose = parts[0].object_from_part
+        tets = ipc.TetMesh(cut.vertices @ pose[:3, :3].T + pose[:3, 3], cut.tets)
+    else:
+        tets = ipc.tetrahedralize(object_surface(parts, 0.05 * cell), cell)
+    bonded = np.zeros(0, np.int64)
+    if held is not None:
+        bonded = np.flatnonzero(held(tets.vertices))
+        if not 0 < len(bonded) < len(tets.vertices):
+            rule = f"holds {len(bonded)} of the {len(tets.vertices)} vertices of {name!r}: it must hold some and leave some"
+            raise InputError("held", value=held, rule=rule)
+    material = ipc.Material(young=youngs_modulus, poisson=poisson_ratio, density=density)
+    return ipc.SoftBody(name, tets, material, bonded=bonded)
 
 
 def object_body(
@@ -37,7 +147,7 @@ def object_body(
     edge_length: float = 1e-3,
     lowest: float = 0.0,
     sag: float = SAG,
-) -> ipc.KinematicBody | ipc.AffineBody | ipc.SoftBody:
+) -> SceneBody:
     """The object of a press scene as a body of the solver, in the object's frame.
 
     ``kinematic``: a rigid surface that is driven, without the triangles that no press brings near the pad. ``affine``: free and
@@ -63,17 +173,17 @@ def object_body(
             near = (height[surface.faces].min(axis=1) - height.min()) <= lowest
             used, faces = np.unique(surface.faces[near], return_inverse=True)
             surface = ipc.TriMesh(surface.vertices[used], faces.reshape(-1, 3))
-        return ipc.KinematicBody(OBJECT, surface)
+        return SceneBody(ipc.KinematicBody(OBJECT, surface), tuple(parts))
     try:
         if spec.dynamics == "affine":
             volume = _volume(surface)
-            return ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume)))
+            return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
             tets = ipc.tetrahedralize(surface, edge_length)
             height = tets.vertices @ rotation[2]
             held = np.flatnonzero(height >= height.max() - _HELD * np.ptp(height))
             material = ipc.Material(young=spec.youngs_modulus, poisson=spec.poisson_ratio)
-            return ipc.SoftBody(OBJECT, tets, material, bonded=held)
+            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=held))
     except ipc.IpcError as error:
         raise InputError("object.dynamics", value=spec.dynamics, rule=f"cannot be made from this object: {error}") from error
     raise InputError("object.dynamics", value=spec.dynamics, rule="must be a known kind of body", choices=DYNAMICS)

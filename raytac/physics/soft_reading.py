@@ -9,21 +9,61 @@ import numpy as np
 
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.coat_surface import CoatPlaces, CoatSurface
+from raytac.gel.fine_contact import FineContact, FineGrid
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
 from raytac.gel.part import Part, mesh_part
 from raytac.gel.product import sandwich
-from raytac.gel.spline import hat_matrix
 from raytac.gel.standoff import ContactFit, StandOff
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.physics.soft_contact import SoftContact
+from raytac.physics.pad_compliance import coat_compliance
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["SoftReader", "SoftReading"]
+__all__ = ["SeenObject", "SeenPad", "SoftReader", "SoftReading"]
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
+_FINE = 0.1e-3
+"""Spacing of the grid on which the contact is found [m]."""
+_BEHIND = 1e-3
+"""An underside so far below the coat [m] is that of an object beside or behind the pad: no contact overlaps by that much."""
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """One object as B pads may touch it; pad frame."""
+
+    parts: Sequence[Part]
+    """Exact shape of a rigid object, object frame; empty for a soft one."""
+    poses: np.ndarray
+    """``pad_from_object``, (B, 4, 4)."""
+    surface: tuple[np.ndarray, np.ndarray] | None = None
+    """Of a soft object: vertices (B, n, 3) [m] and faces as they are now."""
+    near: np.ndarray | None = None
+    """Whether it counts, (B,) bool; None: always. One that does not touch may lie anywhere, also behind the pad."""
+
+    def counts(self, b: int) -> bool:
+        return self.near is None or bool(self.near[b])
+
+    def shape(self, b: int, lowered: float = 0.0) -> tuple[Sequence[Part], np.ndarray]:
+        """Parts and their pose (4, 4) over pad ``b``, ``lowered`` along z [m]."""
+        pose = self.poses[b].copy()
+        if self.surface is not None:
+            pose = np.eye(4)
+        pose[2, 3] -= lowered
+        return (self.parts if self.surface is None else (mesh_part(self.surface[0][b], self.surface[1]),)), pose
+
+
+@dataclass(frozen=True)
+class SeenPad:
+    """What a solver knows of B copies of one pad; pad frame."""
+
+    coat: np.ndarray
+    """Vertices of the coat [m], shape (B, V, 3)."""
+    forces: np.ndarray
+    """What touches does to each of them [N], shape (B, V, 3)."""
+    objects: tuple[SeenObject, ...]
 
 
 @dataclass(frozen=True)
@@ -35,37 +75,38 @@ class SoftReading:
     """On each vertex of the coat [N], shape (B, V, 3)."""
     clearance: np.ndarray
     """Mean distance that the barrier kept [m], shape (B,); NaN out of contact."""
-    poses: np.ndarray
-    """``pad_from_object`` (B, 4, 4), lowered by the clearance."""
+    poses: tuple[np.ndarray, ...]
+    """Of each object: ``pad_from_object`` (B, 4, 4), lowered by the clearance."""
     underside: np.ndarray
-    """Underside of the object there over the grid [m], shape (B, Ny, Nx), inf where it is not. Of a rigid object, what lies wholly
-    above the pad's highest point may be left out; of a soft one, all is there, in contact or not."""
+    """Underside of the objects there over the grid [m], shape (B, Ny, Nx), inf where there is none. Of a rigid object, what lies
+    wholly above the pad's highest point may be left out; of a soft one, all is there, in contact or not."""
 
 
 class SoftReader:
-    """Reads a ``SoftContact``."""
+    """Reads one kind of pad, whatever touches it: one object or several, rigid or soft."""
 
-    def __init__(self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid, parts: Sequence[Part]) -> None:
-        self.mesh, self.grid, self.parts = mesh, grid, parts
+    def __init__(self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid) -> None:
+        self.mesh, self.grid = mesh, grid
         self._surface = CoatSurface(mesh.coat, gelpad)
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
         self._rest = grid.rest.astype(np.float32)
-        lines = (mesh.coat.lines_y, grid.y), (mesh.coat.lines_x, grid.x)
-        self._hat_y, self._hat_x = (hat_matrix(at, to).astype(np.float32) for at, to in lines)
+        self._gelpad = gelpad
+        self._fine_pad = grid if min(grid.pitch) > 0.9 * _FINE else make_grid(gelpad, _FINE)
+        self._fine: tuple[FineContact, FineGrid] | None = None
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._stand_off = StandOff(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
         corners = mesh.coat.rest[mesh.coat.faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         self._vertex_area = np.bincount(mesh.coat.faces.ravel(), np.repeat(area / 3.0, 3), len(mesh.coat.rest))
 
-    def clearance(self, contact: SoftContact, driven: np.ndarray) -> np.ndarray:
-        """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact; ``driven`` (B, 4, 4): where a drive has the object."""
-        coat, forces, poses = contact.coat(), contact.forces(), contact.pad_from_object(driven)
-        return np.array([self._fit(contact, coat[b], forces[b], poses[b], b)[1].clearance for b in range(len(coat))])
+    def clearance(self, seen: SeenPad) -> np.ndarray:
+        """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact."""
+        return np.array([self._fit(seen, b)[1].clearance for b in range(len(seen.coat))])
 
-    def read(self, contact: SoftContact, driven: np.ndarray, failed: np.ndarray) -> SoftReading:
-        """All that is shown of every pad; NaN for those that ``failed``."""
-        coat, forces, poses = contact.coat(), contact.forces(), contact.pad_from_object(driven).copy()
+    def read(self, seen: SeenPad, failed: np.ndarray) -> SoftReading:
+        """All that is shown of every pad; NaN for those that ``failed``, (B,)."""
+        coat, forces = seen.coat.copy(), seen.forces.copy()
+        poses = tuple(thing.poses.copy() for thing in seen.objects)
         batch = len(coat)
         clearance = np.full(batch, np.nan)
         height = np.empty((batch, *self.grid.shape), np.float32)
@@ -73,50 +114,87 @@ class SoftReader:
         centre, undersides = np.full((batch, 2), np.nan), np.full(height.shape, np.inf)
         for b in range(batch):
             if failed[b]:
-                coat[b] = forces[b] = poses[b] = height[b] = np.nan
+                coat[b] = forces[b] = height[b] = np.nan
+                for pose in poses:
+                    pose[b] = np.nan
                 continue
-            places, fit = self._fit(contact, coat[b], forces[b], poses[b], b)
+            places, fit = self._fit(seen, b)
             coat[b, :, 2] += fit.shift
             height[b] = self._heights(places, coat[b])
             if not np.isfinite(fit.clearance):
-                undersides[b] = self._underside(contact, poses[b], 0.0, b)
+                undersides[b] = self._underside(seen, b, self.grid)
                 continue
             clearance[b] = fit.clearance
-            poses[b, 2, 3] -= fit.clearance
+            for pose in poses:
+                pose[b, 2, 3] -= fit.clearance
             load = np.maximum(-forces[b, :, 2], 0.0)
-            under = undersides[b] = self._underside(contact, poses[b], fit.clearance, b)
-            borne = sandwich(self._hat_y, load.reshape(self.mesh.coat.shape), self._hat_x.T)
-            height[b], touched[b] = self._stand_off.close(height[b], under, borne)
+            fine, to_grid = self._fine_contact()
+            upwards = seen.coat[b, :, 2] - self.mesh.coat.rest[:, 2]
+            smooth = None
+            if len(seen.objects) > 1:
+                smooth = self._fine_pad.rest + fine.here.lattice(self._surface.rise(places, upwards))
+            near = self._underside(seen, b, self._fine_pad, fit.clearance, smooth)
+            shape = fine.solve(places, upwards, load, near - self._fine_pad.rest)
+            same = self._fine_pad is self.grid
+            under = undersides[b] = near if same else self._underside(seen, b, self.grid, fit.clearance, height[b])
+            height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
             centre[b] = load @ coat[b, :, :2] / load.sum()
         deformed = DeformedCoat(self.mesh.coat, coat)
-        surface = GelSurface(self.grid, height, touched, centre, poses, deformed)
+        surface = GelSurface(self.grid, height, touched, centre, _touched_pose(seen, poses), deformed)
         return SoftReading(surface, forces, clearance, poses, undersides)
 
-    def _fit(
-        self, contact: SoftContact, coat: np.ndarray, forces: np.ndarray, pose: np.ndarray, b: int
-    ) -> tuple[CoatPlaces, ContactFit]:
+    def _fit(self, seen: SeenPad, b: int) -> tuple[CoatPlaces, ContactFit]:
+        coat, forces = seen.coat[b], seen.forces[b]
         moved = coat - self.mesh.coat.rest
         places = self._surface.places(moved)
         if not (forces[:, 2] < 0.0).any():
             return places, ContactFit(float("nan"), np.zeros(len(coat)))
         below = float(self.grid.rest.max()) + 10.0 * self.mesh.d_hat
-        parts, pose = self._object(contact, pose, b)
-        under = object_height(parts, pose[None], self._stand_off.x, self._stand_off.y, below=below)[0]
+        under = np.full((len(self._stand_off.y), len(self._stand_off.x)), np.inf)
+        for thing in seen.objects:
+            if thing.counts(b):
+                parts, pose = thing.shape(b)
+                found = object_height(parts, pose[None], self._stand_off.x, self._stand_off.y, below=below)[0]
+                np.minimum(under, found, out=under)
+        if len(seen.objects) > 1:
+            smooth = self._stand_off.heights(self._surface.rise(places, moved[:, 2]))
+            under[under < smooth - _BEHIND] = np.inf
         return places, self._stand_off.fit(places, moved[:, 2], -forces[:, 2] / self._vertex_area, under)
-
-    def _object(self, contact: SoftContact, pose: np.ndarray, b: int) -> tuple[Sequence[Part], np.ndarray]:
-        """Parts and pose of one object; a soft one is its surface as it is now."""
-        soft = contact.soft_object()
-        return (self.parts, pose) if soft is None else ((mesh_part(soft[0][b], soft[1]),), np.eye(4))
 
     def _heights(self, places: CoatPlaces, coat: np.ndarray) -> np.ndarray:
         rise = self._surface.rise(places, coat[:, 2] - self.mesh.coat.rest[:, 2])
         return self._rest + sandwich(self._rows, rise, self._columns)
 
-    def _underside(self, contact: SoftContact, shown: np.ndarray, clearance: float, b: int) -> np.ndarray:
-        """Underside of the shown object over the grid [m], (Ny, Nx)."""
-        parts, pose = self._object(contact, shown, b)
-        if parts is self.parts:
-            return object_height(parts, pose[None], self.grid.x, self.grid.y, below=float(self.grid.rest.max()))[0]
-        pose[2, 3] = -clearance
-        return object_height(parts, pose[None], self.grid.x, self.grid.y)[0]
+    def _fine_contact(self) -> tuple[FineContact, FineGrid]:
+        """What finds the contact, and what takes it to the grid; made at the first contact, since the mesh's compliance takes a while."""
+        if self._fine is None:
+            found, continued = (coat_compliance(self.mesh, self._gelpad, rollers=rollers) for rollers in (False, True))
+            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found, continued)
+            self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y)
+        return self._fine
+
+    def _underside(
+        self, seen: SeenPad, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Underside of the shown objects over a grid [m], (Ny, Nx); without what is far below the ``smooth`` coat there, if it is given."""
+        under = np.full(grid.shape, np.inf)
+        highest = float(grid.rest.max())
+        for thing in seen.objects:
+            if thing.counts(b):
+                parts, pose = thing.shape(b, clearance)
+                below = highest if thing.surface is None else np.inf
+                np.minimum(under, object_height(parts, pose[None], grid.x, grid.y, below=below)[0], out=under)
+        if len(seen.objects) > 1 and smooth is not None:
+            under[under < smooth - _BEHIND] = np.inf
+        return under
+
+
+def _touched_pose(seen: SeenPad, poses: tuple[np.ndarray, ...]) -> np.ndarray | None:
+    """Pose (B, 4, 4) of the only object, or of the first that counts in each environment; None without one."""
+    if not poses:
+        return None
+    found = poses[0].copy()
+    for thing, pose in reversed(list(zip(seen.objects, poses, strict=True))):
+        near = np.ones(len(pose), bool) if thing.near is None else thing.near
+        found[near] = pose[near]
+    return found

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.markers.calibration import PUBLISHED
 from raytac.report.machine import machine
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.sensor import SensorSpec
@@ -33,10 +34,8 @@ __all__ = [
 
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Every file that a calibration writes."""
-TESTED = ("fots", "superposition", "force_field")
+TESTED = ("fots", PUBLISHED, "superposition", "force_field")
 """Models that are compared with surface tracking."""
-PUBLISHED = "fots_published"
-"""FOTS with one λ for contacts of all sizes, fitted to the same presses."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class MotionReport:
     errors: list[ModelError]
     """On held-out presses."""
     fit_errors: list[ModelError]
-    """Of FOTS on the presses that it was fitted to."""
+    """Of FOTS, and of FOTS as published, on the presses that both were fitted to."""
     times_ms: dict[str, float]
     """Median time of a frame of every model, at the probes."""
     probes: int
@@ -121,11 +120,7 @@ def calibrate_markers(
     fitted = replace(sensor, marker_motion=motion)
     grid = fit[0].surface.grid
     errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
-    as_published = replace(sensor, marker_motion=fit_motion(data, published=True, device=device))
-    published, _ = model_errors(as_published, held_out, grid, models=("fots",), device=device)
-    errors += [replace(row, model=PUBLISHED) for row in published]
-    times[PUBLISHED] = times["fots"]
-    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots",), device=device)
+    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", PUBLISHED), device=device)
     markers = probe_sensor(sensor).markers
     report = MotionReport(motion, errors, fit_errors, times, markers.rows * markers.columns, held_out)
     return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad)))
@@ -135,8 +130,8 @@ def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame],
     def listed(frames: list[PressFrame]) -> list[str]:
         return [f"  {press}" for press in dict.fromkeys(str(frame.press) for frame in frames)]
 
-    def errors(rows: list[ModelError]) -> str:
-        return ", ".join(f"{row.load} {1e6 * row.mean:.1f} um" for row in rows if row.model == "fots")
+    def errors(rows: list[ModelError], model: str) -> str:
+        return ", ".join(f"{row.load} {1e6 * row.mean:.1f} um" for row in rows if row.model == model)
 
     gelpad = sensor.gelpad
     return "\n".join(
@@ -148,8 +143,10 @@ def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame],
             *listed(fit),
             "Presses held out:",
             *listed(held_out),
-            f"Mean distance of FOTS, {report.probes} probes on a 1 mm grid, on the fit: {errors(report.fit_errors)};",
-            f"held out: {errors(report.errors)}.",
+            f"Mean distance of FOTS, {report.probes} probes on a 1 mm grid, on the fit: {errors(report.fit_errors, 'fots')};",
+            f"held out: {errors(report.errors, 'fots')}.",
+            f"Without [punch], as published, on the fit: {errors(report.fit_errors, PUBLISHED)};",
+            f"held out: {errors(report.errors, PUBLISHED)}.",
         ]
     )
 
@@ -158,8 +155,10 @@ def motion_metrics(report: MotionReport) -> dict[str, Metric]:
     """Constants and errors as flat keys."""
     metrics: dict[str, Metric] = {"command": "calibrate-markers", "markers.probes": report.probes}
     motion = report.motion
-    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max", "contact_radius"):
+    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         metrics[f"fots.{name}"] = getattr(motion, name)
+    if motion.punch is not None:
+        metrics |= {f"punch.{name}": getattr(motion.punch, name) for name in ("anisotropy", "reach", "slip")}
     for name in ("field_gain", "field_shear", "field_friction"):
         metrics[name.replace("_", ".", 1)] = getattr(motion, name)
     for part, rows in (("held_out", report.errors), ("fit", report.fit_errors)):

@@ -34,7 +34,7 @@ _STYLE: dict[Any, Any] = {
 _LABELS = {
     "surface": "surface tracking",
     "fots": "FOTS",
-    "fots_published": "FOTS, one λ",
+    "fots_published": "FOTS as published",
     "superposition": "superposition",
     "force_field": "force field",
 }

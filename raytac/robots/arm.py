@@ -76,6 +76,13 @@ class Arm:
         mujoco.mj_fullM(self.model, data, full)
         return full[np.ix_(self.dof, self.dof)]
 
+    def inertial(self, data: mujoco.MjData, acceleration: np.ndarray) -> np.ndarray:
+        """M q̈ (n,) [N·m] for ``acceleration`` (n,) [rad/s²]; cheaper than the matrix."""
+        full, torque = np.zeros(self.model.nv), np.zeros(self.model.nv)
+        full[self.dof] = acceleration
+        mujoco.mj_mulM(self.model, data, torque, full)
+        return torque[self.dof]
+
     def bias(self, data: mujoco.MjData) -> np.ndarray:
         """C(q, q̇) q̇ + g(q) (n,) [N·m]: at rest, the torques that hold the arm against gravity."""
         return data.qfrc_bias[self.dof]

@@ -147,7 +147,7 @@ class JointImpedance:
                 raise InputError(name, value=np.asarray(value).tolist(), rule=f"must be {len(arm)} finite numbers")
         away, late = joints - data.qpos[arm.qpos], velocity - data.qvel[arm.dof]
         pull = self._frequency**2 * away + 2.0 * self._ratio * self._frequency * late
-        return _joint_torque(arm, arm.mass_matrix(data) @ pull + arm.bias(data))
+        return _joint_torque(arm, arm.inertial(data, pull) + arm.bias(data))
 
 
 def _joint_torque(arm: Arm, torque: np.ndarray) -> JointTorque:

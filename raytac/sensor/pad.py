@@ -9,6 +9,7 @@ import numpy as np
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.physics.pad_reading import PadReading
 from raytac.physics.solver import check_solver
 from raytac.sensor.contact_width import cells_across
 from raytac.specs import PressScene, SensorSpec
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from raytac.physics.soft import SoftPad
     from raytac.physics.soft_mesh import PadMesh
 
-__all__ = ["load_pad", "pad_forces", "state_surface"]
+__all__ = ["load_pad", "pad_forces", "reading_forces", "state_surface"]
 
 
 def load_pad(
@@ -77,9 +78,23 @@ def pad_forces(
         found["wrench"] = pad.wrench(state)  # type: ignore[arg-type]
     if "traction" in outputs:
         found["traction"] = pad.traction(state)  # type: ignore[arg-type]
-    if found:
-        cell = surface.grid.pitch[0] * surface.grid.pitch[1]
-        found["contact_area"] = np.where(state.failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
-    if found and surface.coat is not None:
-        found["contact_cells"] = np.where(state.failed, np.nan, cells_across(surface, surface.coat.mesh))
+    return found | (_contact_size(surface, state.failed) if found else {})
+
+
+def reading_forces(reading: PadReading, outputs: tuple[str, ...]) -> dict[str, np.ndarray | Any]:
+    """The same of what a world's pad reads."""
+    found: dict[str, Any] = {}
+    if "wrench" in outputs:
+        found["wrench"] = reading.wrench
+    if "traction" in outputs:
+        found["traction"] = reading.traction()
+    return found | (_contact_size(reading.surface, reading.failed) if found else {})
+
+
+def _contact_size(surface: GelSurface, failed: np.ndarray) -> dict[str, np.ndarray]:
+    """``contact_area`` and, of a simulated pad, ``contact_cells``."""
+    cell = surface.grid.pitch[0] * surface.grid.pitch[1]
+    found = {"contact_area": np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)}
+    if surface.coat is not None:
+        found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
     return found

@@ -18,6 +18,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.optics.base import OPTICAL_OUTPUTS
+from raytac.physics.pad_reading import PadReading
 from raytac.sensor.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.imaging import Imaging
 from raytac.sensor.options import (
@@ -32,7 +33,7 @@ from raytac.sensor.options import (
     sensor_spec,
     warn_of_other_shape,
 )
-from raytac.sensor.pad import load_pad, pad_forces, state_surface
+from raytac.sensor.pad import load_pad, pad_forces, reading_forces, state_surface
 from raytac.specs import PressScene, SensorSpec, validate_press
 from raytac.specs.press import PADS
 
@@ -64,6 +65,8 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    pitch: float
+    """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     physics: str
     """How the gel deforms: as asked for, else as the scene that was loaded last asks, else ``rigid``."""
 
@@ -131,8 +134,8 @@ class TactileSensor:
         self.resolution = size if size is not None else self.spec.camera.resolution
         warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.num_envs = device, num_envs
-        self._pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
-        self.grid = make_grid(self.spec.gelpad, self._pitch)
+        self.pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
+        self.grid = make_grid(self.spec.gelpad, self.pitch)
         self._level: str | PadMesh = pad or PADS[0]
         self.markers, self._marker_perturbation = markers, marker_perturbation
         if markers is not None:
@@ -235,7 +238,7 @@ class TactileSensor:
             physics=self.physics,
             level=self._level,
             device=self.device,
-            pitch=self._pitch,
+            pitch=self.pitch,
             num_envs=self.num_envs,
             seed=self.seed,
             offsets=offsets,
@@ -246,8 +249,8 @@ class TactileSensor:
             self._tracker.reset()
         return self._pad
 
-    def update(self, state: ContactState | GelSurface) -> TactileFrame:
-        """Frame of a gel surface, or of a state of the physics that ``load`` or ``press`` set up.
+    def update(self, state: ContactState | GelSurface | PadReading) -> TactileFrame:
+        """Frame of a gel surface, of a state of the physics that ``load`` or ``press`` set up, or of what a world's pad reads.
 
         With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
 
@@ -258,6 +261,9 @@ class TactileSensor:
         if isinstance(state, GelSurface):
             surface, force, area, failed = state, None, None, None
             forces: dict[str, Any] = {}
+        elif isinstance(state, PadReading):
+            surface, force, area, failed = state.surface, state.force, None, state.failed
+            forces = reading_forces(state, self.outputs)
         else:
             surface, failed = state_surface(self._pad, state), state.failed
             assert self._pad is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from raytac.specs.files import available
-from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion
+from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec, load_marker_motion
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.press_file import load_press, validate_press
@@ -21,8 +21,11 @@ from raytac.specs.sensor import (
 )
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.sensor_file import load_lights, load_sensor, with_lights
+from raytac.specs.task import BodySpec, MountSpec, RobotSpec, TaskScene
+from raytac.specs.task_file import load_task
 
 __all__ = [
+    "BodySpec",
     "CameraSpec",
     "CaseSpec",
     "CoatSpec",
@@ -31,18 +34,23 @@ __all__ = [
     "LightsSpec",
     "MarkerMotionSpec",
     "MarkerSpec",
+    "MountSpec",
     "ObjectSpec",
     "PressScene",
+    "PunchSpec",
     "RefractionSpec",
     "ResponseSpec",
+    "RobotSpec",
     "SensorSpec",
     "StageSpec",
+    "TaskScene",
     "available",
     "load_lights",
     "load_marker_motion",
     "load_mesh",
     "load_press",
     "load_sensor",
+    "load_task",
     "validate_press",
     "validate_sensor",
     "with_lights",

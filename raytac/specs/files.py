@@ -1,4 +1,4 @@
-"""From a name or a path to the file that holds a sensor, its lights, its markers' motion or a press scene."""
+"""From a name or a path to the file that holds a sensor, its lights, its markers' motion, a press scene or a task scene."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ __all__ = ["available", "find_file", "is_file"]
 _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "sensor": ("scenes", "sensors"),
     "press scene": ("scenes", "press"),
+    "task scene": ("scenes", "tasks"),
     "lights": ("lights", ""),
     "marker motion": ("scenes", "markers"),
 }
 
 
 def available(what: str) -> tuple[str, ...]:
-    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"``, ``"lights"`` or ``"marker motion"``."""
+    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"``, ``"task scene"``, ``"lights"`` or ``"marker motion"``."""
     return tuple(sorted(path.stem for path in _folder(what).glob("*.toml")))
 
 

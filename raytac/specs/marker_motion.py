@@ -9,7 +9,19 @@ from typing import Final
 from raytac.specs.files import find_file
 from raytac.specs.toml import Number, Schema, Text, read_toml
 
-__all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "load_marker_motion", "marker_motion_text"]
+__all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "PunchSpec", "load_marker_motion", "marker_motion_text"]
+
+
+@dataclass(frozen=True)
+class PunchSpec:
+    """How the skin around a contact that sticks follows it: the rigid punch of contact mechanics; formulas in docs/markers.md."""
+
+    anisotropy: float
+    """κ: how much farther the skin follows along the shear than across it [-]; ν / (2 − ν) on a half-space, 0 alike."""
+    reach: float
+    """ℓ: length over which what a half-space would do fades in a pad of finite thickness [m]."""
+    slip: float
+    """c: the contact sticks up to a shear of c times its mean indentation times its radius [1/m]."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +40,6 @@ class MarkerMotionSpec:
     """λ_t of FOTS: how fast the rotation falls off around the contact centre [1/m²]."""
     twist_max: float
     """Δθ_max of FOTS: the most that markers follow a twist [rad]."""
-    contact_radius: float
-    """Radius of the contact that λ_s and λ_t hold for [m]; they scale with 1 / radius² for others. 0: they hold for all, as published."""
     field_gain: float
     """Scale of the normalised force field: marker displacement by penetration along a wall's normal [-]."""
     field_shear: float
@@ -38,6 +48,8 @@ class MarkerMotionSpec:
     """Friction coefficient of the force field [-]: tangential force is at most this share of the normal one."""
     provenance: str
     """Data, date and errors of the fit, as text."""
+    punch: PunchSpec | None = None
+    """In place of FOTS' Gaussians and caps of shear and twist; None: those, as published."""
     source: Path | None = None
     """File that it was read from."""
 
@@ -51,7 +63,11 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
         "shear_max_mm": Number("(0, 10]"),
         "twist_lambda_per_mm2": Number("(0, 100]"),
         "twist_max_deg": Number("(0, 180]"),
-        "contact_radius_mm": Number("[0, 50]", default=0.0),
+    },
+    "punch": {
+        "anisotropy": Number("[0, 1]"),
+        "reach_mm": Number("(0, 1000]"),
+        "slip_per_mm": Number("[0, 1000]"),
     },
     "force_field": {
         "gain": Number("[0, 100]"),
@@ -70,15 +86,18 @@ def load_marker_motion(name_or_path: str | Path, *, base: Path | None = None) ->
     """
     path = find_file("marker motion", name_or_path, base=base)
     top = read_toml(path)
-    head = top.read(MARKER_MOTION_SCHEMA[""], sections=("fots", "force_field"))
+    head = top.read(MARKER_MOTION_SCHEMA[""], sections=("fots", "punch", "force_field"))
     fots = top.section("fots").read(MARKER_MOTION_SCHEMA["fots"])
     field = top.section("force_field").read(MARKER_MOTION_SCHEMA["force_field"])
-    return MarkerMotionSpec(**fots, **{f"field_{key}": value for key, value in field.items()}, **head, source=path)
+    punch = PunchSpec(**top.section("punch").read(MARKER_MOTION_SCHEMA["punch"])) if "punch" in top.data else None
+    forces = {f"field_{key}": value for key, value in field.items()}
+    return MarkerMotionSpec(**fots, **forces, **head, punch=punch, source=path)
 
 
 def marker_motion_text(motion: MarkerMotionSpec) -> str:
     """The file of ``motion``; ``load_marker_motion`` reads it back, to six digits."""
     degrees = 180.0 / 3.141592653589793
+    punch = motion.punch
     rows = {
         "fots": {
             "dilate_gain_per_mm3": (motion.dilate_gain * 1e-9, "integral form of the published sum; see docs/markers.md"),
@@ -87,7 +106,13 @@ def marker_motion_text(motion: MarkerMotionSpec) -> str:
             "shear_max_mm": (motion.shear_max * 1e3, "cap of the shear that markers follow"),
             "twist_lambda_per_mm2": (motion.twist_lambda * 1e-6, "lambda_t"),
             "twist_max_deg": (motion.twist_max * degrees, "cap of the twist that markers follow"),
-            "contact_radius_mm": (motion.contact_radius * 1e3, "radius that lambda_s and lambda_t hold for; 0: as published"),
+        },
+        "punch": {}
+        if punch is None
+        else {
+            "anisotropy": (punch.anisotropy, "kappa: nu / (2 - nu) on a half-space"),
+            "reach_mm": (punch.reach * 1e3, "length over which the half-space's motion fades in the pad"),
+            "slip_per_mm": (punch.slip * 1e-3, "shear that sticks, by mean indentation times radius"),
         },
         "force_field": {
             "gain": (motion.field_gain, "displacement by penetration along a wall's normal"),
@@ -98,6 +123,8 @@ def marker_motion_text(motion: MarkerMotionSpec) -> str:
     lines = ["# Marker motion of a gelpad, written by `raytac calibrate markers`. Lengths in mm.", ""]
     lines += ['provenance = """', *motion.provenance.strip().splitlines(), '"""']
     for table, values in rows.items():
+        if not values:
+            continue
         lines += ["", f"[{table}]"]
         lines += [f"{key} = {value:.6g}".ljust(40) + f"# {note}" for key, (value, note) in values.items()]
     return "\n".join(lines) + "\n"

@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from raytac.errors import MeshError, SpecError
-from raytac.specs.files import find_file, is_file
-from raytac.specs.mesh import load_mesh
+from raytac.errors import SpecError
+from raytac.specs.files import find_file
 from raytac.specs.press import DYNAMICS, MOVES, PADS, PHYSICS, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
+from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion
+from raytac.specs.toml import Number, Schema, Table, Text, read_toml
 
 __all__ = ["OBJECT_SCHEMA", "POSE_SCHEMA", "SCENE_SCHEMA", "STAGE_SCHEMA", "load_press", "validate_press"]
-
-_LENGTH = Number("(0, 100]")
-
-OBJECT_SCHEMA: Final[dict[str, Schema]] = {
-    "none": {},
-    "sphere": {"radius_mm": _LENGTH},
-    "cylinder": {"radius_mm": _LENGTH, "length_mm": _LENGTH},
-    "edge": {"side_mm": _LENGTH},
-    "cone": {"radius_mm": _LENGTH, "height_mm": _LENGTH, "tip_radius_mm": Number("[0, 100]")},
-    "torus": {"major_radius_mm": _LENGTH, "minor_radius_mm": _LENGTH},
-    "pins": {
-        "rows": Integer("[1, 50]"),
-        "columns": Integer("[1, 50]"),
-        "pitch_mm": _LENGTH,
-        "pin_radius_mm": _LENGTH,
-        "pin_height_mm": _LENGTH,
-    },
-    "coin": {"radius_mm": _LENGTH, "thickness_mm": _LENGTH, "relief_height_mm": _LENGTH},
-    "mesh": {"path": Text(), "scale_m_per_unit": Number("(0, 10]")},
-    "mjcf": {"path": Text(), "body": Text()},
-}
-"""Kind of object to the keys of its own in ``[object]``."""
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
@@ -143,48 +119,9 @@ def _read_object(table: Table) -> ObjectSpec:
     if elastic and dynamics != "soft":
         key = "youngs_modulus_kpa" if "youngs_modulus" in elastic else "poisson_ratio"
         raise table.error('is the material of a soft object, so dynamics must be "soft"', key, table.data[key])
-    length = math.hypot(*quaternion)
-    if abs(length - 1) > 0.01:
-        rule = f"must be a unit quaternion w, x, y, z (to 1 %, then normalised); its length is {length:.4g}"
-        raise table.error(rule, "quaternion_wxyz", table.data["quaternion_wxyz"])
-    w, i, j, k = (component / length for component in quaternion)
-    _check_lengths(table, kind, values)
-    if kind in ("mesh", "mjcf"):
-        values["path"] = str(_resolved(table, values["path"]))
-    if kind == "mesh":
-        _check_mesh(table, values)
-    elif kind == "mjcf" and not is_file(Path(values["path"])):
-        raise table.error(f"the model file does not exist ({values['path']})", "path", table.data["path"])
-    return ObjectSpec(kind, values, (x, y, 0.0), (w, i, j, k), mass, dynamics, **elastic)
-
-
-def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
-    """Lengths [m] of one object that contradict each other."""
-    if kind == "cone" and p["tip_radius"] >= p["radius"]:
-        raise _length_error(table, "tip_radius_mm", f"must be less than radius_mm = {_mm(p['radius'])}")
-    elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
-        raise _length_error(table, "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}")
-    elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] < 2 * p["pin_radius"]:
-        raise _length_error(table, "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}")
-    elif kind == "coin" and p["relief_height"] >= p["thickness"]:
-        raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
-
-
-def _resolved(table: Table, path: str) -> Path:
-    """Absolute path of a file that a scene names, relative to the scene's folder."""
-    try:
-        return (table.file.parent / Path(path).expanduser()).resolve()
-    except (OSError, RuntimeError) as error:  # "~nobody/x.stl", or a circle of links
-        raise table.error(f"the path has no meaning here ({error})", "path", path) from error
-
-
-def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
-    try:
-        load_mesh(values["path"], values["scale"])
-    except MeshError as error:
-        key = "scale_m_per_unit" if error.key == "scale" else "path"
-        rule = f"{error.rule} (mesh {values['path']})"
-        raise MeshError(rule, file=table.file, key=f"object.{key}", value=table.data[key], choices=error.choices) from error
+    quaternion = unit_quaternion(table, quaternion)
+    check_shape(table, kind, values)
+    return ObjectSpec(kind, values, (x, y, 0.0), quaternion, mass, dynamics, **elastic)
 
 
 def _read_trajectory(tables: tuple[Table, ...]) -> tuple[StageSpec, ...]:
@@ -205,10 +142,6 @@ def _read_trajectory(tables: tuple[Table, ...]) -> tuple[StageSpec, ...]:
             touching = False
         stages.append(StageSpec(**values))
     return tuple(stages)
-
-
-def _length_error(table: Table, key: str, rule: str) -> SpecError:
-    return table.error(rule, key, table.data[key])
 
 
 def _mm(length: float) -> float:

@@ -17,17 +17,21 @@ from typing import Any, Final
 
 from raytac.errors import SpecError
 
-__all__ = ["REQUIRED", "Integer", "Interval", "Number", "Schema", "Table", "Text", "Unit", "read_toml", "split_unit"]
+__all__ = ["ANY", "REQUIRED", "Integer", "Interval", "Number", "Schema", "Table", "Text", "Unit", "read_toml", "split_unit"]
 
 REQUIRED: Final = object()
 """Default of a field that a file must give."""
+ANY: Final = -1
+"""Length of a list of one value or more."""
 
 _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "m_per_unit": (1.0, 1.0, "m per file unit"),
+    "per_mm": (1e3, 1.0, "1/mm"),
     "per_mm2": (1e6, 1.0, "1/mm²"),
     "per_mm3": (1e9, 1.0, "1/mm³"),
     "w_per_sr": (1.0, 1.0, "W/sr"),
     "kg_m3": (1.0, 1.0, "kg/m³"),
+    "m_s2": (1.0, 1.0, "m/s²"),
     "wxyz": (1.0, 1.0, ""),
     "kpa": (1000.0, 1.0, "kPa"),
     "deg": (math.pi, 180.0, "°"),
@@ -95,7 +99,7 @@ class _Refused(Exception):
 
 @dataclass(frozen=True)
 class Number:
-    """A real number, or ``length`` of them, in ``interval`` (in the unit of the file)."""
+    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval`` (in the unit of the file)."""
 
     interval: str
     length: int = 0
@@ -106,13 +110,14 @@ class Number:
         object.__setattr__(self, "_range", Interval.parse(self.interval))
 
     def rule(self, unit: Unit) -> str:
-        number = f"{self.length} numbers, each" if self.length else "a number"
+        many = "a list of numbers, each" if self.length == ANY else f"{self.length} numbers, each"
+        number = many if self.length else "a number"
         return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
 
     def parse(self, value: object, unit: Unit) -> float | tuple[float, ...]:
         if not self.length:
             return self._one(value, unit)
-        if not isinstance(value, list) or len(value) != self.length:
+        if not isinstance(value, list) or len(value) != (max(len(value), 1) if self.length == ANY else self.length):
             raise _Refused(self.rule(unit))
         return tuple(self._one(v, unit) for v in value)
 

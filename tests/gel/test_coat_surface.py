@@ -83,8 +83,8 @@ def ball(x, y, depth, radius=4e-3):
     return np.where(square > 0, radius - depth - np.sqrt(np.maximum(square, 0.0)), np.inf)
 
 
-def test_stand_off_is_measured_and_closed():
-    """A coat held 40 µm off a ball everywhere in contact: the clearance is found, and the shown coat touches the ball there."""
+def test_stand_off_is_measured_and_taken_out_of_the_mesh():
+    """A coat held 40 µm off a ball everywhere in contact: the clearance is found, and the moved mesh lies on the ball there."""
     mesh, grid = pad_mesh(GELPAD, "medium").coat, make_grid(GELPAD, 0.2e-3)
     surface, d_hat = CoatSurface(mesh, GELPAD), 60e-6
     stand_off = StandOff(surface, grid.rest, grid.x, grid.y, d_hat)
@@ -99,14 +99,9 @@ def test_stand_off_is_measured_and_closed():
     rise = surface.rise(places, moved[:, 2] + fit.shift)
     rows, columns = surface.matrices(grid.x, grid.y)
     smooth = (grid.rest + rows @ rise @ columns).astype(np.float32)
-    borne = hat_matrix(mesh.lines_y, grid.y) @ pressure.reshape(mesh.shape) @ hat_matrix(mesh.lines_x, grid.x).T
-    shown, touched = stand_off.close(smooth, under - fit.clearance, borne)
-    inside = np.hypot(grid.x[None, :], grid.y[:, None]) < 1.5e-3
-    assert touched[inside].all() and not touched[np.hypot(grid.x[None, :], grid.y[:, None]) > 3e-3].any()
-    assert np.abs(shown - (under - fit.clearance))[inside].max() < 1e-6
-    away = ~np.isfinite(under)
-    assert np.array_equal(shown[away], smooth[away])
-    assert (shown <= np.where(np.isfinite(under), under - fit.clearance, np.inf) + 1e-7).all()  # nothing reaches into the ball
+    inside = np.hypot(grid.x[None, :], grid.y[:, None]) < 1.0e-3
+    off = (smooth - (under - fit.clearance))[inside]
+    assert np.sqrt((off**2).mean()) < 3e-6 and abs(off.mean()) < 1e-6
 
 
 def test_stand_off_without_contact_is_none():

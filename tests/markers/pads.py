@@ -23,7 +23,6 @@ MOTION = MarkerMotionSpec(
     shear_max=0.6e-3,
     twist_lambda=1.2e5,
     twist_max=math.radians(20),
-    contact_radius=0.0,
     field_gain=0.5,
     field_shear=2.0,
     field_friction=1.0,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from raytac.gel.surface import PadGrid
-from raytac.markers.calibration import ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
+from raytac.markers.calibration import PUBLISHED, ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
 from raytac.markers.calibration_presses import FIT, HELD_OUT, PressFrame
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.tracker import MarkerTracker
-from raytac.specs import SensorSpec, load_sensor, validate_press
+from raytac.specs import PunchSpec, SensorSpec, load_sensor, validate_press
 from raytac.specs.marker_motion import load_marker_motion, marker_motion_text
 from tests.markers.pads import MOTION, fots_presses
 
@@ -43,9 +45,24 @@ def frames(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
 
 
 def test_the_fit_finds_the_constants_again(sensor: SensorSpec, frames: list[PressFrame]) -> None:
-    motion = fit_motion(ProbeData.of(sensor, frames), published=True, device="cpu")
+    motion = fit_motion(ProbeData.of(sensor, frames), device="cpu")
     for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         assert getattr(motion, name) == pytest.approx(getattr(MOTION, name), rel=0.1), name
+
+
+def test_the_fit_finds_the_punch_again(sensor: SensorSpec, grid: PadGrid) -> None:
+    """Markers that move around a punch, some of them past its slip; Gaussians do not fit them."""
+    punch = PunchSpec(0.6, 6e-3, 700.0)
+    moved = replace(sensor, marker_motion=replace(MOTION, punch=punch))
+    frames = fots_presses(moved, grid)
+    fitted = replace(sensor, marker_motion=fit_motion(ProbeData.of(sensor, frames), device="cpu"))
+    assert fitted.marker_motion is not None and fitted.marker_motion.punch is not None
+    for name in ("anisotropy", "reach", "slip"):
+        assert getattr(fitted.marker_motion.punch, name) == pytest.approx(getattr(punch, name), rel=0.1), name
+    errors, _ = model_errors(fitted, frames, grid, models=("fots", PUBLISHED), device="cpu")
+    by = {(e.model, e.load): e.mean for e in errors}
+    for load in ("shear", "twist"):
+        assert by["fots", load] < 3e-6 and by["fots", load] < 0.3 * by[PUBLISHED, load]
 
 
 def test_errors_are_small_for_the_model_that_made_the_data_only(
@@ -69,10 +86,13 @@ def test_the_tracker_at_the_probes_gives_what_the_fit_saw(sensor: SensorSpec, gr
 
 def test_the_file_of_a_fit_is_read_back(tmp_path) -> None:
     path = tmp_path / "made.toml"
-    path.write_text(marker_motion_text(MOTION))
-    again = load_marker_motion(path)
-    for name in MOTION.__dataclass_fields__:
-        if name == "provenance":
-            assert again.provenance.strip() == MOTION.provenance
-        elif name != "source":
-            assert getattr(again, name) == pytest.approx(getattr(MOTION, name), rel=1e-5), name
+    for made in (MOTION, replace(MOTION, punch=PunchSpec(0.7, 6.25e-3, 1300.0))):
+        path.write_text(marker_motion_text(made))
+        again = load_marker_motion(path)
+        for name in made.__dataclass_fields__:
+            if name == "provenance":
+                assert again.provenance.strip() == made.provenance
+            elif name == "punch":
+                assert again.punch == made.punch
+            elif name != "source":
+                assert getattr(again, name) == pytest.approx(getattr(made, name), rel=1e-5), name

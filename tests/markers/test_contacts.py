@@ -74,6 +74,25 @@ def test_the_radius_counts_every_cell_that_a_disc_touches(radius: float, grid: P
     assert np.ptp(found) < 0.15e-3
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0, 120.0])
+def test_the_ellipse_of_an_elliptic_contact_is_its_own(angle_deg: float, grid: PadGrid) -> None:
+    """Semi-axes 4 and 1.5 mm, anywhere, in any direction: the cells' ellipse, 0.15 mm wider all around; and what it is pressed in."""
+    angle = np.deg2rad(angle_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    x, y = np.meshgrid(grid.x - 1.1e-3, grid.y + 0.7e-3)
+    own = np.stack([x, y], axis=-1) @ turn
+    contact = ((own / (4e-3, 1.5e-3)) ** 2).sum(axis=-1) < 1
+    height = (grid.rest - 1e-4 * contact).astype(np.float32)
+    contacts = follow(grid, GelSurface(grid, height[None], contact[None], np.array([[1.1e-3, -0.7e-3]]), pose()[None]))
+    xx, xy, yy = contacts.ellipse[0, 0]
+    found = np.array([[xx, xy], [xy, yy]])
+    expected = turn @ np.diag(np.square((4.15e-3, 1.65e-3))) @ turn.T
+    np.testing.assert_allclose(found, expected, atol=0.05 * expected.max())
+    assert np.sqrt(np.linalg.det(found)) == pytest.approx(contacts.radius[0, 0] ** 2)
+    volume = contact.sum() * 1e-4 * np.prod(grid.pitch)
+    assert contacts.depth[0, 0] == pytest.approx(volume / (np.pi * contacts.radius[0, 0] ** 2), rel=1e-3)
+
+
 def test_shear_and_twist_add_up_from_first_touch(grid: PadGrid) -> None:
     places = [(0.0, 0.0), (2e-4, 0.0), (2e-4, 3e-4)]
     twists = [0.3, 0.3, 0.5]

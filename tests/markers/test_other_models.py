@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from raytac.gel.surface import PadGrid
 from raytac.markers.compliance import cached_compliance, coat_compliance, rest_stiffness
 from raytac.markers.pattern import marker_centres
+from raytac.markers.sampling import height_and_slope
+from raytac.markers.superposition import SuperpositionMarkers
 from raytac.markers.tracker import MarkerTracker
 from raytac.physics.soft_bodies import pad_body
 from raytac.physics.soft_mesh import PadLevel, PadMesh, pad_mesh
@@ -102,6 +105,33 @@ def test_superposition_drags_what_is_held(sensor: SensorSpec, grid: PadGrid, sup
     assert np.abs(moved[out > 8e-3]).max() < 1e-4
     superposed.reset()
     assert not superposed.update(pressed(grid, [])).displacement.any()
+
+
+def test_superposition_slides_as_coulomb_has_it(sensor: SensorSpec, grid: PadGrid) -> None:
+    """At μ = 0.3 a shear of two depths slides: markers stop, whatever the object does then; every load is in the cone, none pulls."""
+    gel = replace(sensor, gelpad=replace(sensor.gelpad, friction=0.3))
+    start = pressed(grid, [(0, 0, DEEP)], poses=[pose()])
+    middle = int(np.linalg.norm(marker_centres(sensor.markers), axis=1).argmin())
+
+    def sheared(sensor: SensorSpec, x: float) -> tuple[float, np.ndarray]:
+        tracker = MarkerTracker(sensor, "superposition", grid)
+        before = tracker.update(start).displacement[0, middle, 0]
+        moved = tracker.update(pressed(grid, [(0, 0, DEEP)], poses=[pose(x)])).displacement[0, middle, 0] - before
+        model = tracker.model
+        assert isinstance(model, SuperpositionMarkers)
+        height, _, touched = height_and_slope(start, model.coat.rest[None, :, :2])
+        wanted = np.zeros((len(model.coat.rest), 3))
+        wanted[:, 0], wanted[:, 2] = x, height[0] - model.coat.rest[:, 2]
+        coat = model._superpose(wanted, touched[0] & (wanted[:, 2] < 0))
+        return moved, np.linalg.solve(model._compliance.astype(float) + 1e-9 * np.eye(coat.size), coat.ravel()).reshape(-1, 3)
+
+    stuck, slid, further = (sheared(s, x) for s, x in ((sensor, 8e-4), (gel, 8e-4), (gel, 1.6e-3)))
+    assert slid[0] < 0.6 * stuck[0] and further[0] == pytest.approx(slid[0], rel=0.05)
+    load = slid[1]
+    least = 1e-3 * np.abs(load).max()
+    along, down = np.linalg.norm(load[:, :2], axis=1), -load[:, 2]
+    assert (down > -least).all() and (along <= 0.3 * down + 3 * least).all()
+    assert along.sum() > 0.25 * down.sum()
 
 
 def test_force_field_moves_only_what_is_touched(sensor: SensorSpec, grid: PadGrid) -> None:

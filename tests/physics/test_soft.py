@@ -196,6 +196,61 @@ def test_twist_turns_with_the_object():
     assert turned == pytest.approx(math.radians(4.0), rel=0.1)
 
 
+def test_a_depth_is_kept_through_shear_and_twist():
+    """The clearance changes while gel is drawn along; what is at the depth is the coat, in every state."""
+    stages = indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), StageSpec("shear", shear=(0.4e-3, 0.0))
+    pad = soft(press(*stages, kind="cylinder"))
+    for state in list(pad.run(2))[2:]:
+        assert state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
+        assert pad.surface(state).indentation.max() == pytest.approx(0.5e-3, abs=4e-6)
+
+
+def test_a_flat_face_imprints_flat_under_twist():
+    """No pits under the rim, no holes in the contact, nothing in the object: what the coat's cells of a millimetre used to leave."""
+    pad = SoftPad(SENSOR, press(indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), kind="cylinder"), pitch=0.1e-3)
+    surface = pad.surface(pad.peak(pad.run()))
+    under = pad.object_height(surface)
+    assert under is not None and (under - surface.height).min() > -1e-8
+    rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
+    assert surface.contact[0][rho < 2.9e-3].all() and not surface.contact[0][rho > 3.1e-3].any()
+    assert np.ptp(surface.height[0][rho < 2.9e-3]) < 2e-6
+    assert surface.indentation.max() < 0.5e-3 + 4e-6
+
+
+def test_a_straight_edge_leaves_a_straight_furrow():
+    """Across cells of a millimetre, at an angle to them: along the furrow's bottom and beside it the height does not vary."""
+    half = math.radians(15.0) / 2.0
+    spec = ObjectSpec("edge", {"side": 8e-3}, (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half)), 0.05)
+    pad = SoftPad(SENSOR, PressScene("edge", spec, (indent(0.6e-3),)), pitch=0.1e-3)
+    state = pad.peak(pad.run())
+    surface = pad.surface(state)
+    under = pad.object_height(surface)
+    assert under is not None
+    along = np.linspace(-2.5e-3, 2.5e-3, 101)
+
+    def line(field, aside):
+        """A field along a line beside the edge, linear between nodes in x and y."""
+        x = along * math.cos(2 * half) - aside * math.sin(2 * half)
+        y = along * math.sin(2 * half) + aside * math.cos(2 * half)
+        column, row = (np.clip(np.searchsorted(at, t) - 1, 0, len(at) - 2) for at, t in ((pad.grid.x, x), (pad.grid.y, y)))
+        u, v = (x - pad.grid.x[column]) / pad.grid.pitch[0], (y - pad.grid.y[row]) / pad.grid.pitch[1]
+        lower = (1 - u) * field[row, column] + u * field[row, column + 1]
+        return (1 - v) * lower + v * ((1 - u) * field[row + 1, column] + u * field[row + 1, column + 1])
+
+    assert np.abs(line(surface.height[0], 0.0) - line(under[0], 0.0)).max() < 3e-6  # the object's own edge, as the nodes have it
+    for aside in (0.5e-3, 1.0e-3):
+        # The dome and the edge's ends bend the line; lumps of a cell's length would not be a parabola.
+        beside = line(surface.height[0], aside)
+        assert np.abs(beside - np.polyval(np.polyfit(along, beside, 2), along)).max() < 6e-6
+
+
+def test_a_sharp_cone_can_be_pressed():
+    spec = ObjectSpec("cone", {"radius": 5e-3, "height": 5e-3, "tip_radius": 0.3e-3}, (0.0, 0.0, 0.0), IDENTITY, 0.05)
+    pad = soft(PressScene("cone", spec, (indent(0.8e-3),)))
+    state = pad.peak(pad.run())
+    assert not state.failed[0] and state.depth[0] == pytest.approx(0.8e-3, abs=2e-6)
+
+
 def test_case_and_object_give_the_same_press():
     stages = indent(0.4e-3), StageSpec("shear", shear=(0.2e-3, -0.1e-3)), StageSpec("twist", twist=0.05)
     one, two = (soft(press(*stages, moves=moves)) for moves in ("object", "case"))

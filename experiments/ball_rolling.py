@@ -1,0 +1,253 @@
+"""How far is a ball from its goals when a Panda rolls it under one sensor, with a rigid and with a simulated pad, and how fast is that?
+
+    python experiments/ball_rolling.py --out runs/ball_rolling
+
+The arm is moved by differential inverse kinematics and feels where the ball is: the contact's centre and the force are all that steers.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from experiments.rolling_control import PHASES, RollingController, Strokes
+from raytac.errors import RaytacError
+from raytac.frame import TactileFrame
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.options import CommonOptions, parse_resolution
+from raytac.world.world import TactileWorld
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Roll a ball through goals with one sensor."""
+
+    physics: tuple[str, ...] = ("rigid", "ipc")
+    """Pads to do it with, of rigid and ipc."""
+    scene: str = "ball_rolling"
+    """Task scene with one arm, one sensor and a body named ball."""
+    goals_mm: tuple[tuple[float, float], ...] = ((10.0, 0.0), (10.0, 10.0), (-8.0, 10.0), (0.0, 0.0))
+    """Places that the ball is rolled to, from where it starts [mm], world x and y."""
+    optics: str | None = None
+    """How images are made; if not given, by the table without shadows with the rigid pad, by fast ray tracing with the simulated one."""
+    resolution: str = "320x240"
+    """Of the tactile image [px]."""
+    steps: int = 3000
+    """Most control steps."""
+    picture_every: float = 0.1
+    """Time between two pictures of the film [s]."""
+    quick: bool = False
+    """One short stroke and small images by Phong's model: enough to see that all works."""
+
+
+@dataclass
+class Record:
+    """What one run leaves, by control step."""
+
+    time: list[float]
+    phase: list[int]
+    ball: list[np.ndarray]
+    pad: list[np.ndarray]
+    wrench: list[np.ndarray]
+    markers: list[float]
+    """Longest displacement of a marker [m]."""
+    pictures: list[np.ndarray]
+    seconds: list[float]
+    """Wall time of a control step with image and markers."""
+    part: list[tuple[float, float, float]]
+    """Of it, control, physics and sensor."""
+    resolved: list[tuple[float, float]]
+    """Least gap [m] and least det F of a simulated pad."""
+
+
+def main(args: Args) -> None:
+    start = time.perf_counter()
+    for name in args.physics:
+        if name not in OPTICS:
+            raise RaytacError(f"--physics {name}: must be one of {', '.join(OPTICS)}")
+    out = args.out if args.out is not None else Path("runs") / "ball_rolling"
+    if args.quick:
+        args = replace(args, goals_mm=((2.0, 1.0),), optics="phong", resolution="64x48", steps=150)
+    metrics: dict[str, Metric] = {"experiment": "ball_rolling", "seed": args.seed}
+    with result_folder(out) as folder:
+        for name in args.physics:
+            world = make_world(args, name)
+            controller, record = roll(world, args)
+            metrics["device"] = world.sensors[world.sensor_names[0]].device_used
+            found = summary(world, controller, record, args)
+            metrics |= {f"ball_rolling.{name}.{key}": value for key, value in found.items()}
+            draw(record, world, args, folder / f"{name}.png")
+            film(record, folder / f"{name}.gif", folder / f"{name}_strip.png")
+            print(
+                f"{name}: {found['goals_reached']} of {len(args.goals_mm)} goals, {found['goal_error_mm']:.2f} mm from the last, "
+                f"{found['steps_per_s']:.1f} steps/s"
+            )
+        write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})
+    print(f"written: {out}")
+
+
+OPTICS = {"rigid": "taxim", "ipc": "raytrace"}
+"""How the image is made: by the table with the rigid pad, by fast ray tracing with the simulated one."""
+STROKES = {"rigid": Strokes(), "ipc": Strokes(roll_speed=0.015, press_speed=0.005, lift_speed=0.02, travel_speed=0.05)}
+"""The simulated pad is solved in one go where it moves by 0.1 mm or less against the ball in 10 ms."""
+PITCH = 1e-4
+"""Spacing of the nodes of the gel's surface [m]: a ball needs no finer ones."""
+MARKERS = {"rigid": "fots", "ipc": "surface"}
+
+
+def make_world(args: Args, physics: str) -> TactileWorld:
+    optics = OPTICS[physics] if args.optics is None else args.optics
+    return TactileWorld(
+        args.scene,
+        physics=physics,
+        outputs=("rgb", "wrench"),
+        optics=optics,
+        markers=MARKERS[physics],
+        resolution=parse_resolution(args.resolution),
+        device=args.device,
+        seed=args.seed,
+        sensor_options={"pitch": PITCH, **({"optics_options": {"shadow": False}} if optics == "taxim" else {})},
+    )
+
+
+def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
+    """Step the world until the last goal is reached or ``args.steps`` are over; an image and markers are made in every step."""
+    (name,) = world.sensor_names
+    state = world.reset()
+    goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
+    controller = RollingController(world, 0, goals, STROKES[world.physics])
+    record = Record([], [], [], [], [], [], [], [], [], [])
+    frame = world.observe()[name]  # kernels are compiled here
+    next_picture = 0.0
+    for _ in range(args.steps):
+        began = time.perf_counter()
+        force = max(-float(state.wrench[name][0, 2]), 0.0)
+        controller.update(state.world_from_pad[name][0], frame.surface.contact_centre[0], force)
+        steered = time.perf_counter()
+        state = world.step(controller)
+        stepped = time.perf_counter()
+        frame = world.observe()[name]
+        done = time.perf_counter()
+        record.seconds.append(done - began)
+        record.part.append((steered - began, stepped - steered, done - stepped))
+        record.time.append(float(state.time[0]))
+        record.phase.append(PHASES.index(controller.phase))
+        record.ball.append(state.world_from_body["ball"][0, :3, 3])
+        record.pad.append(state.world_from_pad[name][0])
+        record.wrench.append(state.wrench[name][0])
+        assert frame.markers is not None
+        record.markers.append(float(np.nanmax(np.linalg.norm(frame.markers.displacement[0], axis=-1))))
+        if "min_gap" in state.report:
+            record.resolved.append((float(state.report["min_gap"][0]), float(state.report["min_det"][0])))
+        if record.time[-1] >= next_picture:
+            record.pictures.append(picture(frame))
+            next_picture += args.picture_every
+        if state.failed[0]:
+            raise RaytacError(f"the physics broke down at {state.time[0]:.3f} s")
+        if controller.done:
+            break
+    return controller, record
+
+
+def picture(frame: TactileFrame) -> np.ndarray:
+    """The image with the markers' displacements, ten times as long (H, W, 3) uint8."""
+    from PIL import Image, ImageDraw
+
+    assert frame.rgb is not None and frame.markers is not None
+    image = Image.fromarray(frame.rgb[0])
+    pen = ImageDraw.Draw(image)
+    for at, by in zip(frame.markers.rest_px[0], frame.markers.displacement_px[0], strict=True):
+        if np.isfinite(by).all() and np.hypot(*by) > 0.05:
+            pen.line([*at, *(at + 10.0 * by)], fill=(255, 255, 0), width=1)
+    return np.asarray(image)
+
+
+def summary(world: TactileWorld, controller: RollingController, record: Record, args: Args) -> dict[str, Metric]:
+    """What counts, from the true place of the ball."""
+    ball, pad = np.array(record.ball), np.array(record.pad)
+    wrench, phase = np.array(record.wrench), np.array(record.phase)
+    start = np.array(world.scene.body("ball").position[:2])
+    off = ball[:, :2] - pad[:, :2, 3]
+    rolling = phase == PHASES.index("roll")
+    found: dict[str, Metric] = {
+        "goals_reached": controller.goal,
+        "goals": len(args.goals_mm),
+        "goal_error_mm": 1e3 * float(np.linalg.norm(ball[-1, :2] - start - 1e-3 * np.array(args.goals_mm[-1]))),
+        "strokes": controller.strokes_done,
+        "simulated_s": record.time[-1],
+        "steps_per_s": 1.0 / float(np.median(record.seconds)),
+        "steps_per_s_mean": len(record.seconds) / float(np.sum(record.seconds)),
+        "control_ms": 1e3 * float(np.median([p[0] for p in record.part])),
+        "physics_ms": 1e3 * float(np.median([p[1] for p in record.part])),
+        "sensor_ms": 1e3 * float(np.median([p[2] for p in record.part])),
+        "force_max_n": float(-wrench[:, 2].min()),
+        "marker_max_mm": 1e3 * float(np.max(record.markers)),
+    }
+    if rolling.any():
+        found["ball_off_pad_centre_max_mm"] = 1e3 * float(np.linalg.norm(off[rolling], axis=1).max())
+        steps = np.flatnonzero(rolling[1:] & rolling[:-1])
+        way = np.linalg.norm(np.diff(ball[:, :2], axis=0)[steps], axis=1).sum()
+        pad_way = np.linalg.norm(np.diff(pad[:, :2, 3], axis=0)[steps], axis=1).sum()
+        found["ball_over_pad_way"] = float(way / pad_way)
+    if record.resolved:
+        gap, det = np.array(record.resolved).T
+        found |= {"min_gap_m": float(np.nanmin(gap)), "min_det_f": float(np.nanmin(det))}
+    return found
+
+
+def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
+    """Way of ball and pad over the table, and force and markers over time."""
+    from matplotlib.figure import Figure
+
+    ball, pad, wrench = np.array(record.ball), np.array(record.pad), np.array(record.wrench)
+    start = np.array(world.scene.body("ball").position[:2])
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    grid = figure.add_gridspec(3, 2)
+    above = figure.add_subplot(grid[:, 0])
+    above.plot(*(1e3 * (pad[:, :2, 3] - start)).T, color="0.75", lw=0.8, label="pad's middle")
+    above.plot(*(1e3 * (ball[:, :2] - start)).T, color="C0", label="ball")
+    above.plot(*np.array(args.goals_mm).T, "x", color="C3", ms=9, label="goals")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics} pad, from above")
+    above.legend(loc="best", fontsize="small")
+    rows = (
+        ("force [N]", (wrench[:, :3], ("x", "y", "z"))),
+        ("torque [N mm]", (1e3 * wrench[:, 3:], ("x", "y", "z"))),
+        ("longest marker\ndisplacement [mm]", (1e3 * np.array(record.markers)[:, None], ("",))),
+    )
+    first = None
+    for row, (label, (values, names)) in enumerate(rows):
+        axes = figure.add_subplot(grid[row, 1], sharex=first)
+        first = first or axes
+        for column, name in zip(values.T, names, strict=True):
+            axes.plot(record.time, column, lw=0.9, label=name or None)
+        axes.set_ylabel(label, fontsize="small")
+        if len(names) > 1:
+            axes.legend(ncols=3, fontsize="x-small", loc="best")
+    assert first is not None
+    figure.axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=120)
+
+
+def film(record: Record, path: Path, strip: Path) -> None:
+    """All pictures as an animation, and eight of them in a row."""
+    from PIL import Image
+
+    if not record.pictures:
+        return
+    images = [Image.fromarray(p) for p in record.pictures]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
+    chosen = np.linspace(0, len(images) - 1, min(8, len(images))).round().astype(int)
+    Image.fromarray(np.concatenate([record.pictures[i] for i in chosen], axis=1)).save(strip)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except RaytacError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,33 @@
+"""What any pad's physics tells a sensor about one instant: the surface and what touches does to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+
+__all__ = ["PadReading"]
+
+
+@dataclass(frozen=True)
+class PadReading:
+    """B pads of one sensor at one instant; pad frame.
+
+    A press knows one object and its load (``ContactState``); in a world a pad is touched by whatever comes, and this is what is left.
+    """
+
+    surface: GelSurface
+    wrench: np.ndarray
+    """Force of all that touches on the pad [N] and its torque about the pad frame's origin [N m], shape (B, 6)."""
+    failed: np.ndarray
+    """Environments whose physics broke down, shape (B,), bool."""
+    traction: Callable[[], np.ndarray]
+    """Computes the traction on the pad [Pa], shape (B, Ny, Nx, 3), as ``TactileFrame.traction``; called only if it is asked for."""
+
+    @property
+    def force(self) -> np.ndarray:
+        """Force on the pad [N], shape (B, 3)."""
+        return self.wrench[:, :3]

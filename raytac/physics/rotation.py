@@ -1,0 +1,68 @@
+"""Rotations of a batch as matrices, quaternions and turns: what driving a solver's frames takes."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its functions at run time.)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+__all__ = ["between", "inverse", "nearest_rotation", "quaternion", "quaternions", "turn_angle"]
+
+
+def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
+    """Unit quaternion wxyz of a rotation matrix (3, 3)."""
+    found = np.empty(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation, float).ravel())
+    return tuple((found / np.linalg.norm(found)).tolist())
+
+
+def quaternions(poses: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz of poses (B, 4, 4), shape (B, 4)."""
+    return np.array([quaternion(pose[:3, :3]) for pose in poses])
+
+
+def inverse(poses: np.ndarray) -> np.ndarray:
+    """Inverses of rigid transforms (…, 4, 4)."""
+    found = np.zeros_like(poses)
+    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
+    found[..., :3, :3] = turned
+    found[..., :3, 3] = -(turned @ poses[..., :3, 3, None])[..., 0]
+    found[..., 3, 3] = 1.0
+    return found
+
+
+def turn_angle(rotations: np.ndarray) -> np.ndarray:
+    """Angles [rad] in [0, π] of rotation matrices (…, 3, 3), accurate for small turns too."""
+    antisymmetric = rotations - np.swapaxes(rotations, -1, -2)
+    sine = 0.5 * np.sqrt(0.5 * (antisymmetric**2).sum(axis=(-1, -2)))
+    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
+
+
+def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+    """Poses (B, 4, 4) a ``share`` of the way: positions along the line, rotations along the shorter arc (slerp)."""
+    if share <= 0.0 or share >= 1.0:
+        return (start if share <= 0.0 else end).copy()
+    a, b = quaternions(start), quaternions(end)
+    cosine = (a * b).sum(axis=1, keepdims=True)
+    b = np.where(cosine < 0.0, -b, b)
+    half = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    small = half < 1e-6
+    sine = np.where(small, 1.0, np.sin(half))
+    q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
+    found = np.tile(np.eye(4), (len(start), 1, 1))
+    for pose, one in zip(found, q / np.linalg.norm(q, axis=1, keepdims=True), strict=True):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, one)
+        pose[:3, :3] = matrix.reshape(3, 3)
+    found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
+    return found
+
+
+def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
+    """The rotations closest to matrices (…, 3, 3) in the Frobenius norm: the orthogonal factors of their polar decompositions."""
+    u, _, v = np.linalg.svd(matrices)
+    mirrored = np.linalg.det(u @ v) < 0.0
+    u[mirrored, :, 2] *= -1.0
+    return u @ v

@@ -1,0 +1,565 @@
+"""Any number of soft pads and bodies in one contact solver, driven by poses; what the press stands on, and what robots carry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import ipc
+from raytac.errors import InputError, OverlapError
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import PadGrid
+from raytac.physics.rotation import between, inverse, nearest_rotation, quaternion, quaternions
+from raytac.physics.soft_approach import STEP, TURN, Mover, allowed_share
+from raytac.physics.soft_bodies import SceneBody, pad_body
+from raytac.physics.soft_mesh import PadMesh
+from raytac.physics.soft_reading import SeenObject, SeenPad, SoftReader, SoftReading
+from raytac.physics.soft_stiffness import pad_stiffness
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["CREEP", "MOST_SUBSTEPS", "ScenePad", "SceneReport", "SceneState", "SoftScene"]
+
+MOST_SUBSTEPS = 64
+"""Parts that one step may be cut into: 6.4 mm or 128° near something."""
+CREEP = 5e-5
+"""ε_v [m/s]: under a share r of the greatest friction, what sticks creeps at ε_v (1 − √(1 − r)); r = 0.75: 0.05 mm in two seconds."""
+_CLOSE = 2e-8
+"""A step is solved when no vertex would move further than this [m]; forces of what sticks want it small against ε_v dt."""
+_LINEAR = 1e-4
+"""Residual of the linear solve [-]: a grasped body that travels must come along to a small share of ε_v dt, or friction would slip."""
+_REACH = 4.0
+"""Bodies closer than so many d̂ are near."""
+
+
+@dataclass(frozen=True)
+class ScenePad:
+    """One pad of a scene; its case goes where ``world_from_pad`` says."""
+
+    name: str
+    sensor: SensorSpec
+    mesh: PadMesh
+    pitch: float = 0.1e-3
+    """Spacing of the grid that its surface is read on [m]."""
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """One step of B environments, all of its parts together; every array has shape (B,).
+
+    failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
+    min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
+    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
+    end [J]. substeps: parts of the step.
+    """
+
+    failed: np.ndarray
+    converged: np.ndarray
+    min_gap: np.ndarray
+    min_det: np.ndarray
+    blocked: np.ndarray
+    newton: np.ndarray
+    elastic: np.ndarray
+    barrier: np.ndarray
+    substeps: int
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Everything that a scene's next step depends on; from ``SoftScene.save``."""
+
+    world: ipc.State
+    world_from_pad: np.ndarray
+    driven: dict[str, np.ndarray]
+
+
+class SoftScene:
+    """Pads and bodies in B environments that do not see each other.
+
+    Poses are ``world_from_…`` (…, 4, 4). A pad's gel is solved in the frame of its case, so a case that travels through the air takes
+    its pad along exactly. What the pads show is read by the same code as in a press (``SoftReader``).
+
+    .. code-block:: python
+
+        scene = SoftScene([ScenePad("left", sensor, mesh), ScenePad("right", sensor, mesh)],
+                          [scene_body("cube", (primitive("box", (8e-3,) * 3),), "affine", density=500.0)],
+                          world_from_pads, {"cube": world_from_cube}, dt=0.01)
+        report = scene.step(world_from_pads)
+        reading = scene.reading("left")
+    """
+
+    def __init__(
+        self,
+        pads: Sequence[ScenePad],
+        bodies: Sequence[SceneBody],
+        world_from_pad: ArrayLike,
+        world_from_body: Mapping[str, ArrayLike],
+        *,
+        dt: float = 0.01,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        friction: Mapping[tuple[str, str], float] | None = None,
+        ignored: Sequence[tuple[str, str]] = (),
+        num_envs: int | None = None,
+        device: str = "cpu",
+        settings: ipc.Settings | None = None,
+    ) -> None:
+        """Put pads and bodies into the solver where they start, clear of each other.
+
+        Args:
+            pads: S of them, by unique names.
+            bodies: by names that are unique too.
+            world_from_pad: where the pads start, (S, 4, 4) or (B, S, 4, 4).
+            world_from_body: of each body by name, (4, 4) or (B, 4, 4).
+            dt: length of a step [s].
+            gravity: [m/s²], world frame, (3,) or (B, 3).
+            friction: μ by pair of names where the rule does not fit. The rule: with a pad, the body's own coefficient if it has one, else
+                the pad's gel's; between bodies, the larger of theirs, as in MuJoCo.
+            ignored: pairs of names that pass through each other.
+            num_envs: B; None: as the poses say.
+            device: ``cpu``, ``cuda`` or ``auto``.
+            settings: of the solver, instead of ``dt`` and this module's own (see docs/soft-pad.md).
+
+        Raises:
+            InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid.
+            OverlapError: bodies overlap where they start; the message names the surfaces.
+        """
+        self.pads = {pad.name: pad for pad in pads}
+        self.bodies = {body.name: body for body in bodies}
+        self._check_names(pads, bodies)
+        self.gravity = np.asarray(gravity, float)
+        self.num_envs = num_envs or _batch(world_from_pad, 4, world_from_body)
+        self._start = self._poses("world_from_pad", world_from_pad, len(pads)), self._of_bodies(world_from_body)
+        d_hat = min(pad.mesh.d_hat for pad in pads)
+        self.settings = settings or ipc.Settings(
+            dt=dt,
+            d_hat=d_hat,
+            velocity_tolerance=_CLOSE / dt,
+            friction_velocity=CREEP,
+            friction_relags=0,  # every step lags it anew, and steps are small in contact
+            linear_tolerance=_LINEAR,
+        )
+        placed = [self._at_start(body.solid, self._start[1][body.name][0]) for body in bodies]
+        gels = [
+            self._at_start(pad_body(pad.mesh, pad.sensor.gelpad, pad.name), self._start[0][0, k]) for k, pad in enumerate(pads)
+        ]
+        mu = self._coefficients() | dict(friction or {})
+        try:
+            self.world = ipc.World([*gels, *placed], self.settings, self.num_envs, device, mu, ignored)
+            if settings is None:
+                self.world.set_gravity(self.gravity)
+            if self.num_envs > 1:
+                self._spread(*self._start, np.ones(self.num_envs, bool))
+        except ipc.OverlapError as error:
+            raise OverlapError(f"bodies overlap where they start: {error}") from error
+        except ipc.IpcError as error:
+            raise InputError("scene", value=[*self.pads, *self.bodies], rule=f"cannot be solved: {error}") from error
+        self._begin = self.world.save()
+        self._target = self._start[0].copy(), self._driven(self._start[1])
+        self._readers: dict[str, SoftReader] = {}
+        self._on_surface = {name: self._coat_on_surface(pad) for name, pad in self.pads.items()}
+        self._failed = np.zeros(self.num_envs, bool)
+
+    # --- stepping --------------------------------------------------------------------------------------------------------------
+
+    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
+        """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
+        cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
+        goals = self._target[1] | self._named(driven or {})
+        return self._part(0, (cases, goals), dt or self.settings.dt)[0] == MOST_SUBSTEPS
+
+    def step(
+        self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
+    ) -> SceneReport:
+        """Advance by ``dt`` [s] (None: the scene's).
+
+        Cases go to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), driven bodies to their poses; others stay.
+
+        Where two bodies are near, their relative way in one go is at most ``STEP`` and ``TURN``: the step is then cut into halves, quarters
+        and so on of its time, and poses between are interpolated. Far from everything a pad may go any way at once.
+
+        Raises:
+            InputError: an unknown or free body, a bad pose, or a motion near another body that would take more than
+                ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then.
+        """
+        cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
+        goals = self._target[1] | self._named(driven or {})
+        begun = self._target[0], self._target[1]
+        before: SceneState | None = None
+        done, total = 0, None
+        while done < MOST_SUBSTEPS:
+            part, pair = self._part(done, (cases, goals), dt or self.settings.dt)
+            if part == 0:
+                if before is not None:
+                    self.restore(before)
+                self._refuse(pair, begun, (cases, goals))
+            if part < MOST_SUBSTEPS and before is None:
+                before = self.save()
+            done += part
+            share = done / MOST_SUBSTEPS
+            at = np.stack([between(begun[0][:, k], cases[:, k], share) for k in range(len(self.pads))], axis=1)
+            there = {name: between(begun[1][name], goal, share) for name, goal in goals.items()}
+            found = self.advance(at, there, (dt or self.settings.dt) * part / MOST_SUBSTEPS)
+            total = found if total is None else _joined(total, found)
+        assert total is not None
+        return total
+
+    def advance(self, world_from_pad: np.ndarray, driven: Mapping[str, np.ndarray], dt: float | None = None) -> SceneReport:
+        """One step of the solver, as it is told: (B, S, 4, 4) and (B, 4, 4) by name; ``dt`` [s]: None for the scene's."""
+        for k, name in enumerate(self.pads):
+            self.world.set_target(name, world_from_pad[:, k, :3, 3], quaternions(world_from_pad[:, k]))
+        for name, pose in driven.items():
+            self.world.set_target(name, pose[:, :3, 3], quaternions(pose))
+        self._target = world_from_pad.copy(), self._target[1] | {name: pose.copy() for name, pose in driven.items()}
+        report = self.world.step(dt)
+        self._failed = report.failed
+        return SceneReport(
+            report.failed,
+            report.converged,
+            report.min_gap,
+            report.min_det,
+            report.blocked,
+            report.newton,
+            report.elastic,
+            report.barrier,
+            substeps=1,
+        )
+
+    # --- reading ---------------------------------------------------------------------------------------------------------------
+
+    def wrench(self, pad: str) -> np.ndarray:
+        """Force [N] of what touches a pad and its torque [N m] about the pad frame's origin, world axes, shape (B, 6).
+
+        All of the gel's surface counts, its sides too. At rest it is what the pad does to the link that carries it (``bond_wrench``);
+        the gel's weight and inertia are not in it, since the link's model has the gel's mass.
+        """
+        return self._contact_wrench(self._pad(pad).name)
+
+    def bond_wrench(self, pad: str) -> np.ndarray:
+        """Force [N] and torque about the pad frame's origin [N m] of a pad on its case, world axes, shape (B, 6): with its weight."""
+        found = self.world.wrench(self._pad(pad).name)
+        return np.concatenate([found.force, found.torque], axis=1)
+
+    def body_wrench(self, name: str) -> np.ndarray:
+        """Force [N] of what touches a body and its torque [N m] about the body's origin, world axes, shape (B, 6)."""
+        return self._contact_wrench(self._body(name).name)
+
+    def stiffness(self, pad: str) -> np.ndarray:
+        """Bound of the stiffness of what touches a pad, (B, 6, 6), world axes, about the place where it presses: see ``pad_stiffness``."""
+        mine = self._pad(pad)
+        bodies = self.world.layout.names.index(pad)
+        first, last = self.world.layout.vert_start[bodies : bodies + 2]
+        loaded = np.linalg.norm(self.world.contact_forces(pad), axis=2) > 0.0
+        areas = (loaded * self.world.layout.vert_area[first:last]).sum(axis=1)
+        turn = np.zeros((self.num_envs, 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = self.world.frame(pad)[0]
+        local = np.stack([pad_stiffness(mine.sensor.gelpad, float(area)) for area in areas])
+        return turn @ local @ np.swapaxes(turn, 1, 2)
+
+    def pose(self, name: str) -> np.ndarray:
+        """``world_from_body`` or ``world_from_pad`` (B, 4, 4) as it is; of a free soft body, the rigid motion that fits it best."""
+        found = np.tile(np.eye(4), (self.num_envs, 1, 1))
+        body = None if name in self.pads else self._body(name)
+        if body is None or body.is_driven:
+            found[:, :3, :3], found[:, :3, 3] = self.world.frame(name)
+        elif isinstance(body.solid, ipc.SoftBody):
+            rest = body.solid.mesh.vertices
+            now = self.world.positions(name)
+            middle, centre = now.mean(axis=1), rest.mean(axis=0)
+            found[:, :3, :3] = nearest_rotation(np.einsum("bni,nj->bij", now - middle[:, None], rest - centre))
+            found[:, :3, 3] = middle - found[:, :3, :3] @ centre
+        else:
+            matrix, position = self.world.affine_pose(name)
+            found[:, :3, :3], found[:, :3, 3] = nearest_rotation(matrix), position
+        return found
+
+    def velocity(self, name: str) -> np.ndarray:
+        """Mean velocity of a free body's nodes [m/s], world frame, (B, 3)."""
+        return self.world.velocities(self._body(name).name).mean(axis=1)
+
+    def mesh(self, name: str, seen_from: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of a body or pad as it is: vertices (B, n, 3) [m], world frame or that of the pad ``seen_from``, and faces (F, 3)."""
+        vertices, faces = self.world.surface(name)
+        at = self.world.positions(name)
+        if name in self.pads or self._body(name).is_soft:
+            at = at[:, vertices]
+        return (at if seen_from is None else self._into(seen_from, at)), faces
+
+    def coat(self, pad: str) -> np.ndarray:
+        """Vertices of a pad's coat [m], pad frame, shape (B, V, 3): as the solver has them, with the barrier's clearance."""
+        return self.world.positions(pad, frame="body")[:, self._pad(pad).mesh.coat_vertices]
+
+    def coat_forces(self, pad: str) -> np.ndarray:
+        """What touches does to each vertex of a coat [N], pad frame, shape (B, V, 3)."""
+        return self.world.contact_forces(pad)[:, self._on_surface[pad]] @ self.world.frame(pad)[0]
+
+    def grid(self, pad: str) -> PadGrid:
+        """Grid that a pad's surface is read on."""
+        return make_grid(self._pad(pad).sensor.gelpad, self._pad(pad).pitch)
+
+    def reading(self, pad: str, grid: PadGrid | None = None) -> SoftReading:
+        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed."""
+        mine = self._pad(pad)
+        if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
+            mesh = replace(mine.mesh, d_hat=self.world.d_hat)
+            self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
+        return self._readers[pad].read(self.seen(pad), self._failed)
+
+    def seen(self, pad: str) -> SeenPad:
+        """What the reader needs: a pad's coat and forces, and what it touches."""
+        frame = inverse(self.pose(self._pad(pad).name))
+        objects = []
+        for name, near in self.world.touching(pad).items():
+            body = self.bodies.get(name)
+            if body is not None and not body.is_soft:
+                objects.append(SeenObject(body.parts, frame @ self.pose(name), None, near))
+            elif name != pad:
+                objects.append(SeenObject((), frame @ self.pose(name), self.mesh(name, pad), near))
+        return SeenPad(self.coat(pad), self.coat_forces(pad), tuple(objects))
+
+    # --- state -----------------------------------------------------------------------------------------------------------------
+
+    def save(self) -> SceneState:
+        """The state of every environment."""
+        return SceneState(self.world.save(), self._target[0].copy(), {name: p.copy() for name, p in self._target[1].items()})
+
+    def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
+        """Put environments, a mask (B,) or a list, None for all, back to a saved state; there are no contact forces until the next step."""
+        mask = self._mask(envs)
+        self.world.restore(state.world, mask)
+        self._target[0][mask] = state.world_from_pad[mask]
+        for name, pose in state.driven.items():
+            self._target[1][name][mask] = pose[mask]
+        self._failed = self._failed & ~mask | state.world.failed & mask
+
+    def reset(
+        self,
+        envs: ArrayLike | None = None,
+        world_from_pad: ArrayLike | None = None,
+        world_from_body: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Undeformed, at rest, without history, where the scene was made or at other poses (shapes as for the scene itself).
+
+        Raises:
+            OverlapError: bodies overlap at these poses; nothing has changed then.
+        """
+        mask = self._mask(envs)
+        if world_from_pad is None and world_from_body is None:
+            self.restore(SceneState(self._begin, self._start[0], self._driven(self._start[1])), mask)
+            return
+        cases = self._start[0] if world_from_pad is None else self._poses("world_from_pad", world_from_pad, len(self.pads))
+        places = self._start[1] | self._named(world_from_body or {}, free=True)
+        before = self.save()
+        try:
+            self.world.restore(self._begin, mask)
+            self._spread(cases, places, mask)
+        except ipc.OverlapError as error:
+            self.world.restore(before.world, mask)
+            raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
+        self.restore(SceneState(self.world.save(), cases, self._driven(places)), mask)
+
+    # --- inner -----------------------------------------------------------------------------------------------------------------
+
+    def _part(self, done: int, goals: tuple, dt: float) -> tuple[int, tuple[str, str] | None]:
+        """Sixty-fourths of the step that may be made next, a power of two that ``done`` is a multiple of; 0 if that is too few."""
+        movers = self._movers(goals, dt * (1.0 - done / MOST_SUBSTEPS))
+        pairs = [(a, b) for a, b in self._pairs() if not _still(movers[a], movers[b])]
+        share, pair = allowed_share(movers, pairs, _REACH * self.world.d_hat)
+        room = (MOST_SUBSTEPS - done) * share
+        part = MOST_SUBSTEPS
+        while part >= 1 and (part > room * (1.0 + 1e-9) or done % part):
+            part //= 2
+        return part, pair
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Pairs with a driven member; the half-spaces second."""
+        pads, bodies = list(self.pads), list(self.bodies.values())
+        found = [(a, b) for k, a in enumerate(pads) for b in pads[k + 1 :]]
+        found += [(a, b.name) for a in pads for b in bodies]
+        for k, a in enumerate(bodies):
+            found += [
+                (b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name)
+                for b in bodies[k + 1 :]
+                if a.is_driven != b.is_driven
+            ]
+        return found
+
+    def _movers(self, goals: tuple, left: float) -> dict[str, Mover]:
+        found = {}
+        for k, (name, pad) in enumerate(self.pads.items()):
+            rest = pad.mesh.tets.vertices
+            now = self.world.positions(name, frame="body")
+            low, high = np.minimum(rest.min(axis=0), now.min(axis=1)), np.maximum(rest.max(axis=0), now.max(axis=1))
+            found[name] = Mover(self._target[0][:, k], goals[0][:, k], low, high)
+        for name, body in self.bodies.items():
+            found[name] = self._mover(body, goals[1], left)
+        return found
+
+    def _mover(self, body: SceneBody, goals: Mapping[str, np.ndarray], left: float) -> Mover:
+        name, solid = body.name, body.solid
+        one = np.ones((self.num_envs, 1))
+        if isinstance(solid, ipc.HalfSpace):
+            return Mover(self._target[1][name], goals[name], 0.0 * one, 0.0 * one, is_plane=True)
+        if isinstance(solid, ipc.SoftBody):
+            start = self._target[1][name] if body.is_driven else self.pose(name)
+            at = np.einsum("bji,bnj->bni", start[:, :3, :3], self.world.positions(name) - start[:, None, :3, 3])
+            low, high = at.min(axis=1), at.max(axis=1)
+        else:
+            start = self._target[1][name] if body.is_driven else self.pose(name)
+            vertices = solid.surface.vertices
+            low, high = one * vertices.min(axis=0), one * vertices.max(axis=0)
+        if body.is_driven:
+            return Mover(start, goals[name], low, high)
+        end = start.copy()
+        end[:, :3, 3] += left * self.velocity(name)
+        return Mover(start, end, low, high)
+
+    def _refuse(self, pair: tuple[str, str] | None, begun: tuple, goals: tuple) -> None:
+        ways = [np.linalg.norm(goals[0][:, k, :3, 3] - begun[0][:, k, :3, 3], axis=1).max() for k in range(len(self.pads))]
+        ways += [np.linalg.norm(goal[:, :3, 3] - begun[1][name][:, :3, 3], axis=1).max() for name, goal in goals[1].items()]
+        rule = (
+            f"takes {' and '.join(pair or ())} too far against each other where they are near: at most {MOST_SUBSTEPS * STEP * 1e3:.3g} mm "
+            f"or {np.degrees(MOST_SUBSTEPS * TURN):.3g} degrees in one step of {self.settings.dt} s; move slower or in more steps"
+        )
+        raise InputError("world_from_pad", value=f"ways of up to {float(max(ways)) * 1e3:.3g} mm", rule=rule)
+
+    def _contact_wrench(self, name: str) -> np.ndarray:
+        if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):
+            found = self.world.wrench(name)
+            return np.concatenate([found.force, found.torque], axis=1)
+        forces = self.world.contact_forces(name)
+        arm = self.mesh(name)[0] - self.pose(name)[:, None, :3, 3]
+        return np.concatenate([forces.sum(axis=1), np.cross(arm, forces).sum(axis=1)], axis=1)
+
+    def _coat_on_surface(self, pad: ScenePad) -> np.ndarray:
+        """Surface vertex of the solver under each vertex of the coat."""
+        vertex_of = self.world.surface(pad.name)[0]
+        place = np.full(len(pad.mesh.tets.vertices), -1)
+        place[vertex_of] = np.arange(len(vertex_of))
+        return place[pad.mesh.coat_vertices]
+
+    def _into(self, pad: str, points: np.ndarray) -> np.ndarray:
+        """Points (B, n, 3), world frame, in a pad's frame."""
+        rotation, position = self.world.frame(pad)
+        return (points - position[:, None]) @ rotation
+
+    def _coefficients(self) -> dict[tuple[str, str], float]:
+        found = {}
+        for pad in self.pads.values():
+            for other in self.pads.values():
+                if other.name > pad.name:
+                    found[pad.name, other.name] = max(pad.sensor.gelpad.friction, other.sensor.gelpad.friction)
+            for body in self.bodies.values():
+                found[pad.name, body.name] = pad.sensor.gelpad.friction if body.friction is None else body.friction
+        names = list(self.bodies.values())
+        for k, one in enumerate(names):
+            for two in names[k + 1 :]:
+                found[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
+        return found
+
+    def _spread(self, cases: np.ndarray, places: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
+        """Put environments of the mask at poses of their own, undeformed and at rest."""
+        state, layout = self.world.save(), self.world.layout
+        poses = {name: cases[:, k] for k, name in enumerate(self.pads)} | dict(places)
+        for name, pose in poses.items():
+            body = self.bodies.get(name)
+            index = layout.names.index(name)
+            if body is None or body.is_driven:
+                state.frame_position[mask, index] = pose[mask, :3, 3]
+                state.frame_rotation[mask, index] = quaternions(pose)[mask]
+                continue
+            nodes = slice(layout.node_start[index], layout.node_start[index + 1])
+            change = pose @ inverse(self._start[1][name][:1])
+            moved = np.einsum("bij,nj->bni", change[:, :3, :3], layout.node_rest[nodes]) + change[:, None, :3, 3]
+            state.y[mask, nodes] = moved[mask]
+        self.world.restore(state, mask)
+
+    @staticmethod
+    def _at_start(solid, pose: np.ndarray):
+        return replace(solid, pose=ipc.Pose(tuple(pose[:3, 3].tolist()), quaternion(pose[:3, :3])))
+
+    def _driven(self, poses: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: poses[name].copy() for name, body in self.bodies.items() if body.is_driven}
+
+    # --- checks ----------------------------------------------------------------------------------------------------------------
+
+    def _check_names(self, pads: Sequence[ScenePad], bodies: Sequence[SceneBody]) -> None:
+        names = [thing.name for thing in (*pads, *bodies)]
+        if not pads:
+            raise InputError("pads", value=(), rule="must hold one pad or more")
+        if len(set(names)) < len(names):
+            raise InputError("names", value=names, rule="must be unique among pads and bodies")
+
+    def _pad(self, name: str) -> ScenePad:
+        if name not in self.pads:
+            raise InputError("pad", value=name, rule="must be the name of a pad of this scene", choices=self.pads)
+        return self.pads[name]
+
+    def _body(self, name: str) -> SceneBody:
+        if name not in self.bodies:
+            raise InputError("name", value=name, rule="must be the name of a body of this scene", choices=self.bodies)
+        return self.bodies[name]
+
+    def _mask(self, envs: ArrayLike | None) -> np.ndarray:
+        if envs is None:
+            return np.ones(self.num_envs, bool)
+        chosen = np.asarray(envs)
+        if chosen.dtype == bool and chosen.shape == (self.num_envs,):
+            return chosen.copy()
+        if chosen.dtype == bool or (chosen.size and not (chosen.min() >= 0 and chosen.max() < self.num_envs)):
+            raise InputError("envs", value=envs, rule=f"must be a mask ({self.num_envs},) or numbers below {self.num_envs}")
+        mask = np.zeros(self.num_envs, bool)
+        mask[chosen.astype(int)] = True
+        return mask
+
+    def _named(self, poses: Mapping[str, ArrayLike], free: bool = False) -> dict[str, np.ndarray]:
+        for name in poses:
+            if not (self._body(name).is_driven or free):
+                driven = [n for n, body in self.bodies.items() if body.is_driven]
+                raise InputError("driven", value=name, rule="moves freely and takes no pose", choices=driven)
+        return {name: self._poses(name, pose) for name, pose in poses.items()}
+
+    def _of_bodies(self, poses: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+        for name in poses:
+            self._body(name)
+        for name in self.bodies:
+            if name not in poses:
+                raise InputError("world_from_body", value=list(poses), rule=f"must say where {name!r} starts")
+        return {name: self._poses(name, poses[name]) for name in self.bodies}
+
+    def _poses(self, what: str, values: ArrayLike, count: int | None = None) -> np.ndarray:
+        """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis."""
+        array = np.asarray(values, float)
+        shape = (4, 4) if count is None else (count, 4, 4)
+        if array.shape not in (shape, (self.num_envs, *shape)):
+            raise InputError(what, value=array.shape, rule=f"must have shape {shape} or {(self.num_envs, *shape)}")
+        off = np.abs(np.swapaxes(array[..., :3, :3], -1, -2) @ array[..., :3, :3] - np.eye(3)).max(initial=0.0)
+        if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
+            raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
+        return np.broadcast_to(array, (self.num_envs, *shape)).copy()
+
+
+def _batch(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
+    """Environments that poses with a first axis speak of; 1 if none has one."""
+    given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
+    given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
+    return given[0][0] if given else 1
+
+
+def _still(a: Mover, b: Mover) -> bool:
+    return np.array_equal(a.start, a.end) and np.array_equal(b.start, b.end)
+
+
+def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
+    return SceneReport(
+        one.failed | two.failed,
+        one.converged & two.converged,
+        np.minimum(one.min_gap, two.min_gap),
+        np.minimum(one.min_det, two.min_det),
+        np.maximum(one.blocked, two.blocked),
+        one.newton + two.newton,
+        two.elastic,
+        two.barrier,
+        one.substeps + two.substeps,
+    )

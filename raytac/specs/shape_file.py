@@ -1,0 +1,102 @@
+"""Shapes as press and task scenes write them: the keys of every kind, and the rules between lengths, meshes and poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from raytac.errors import MeshError, SpecError
+from raytac.specs.files import is_file
+from raytac.specs.mesh import load_mesh
+from raytac.specs.toml import Integer, Number, Schema, Table, Text
+
+__all__ = ["OBJECT_SCHEMA", "check_shape", "resolved", "unit_quaternion"]
+
+_LENGTH = Number("(0, 100]")
+
+OBJECT_SCHEMA: Final[dict[str, Schema]] = {
+    "none": {},
+    "sphere": {"radius_mm": _LENGTH},
+    "cylinder": {"radius_mm": _LENGTH, "length_mm": _LENGTH},
+    "box": {"length_mm": _LENGTH, "width_mm": _LENGTH, "height_mm": _LENGTH},
+    "edge": {"side_mm": _LENGTH},
+    "cone": {"radius_mm": _LENGTH, "height_mm": _LENGTH, "tip_radius_mm": Number("[0, 100]")},
+    "torus": {"major_radius_mm": _LENGTH, "minor_radius_mm": _LENGTH},
+    "pins": {
+        "rows": Integer("[1, 50]"),
+        "columns": Integer("[1, 50]"),
+        "pitch_mm": _LENGTH,
+        "pin_radius_mm": _LENGTH,
+        "pin_height_mm": _LENGTH,
+    },
+    "coin": {"radius_mm": _LENGTH, "thickness_mm": _LENGTH, "relief_height_mm": _LENGTH},
+    "mesh": {"path": Text(), "scale_m_per_unit": Number("(0, 10]")},
+    "mjcf": {"path": Text(), "body": Text()},
+}
+"""Kind of object to the keys of its own."""
+
+
+def check_shape(table: Table, kind: str, values: dict[str, Any]) -> None:
+    """Rules between the values of one shape, as read by ``OBJECT_SCHEMA``; paths in ``values`` become absolute.
+
+    Raises:
+        SpecError: lengths that contradict each other, or a file that does not exist.
+        MeshError: the mesh cannot be used.
+    """
+    _check_lengths(table, kind, values)
+    if kind in ("mesh", "mjcf"):
+        values["path"] = str(resolved(table, values["path"]))
+    if kind == "mesh":
+        _check_mesh(table, values)
+    elif kind == "mjcf" and not is_file(Path(values["path"])):
+        raise table.error(f"the model file does not exist ({values['path']})", "path", table.data["path"])
+
+
+def unit_quaternion(table: Table, quaternion: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """w, x, y, z of unit length. Raises ``SpecError`` where ``quaternion_wxyz`` of the table is more than 1 % off it."""
+    length = math.hypot(*quaternion)
+    if abs(length - 1) > 0.01:
+        rule = f"must be a unit quaternion w, x, y, z (to 1 %, then normalised); its length is {length:.4g}"
+        raise table.error(rule, "quaternion_wxyz", table.data["quaternion_wxyz"])
+    w, i, j, k = (component / length for component in quaternion)
+    return w, i, j, k
+
+
+def resolved(table: Table, path: str) -> Path:
+    """Absolute path of a file that a scene names, relative to the scene's folder."""
+    try:
+        return (table.file.parent / Path(path).expanduser()).resolve()
+    except (OSError, RuntimeError) as error:  # "~nobody/x.stl", or a circle of links
+        raise table.error(f"the path has no meaning here ({error})", "path", path) from error
+
+
+def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
+    """Lengths [m] of one object that contradict each other."""
+    if kind == "cone" and p["tip_radius"] >= p["radius"]:
+        raise _length_error(table, "tip_radius_mm", f"must be less than radius_mm = {_mm(p['radius'])}")
+    elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
+        raise _length_error(table, "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}")
+    elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] < 2 * p["pin_radius"]:
+        raise _length_error(table, "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}")
+    elif kind == "coin" and p["relief_height"] >= p["thickness"]:
+        raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
+
+
+def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
+    try:
+        load_mesh(values["path"], values["scale"])
+    except MeshError as error:
+        key = "scale_m_per_unit" if error.key == "scale" else "path"
+        rule = f"{error.rule} (mesh {values['path']})"
+        dotted = f"{table.prefix}.{key}" if table.prefix else key
+        raise MeshError(rule, file=table.file, key=dotted, value=table.data[key], choices=error.choices) from error
+
+
+def _length_error(table: Table, key: str, rule: str) -> SpecError:
+    return table.error(rule, key, table.data[key])
+
+
+def _mm(length: float) -> float:
+    return float(f"{length * 1e3:.6g}")

@@ -1,0 +1,194 @@
+"""``Player``: the one thread that runs a session, told what to do by any number of others."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from raytac.errors import InputError, RaytacError
+from raytac.view.session import Session, Snapshot
+
+__all__ = ["Player", "Status"]
+
+_FASTEST = 1.0 / 30.0
+"""Least time between two states while playing [s]: no browser shows more, and a slow line is not flooded."""
+_SMOOTH = 0.8
+"""Share of the old value in the smoothed frame rate."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the player is doing."""
+
+    mode: str = "starting"
+    """``starting``, ``paused``, ``playing``, ``driving`` (on the way to where the controls ask) or ``stopped``."""
+    states_per_s: float = 0.0
+    """States computed, imaged and handed out a second, smoothed; 0 when nothing moves."""
+    count: int = 0
+    """States since the last reset."""
+    error: str = ""
+    """Why the last command ended; empty if it did not fail. The next command clears it."""
+
+
+class Player:
+    """Runs a session in a thread of its own and hands every new state to ``show``.
+
+    Commands return at once and may come from any thread, as often as they like: of many targets for a control that arrive while a state
+    is computed only the last one is driven to. What goes wrong is told in ``Status.error``; the thread lives on.
+
+    .. code-block:: python
+
+        player = Player(session, show)
+        player.start()
+        player.play()
+        player.drive("depth", 0.5)
+        player.close()
+    """
+
+    def __init__(self, session: Session, show: Callable[[Snapshot | None, Status], None]) -> None:
+        """``show(snapshot, status)`` is called by the player's thread; the snapshot is None where only the status changed."""
+        self._session, self._show = session, show
+        self._names = tuple(control.name for control in session.controls)
+        self._wakeup = threading.Condition()
+        self._targets: dict[str, float] = {}
+        self._orders: list[str] = ["show"]
+        """``show``, ``play``, ``pause``, ``step``, ``reset`` in the order they came."""
+        self._is_closing = False
+        self._status = Status()
+        self._thread = threading.Thread(target=self._work, name="raytac-view-player", daemon=True)
+
+    @property
+    def status(self) -> Status:
+        return self._status
+
+    def start(self) -> None:
+        """Begin: the first state is shown, nothing moves."""
+        self._thread.start()
+
+    def close(self, patience: float | None = None) -> bool:
+        """End the thread after the state it is computing; returns whether it ended within ``patience`` seconds (None: however long)."""
+        with self._wakeup:
+            self._is_closing = True
+            self._wakeup.notify()
+        if self._thread.is_alive():
+            self._thread.join(patience)
+        return not self._thread.is_alive()
+
+    def play(self) -> None:
+        self._order("play")
+
+    def pause(self) -> None:
+        self._order("pause")
+
+    def step(self) -> None:
+        """One state further, then pause."""
+        self._order("step")
+
+    def reset(self) -> None:
+        """Back to the start, paused."""
+        self._order("reset")
+
+    def drive(self, name: str, value: float) -> None:
+        """Take a control to ``value``.
+
+        Raises:
+            InputError: no control of that name.
+        """
+        if name not in self._names:
+            raise InputError("name", value=name, rule="must be a control of the session", choices=self._names)
+        with self._wakeup:
+            self._targets.pop(name, None)  # the latest goes last: of two that exclude each other it wins
+            self._targets[name] = float(value)
+            self._wakeup.notify()
+
+    def _order(self, order: str) -> None:
+        with self._wakeup:
+            if order == "reset":  # what was asked before is void
+                self._orders.clear()
+                self._targets.clear()
+            self._orders.append(order)
+            self._wakeup.notify()
+
+    # --- the thread ------------------------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while True:
+            with self._wakeup:
+                while not (self._is_closing or self._orders or self._targets or self._status.mode in ("playing", "driving")):
+                    self._wakeup.wait()
+                if self._is_closing:
+                    self._status = replace(self._status, mode="stopped", states_per_s=0.0)
+                    return
+                order = self._orders.pop(0) if self._orders else ""
+                targets = {} if order else self._targets
+                if targets:
+                    self._targets = {}
+            began = time.perf_counter()
+            try:
+                snapshot = self._obey(order, targets)
+            except Exception as error:
+                self._fail(error)
+                continue
+            self._tell(snapshot, began)
+
+    def _obey(self, order: str, targets: dict[str, float]) -> Snapshot | None:
+        """Do one thing; returns what there is to show, None if nothing moved."""
+        session, mode = self._session, self._status.mode
+        if order == "pause":
+            self._become("paused")
+            return None
+        if order == "reset":
+            session.reset()
+            self._become("paused", count=0)
+            return session.snapshot()
+        if order == "show":
+            self._become("paused")
+            return session.snapshot()
+        if order in ("play", "step"):
+            session.resume()
+            self._become("playing" if order == "play" else "paused")
+        elif targets:
+            session.drive(targets)
+            if session.is_driven_at_rest:
+                self._become("driving")
+            else:
+                self._become(mode)
+                if mode != "playing":
+                    return None
+        if session.advance():
+            self._status = replace(self._status, count=self._status.count + 1)
+            return session.snapshot()
+        self._become("paused")
+        return None
+
+    def _become(self, mode: str, **changes: int) -> None:
+        is_moving = mode in ("playing", "driving")
+        rate = self._status.states_per_s if is_moving else 0.0
+        self._status = replace(self._status, mode=mode, error="", states_per_s=rate, **changes)
+
+    def _tell(self, snapshot: Snapshot | None, began: float) -> None:
+        if snapshot is not None and self._status.mode in ("playing", "driving"):
+            rest = _FASTEST - (time.perf_counter() - began)
+            if rest > 0.0:
+                time.sleep(rest)
+            rate, old = 1.0 / (time.perf_counter() - began), self._status.states_per_s
+            self._status = replace(self._status, states_per_s=_SMOOTH * old + (1.0 - _SMOOTH) * rate if old else rate)
+        try:
+            self._show(snapshot, self._status)
+        except Exception as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Stop moving and say why; a fault of ours is also printed in full, where whoever started the program sees it."""
+        text = str(error)
+        if not isinstance(error, RaytacError):
+            text = f"{type(error).__name__}: {error}"
+            traceback.print_exception(error)
+        self._status = replace(self._status, mode="paused", states_per_s=0.0, error=text)
+        try:
+            self._show(None, self._status)
+        except Exception as second:
+            traceback.print_exception(second)

@@ -1,0 +1,273 @@
+"""A press scene as a session: its trajectory to play, and sliders that press, shear and twist the object."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import chain
+
+import numpy as np
+
+from raytac.errors import InputError, RaytacError
+from raytac.frame import TactileFrame
+from raytac.gel.part import Part
+from raytac.physics.contact_state import ContactState
+from raytac.physics.part_surface import object_surface
+from raytac.physics.soft import SoftPad
+from raytac.physics.soft_bodies import OBJECT, PAD
+from raytac.sensor import TactileSensor
+from raytac.sensor.contact_width import LEAST_CELLS
+from raytac.specs import PressScene, validate_press
+from raytac.specs.press import StageSpec
+from raytac.view.sensor_view import grid_faces, pad_view, sensor_lines, sensor_solids, strided
+from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid
+
+__all__ = ["PressSession"]
+
+_STRIDE_MM, _TURN_DEG, _PUSH = 0.1, 2.0, 0.25
+"""How far the object goes from one state to the next on its way to where a slider asks: [mm], [degrees], [N]."""
+_NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twist": 0.1}
+"""A control is there when it is this close, in its unit."""
+_DEEPEST = 0.4
+"""Share of the pad's thickness that the depth slider reaches, more if the scene goes deeper."""
+_STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
+"""Ends of the sliders for force [N], shear [mm] and twist [degrees]."""
+_STATES = {"rigid": 20, "ipc": 10}
+"""States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
+_OBJECT_COLOUR = (150, 156, 166)
+
+
+class PressSession:
+    """One sensor and the object of a press scene (see ``Session``); the world frame is the pad frame."""
+
+    units_per_metre = 100.0
+    is_driven_at_rest = True
+
+    def __init__(self, sensor: TactileSensor, scene: PressScene) -> None:
+        """Put the object before the sensor; nothing is imaged yet.
+
+        Args:
+            sensor: with ``num_envs = 1``; what it does not output is not shown.
+            scene: of any physics. Without an object, or with one that lies free, there are no sliders.
+
+        Raises:
+            RaytacError: as ``TactileSensor.load``.
+        """
+        validate_press(sensor.spec, scene)
+        self._sensor, self._stages = sensor, len(scene.trajectory)
+        self._is_drivable = scene.object.kind != "none" and scene.object.dynamics != "affine"
+        if self._is_drivable:
+            # One more stage, never played: it makes a simulated pad keep as much of the object as the sliders can bring near the gel.
+            scene = replace(scene, trajectory=(*scene.trajectory, StageSpec("indent", force=_STRONGEST)))
+        self._pad = sensor.load(scene)
+        self.title = f"{scene.name} · {sensor.spec.name} · {sensor.label}"
+        size = max(sensor.spec.gelpad.size)
+        self.camera = CameraPlace((0.9 * size, -1.75 * size, 1.35 * size), (0.0, 0.0, -0.15 * size))
+        self.controls = self._make_controls(scene) if self._is_drivable else ()
+        self._grid = strided(self._pad.grid)
+        quantities = ("indentation", *(("pressure", "shear") if "traction" in sensor.outputs else ()))
+        self.pads = (Pad(sensor.spec.name, grid_faces(self._grid), quantities),)
+        self.solids = (*sensor_solids(sensor.spec), *self._object_solids())
+        self.lines = (*sensor_lines(sensor.spec), *self._coat_lines())
+        self._held: dict[str, float] = {}
+        """Controls that were moved and hold the object, in their own unit."""
+        self._states: Iterator[ContactState] = iter(())
+        self.reset()
+
+    # --- what a player asks ----------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        self._held = {}
+        self._has_ended = False
+        if self._sensor.markers is not None:
+            self._sensor.reset_markers()
+        self._states = self._pad.run(_STATES[self._sensor.physics])
+        self._state = next(self._states)
+        self._start = self._state.pad_from_object[0]
+        self._shot: Snapshot | None = None
+
+    def resume(self) -> None:
+        if self._held or self._has_ended:
+            self.reset()
+
+    def drive(self, targets: Mapping[str, float]) -> None:
+        self._check(targets)
+        for name, value in targets.items():
+            control = next(c for c in self.controls if c.name == name)
+            self._held.pop(control.instead_of, None)
+            self._held[name] = value
+        # In the order of a press, whatever the order of the hands: an object that is sheared before it is pressed feels nothing.
+        ways = [self._way(control.name) for control in self.controls if control.name in self._held]
+        self._states = chain.from_iterable(self._pad.follow(stage, steps) for stage, steps in ways if stage is not None)
+
+    def advance(self) -> bool:
+        state = next(self._states, None)
+        if state is None or state.stage >= self._stages:
+            self._has_ended = not self._held
+            return False
+        if state.failed[0]:
+            self._states, self._has_ended = iter(()), True
+            raise RaytacError(
+                "the physics broke down here: the state did not settle or is not finite; reset, or try smaller steps"
+            )
+        self._state, self._shot = state, None
+        return True
+
+    def snapshot(self) -> Snapshot:
+        if self._shot is None:
+            began = time.perf_counter()
+            frame = self._sensor.update(self._state)
+            self._shot = self._drawn(frame, 1e3 * (time.perf_counter() - began))
+        return self._shot
+
+    # --- controls --------------------------------------------------------------------------------------------------------------
+
+    def _make_controls(self, scene: PressScene) -> tuple[Control, ...]:
+        thickness = 1e3 * self._sensor.spec.gelpad.thickness
+        deepest = max([_DEEPEST * thickness, *(1e3 * (stage.depth or 0.0) for stage in scene.trajectory)])
+        return (
+            Control(
+                "depth",
+                "depth [mm]",
+                0.0,
+                round(deepest, 2),
+                0.01,
+                "Below first touch; 0 lifts the object off",
+                instead_of="force",
+            ),
+            Control(
+                "force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear and twist", instead_of="depth"
+            ),
+            Control("shear_x", "shear x [mm]", -_FARTHEST, _FARTHEST, 0.02),
+            Control("shear_y", "shear y [mm]", -_FARTHEST, _FARTHEST, 0.02),
+            Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),
+        )
+
+    def _check(self, targets: Mapping[str, float]) -> None:
+        for name, value in targets.items():
+            control = next((c for c in self.controls if c.name == name), None)
+            if control is None:
+                raise InputError(
+                    "control", value=name, rule="must be one of the scene's", choices=[c.name for c in self.controls]
+                )
+            if not control.low <= value <= control.high:
+                raise InputError(control.label, value=value, rule=f"must be within {control.low:g} and {control.high:g}")
+
+    def _way(self, name: str) -> tuple[StageSpec | None, int]:
+        """The stage that takes the object to where the control ``name`` is held, in how many states; None if it is there."""
+        now, wanted = self._places(), self._held[name]
+        off = wanted - now[name]
+        if abs(off) <= _NEAR[name]:
+            return None, 0
+        if name in ("shear_x", "shear_y"):
+            # Both are one stage; a side that nobody holds stays where it is.
+            ends = tuple(self._held.get(side, now[side]) for side in ("shear_x", "shear_y"))
+            way = np.hypot(ends[0] - now["shear_x"], ends[1] - now["shear_y"])
+            return StageSpec("shear", shear=(1e-3 * ends[0], 1e-3 * ends[1])), _steps(way / _STRIDE_MM)
+        if name == "twist":
+            return StageSpec("twist", twist=float(np.radians(wanted))), _steps(off / _TURN_DEG)
+        steps = _steps(off / (_STRIDE_MM if name == "depth" else _PUSH))
+        if wanted == 0.0:
+            return StageSpec("release"), steps
+        return (StageSpec("indent", depth=1e-3 * wanted) if name == "depth" else StageSpec("indent", force=wanted)), steps
+
+    def _places(self) -> dict[str, float]:
+        """Where the object is now, by control and in its unit."""
+        pose = self._state.pad_from_object[0]
+        turned = pose[:3, :3] @ self._start[:3, :3].T
+        x, y = 1e3 * (pose[:2, 3] - self._start[:2, 3])
+        return {
+            "depth": max(1e3 * float(self._state.depth[0]), 0.0),
+            "force": float(self._state.normal_force[0]),
+            "shear_x": float(x),
+            "shear_y": float(y),
+            "twist": float(np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))),
+        }
+
+    # --- drawing ---------------------------------------------------------------------------------------------------------------
+
+    def _object_solids(self) -> tuple[Solid, ...]:
+        if not self._pad.parts:
+            return ()
+        soft = self._soft_object()
+        if soft is not None:
+            return (Solid("object", *soft, _OBJECT_COLOUR, hides_pads=True),)
+        closed = [part for part in self._pad.parts if part.kind != "plane"]
+        shapes = []
+        if closed:
+            surface = object_surface(closed)
+            shapes.append(Solid("object", surface.vertices, surface.faces, _OBJECT_COLOUR, hides_pads=True))
+        for k, part in enumerate(p for p in self._pad.parts if p.kind == "plane"):
+            shapes.append(
+                Solid(f"object_plane_{k}", *_square(part, 2.0 * max(self._sensor.spec.gelpad.size)), _OBJECT_COLOUR, 0.5)
+            )
+        return tuple(shapes)
+
+    def _soft_object(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Surface of an object that deforms as it is now: vertices in the pad frame (V, 3) [m] and faces; None for a rigid one."""
+        solver = self._pad.solver if isinstance(self._pad, SoftPad) else None
+        if solver is None or not solver.body.is_soft:
+            return None
+        vertices, faces = solver.scene.mesh(OBJECT, PAD)
+        return vertices[0], faces
+
+    def _coat_lines(self) -> tuple[Lines, ...]:
+        """Edges of the simulated pad's own mesh over the smooth coat."""
+        if not isinstance(self._pad, SoftPad):
+            return ()
+        return (Lines("coat_mesh", self._coat_edges(self._pad.mesh.coat.rest), (205, 212, 222), 0.8),)
+
+    def _coat_edges(self, vertices: np.ndarray) -> np.ndarray:
+        rows, columns = self._pad.mesh.coat.shape  # type: ignore[union-attr]
+        at = vertices.reshape(rows, columns, 3) + np.array([0.0, 0.0, 2e-5])  # clear of the faces below
+        along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 3)
+        return np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 3)])
+
+    def _drawn(self, frame: TactileFrame, image_ms: float) -> Snapshot:
+        name, surface = self._sensor.spec.name, frame.surface
+        poses = {solid.name: self._state.pad_from_object[0] for solid in self.solids if solid.name.startswith("object")}
+        reshaped: dict[str, np.ndarray] = {}
+        if isinstance(self._pad, SoftPad):
+            if surface.coat is not None:
+                reshaped["coat_mesh"] = self._coat_edges(surface.coat.positions[0])
+            soft = self._soft_object()
+            if soft is not None:
+                reshaped["object"], poses["object"] = soft[0], np.eye(4)
+        warning = ""
+        if frame.contact_cells is not None and frame.contact_cells[0] < LEAST_CELLS:
+            cells = frame.contact_cells[0]
+            warning = f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} its force at a given depth is too large."
+        controls = {name: self._held.get(name, value) for name, value in self._places().items()} if self._is_drivable else {}
+        return Snapshot(
+            pads={name: pad_view(frame, self._grid, np.eye(4))},
+            poses=poses,
+            reshaped=reshaped,
+            controls=controls,
+            facts=self._facts(frame),
+            warning=warning,
+            time_ms={"image": image_ms, **frame.time_ms},
+        )
+
+    def _facts(self, frame: TactileFrame) -> dict[str, str]:
+        state, surface = self._state, frame.surface
+        where = "held by the sliders" if self._held else f"{state.kind} {100.0 * state.fraction:.0f} %"
+        facts = {"stage": where}
+        if self._is_drivable:
+            facts["depth"] = f"{1e3 * float(state.depth[0]):.3f} mm"
+        facts["deepest imprint"] = f"{1e3 * float(np.nanmax(surface.indentation[0])):.3f} mm"
+        if frame.contact_area is not None:
+            facts["contact area"] = f"{1e6 * float(frame.contact_area[0]):.2f} mm²"
+        return facts
+
+
+def _steps(share: float) -> int:
+    return max(int(np.ceil(abs(share))), 1)
+
+
+def _square(part: Part, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """A square of the plane z = 0 of a part, object frame: vertices and faces, seen from both sides."""
+    corners = 0.5 * size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    pose = part.object_from_part
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
+    return corners @ pose[:3, :3].T + pose[:3, 3], faces

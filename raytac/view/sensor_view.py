@@ -1,0 +1,124 @@
+"""A sensor as the viewer draws it: gel block, case, lights and view of the camera once, its coat and image at every state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.frame import TactileFrame
+from raytac.gel.pad import rest_height
+from raytac.gel.surface import PadGrid
+from raytac.specs import SensorSpec
+from raytac.view.session import Lines, PadView, Solid
+
+__all__ = ["grid_faces", "pad_view", "sensor_lines", "sensor_solids", "strided"]
+
+_MOST_VERTICES = 12_000
+"""Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
+_GEL, _CASE, _VIEW = (176, 205, 212), (105, 112, 122), (190, 150, 60)
+
+
+def strided(grid: PadGrid) -> PadGrid:
+    """The grid thinned to at most ``_MOST_VERTICES`` nodes, edges kept."""
+    step = 1
+    while True:
+        x, y = _thinned(len(grid.x), step), _thinned(len(grid.y), step)
+        if len(x) * len(y) <= _MOST_VERTICES:
+            return PadGrid(grid.x[x], grid.y[y], grid.rest[np.ix_(y, x)])
+        step += 1
+
+
+def _thinned(count: int, step: int) -> np.ndarray:
+    """Every ``step``-th of ``count`` numbers and the last."""
+    taken = np.arange(0, count, step)
+    return taken if taken[-1] == count - 1 else np.append(taken, count - 1)
+
+
+def grid_faces(grid: PadGrid) -> np.ndarray:
+    """Triangles (F, 3) over the nodes of a grid, row by row, counter-clockwise seen from +z."""
+    rows, columns = grid.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (m.ravel() for m in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+
+
+def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0) -> PadView:
+    """What the page draws of one environment's frame, with the coat at the nodes of ``grid`` (from ``strided``)."""
+    full = frame.surface.grid
+    rows, columns = np.searchsorted(full.y, grid.y), np.searchsorted(full.x, grid.x)
+    at = np.ix_(rows, columns)
+    height = frame.surface.height[env][at].astype(float)
+    x, y = np.meshgrid(grid.x, grid.y)
+    values = {"indentation": (grid.rest - height).ravel()}
+    if frame.traction is not None:
+        traction = frame.traction[env][at].reshape(-1, 3)
+        values["pressure"], values["shear"] = -traction[:, 2], np.hypot(traction[:, 0], traction[:, 1])
+    markers = None
+    if frame.markers is not None:
+        markers = frame.markers.rest_px[env], frame.markers.displacement_px[env]
+    return PadView(
+        world_from_pad=world_from_pad,
+        vertices=np.stack([x.ravel(), y.ravel(), height.ravel()], axis=1),
+        values=values,
+        rgb=None if frame.rgb is None else frame.rgb[env],
+        markers_px=markers,
+        wrench=None if frame.wrench is None else frame.wrench[env],
+    )
+
+
+def sensor_solids(spec: SensorSpec, prefix: str = "") -> tuple[Solid, ...]:
+    """The gel block below its coat, and the lights; pad frame."""
+    return (Solid(prefix + "gel", *_block(spec), _GEL, 0.35), *_lights(spec, prefix))
+
+
+def sensor_lines(spec: SensorSpec, prefix: str = "") -> tuple[Lines, ...]:
+    """The inside of the case as a box, and the camera's view of the plane z = 0; pad frame."""
+    (wide, long), gel = spec.case.size, spec.gelpad
+    case = _box_edges((-0.5 * wide, -0.5 * long, spec.case.floor_z), (0.5 * wide, 0.5 * long, -gel.thickness))
+    camera = spec.camera
+    (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
+    eye = np.asarray(camera.position)
+    corners = np.array([[u, v] for u, v in ((0, 0), (width, 0), (width, height), (0, height))], float)
+    seen = np.column_stack([eye[0] + (corners[:, 0] - cx) * px, eye[1] + (corners[:, 1] - cy) * py, np.zeros(4)])
+    rays = [np.stack([np.broadcast_to(eye, (4, 3)), seen], axis=1), np.stack([seen, np.roll(seen, -1, axis=0)], axis=1)]
+    return Lines(prefix + "case", case, _CASE), Lines(prefix + "camera_view", np.concatenate(rays), _VIEW)
+
+
+def _block(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Sides and back of the gel as triangles, under the resting edge of the coat."""
+    gel = spec.gelpad
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, 25) for size in gel.size)
+    around = np.concatenate(
+        [
+            np.column_stack([x[:-1], np.full(24, y[0])]),
+            np.column_stack([np.full(24, x[-1]), y[:-1]]),
+            np.column_stack([x[:0:-1], np.full(24, y[-1])]),
+            np.column_stack([np.full(24, x[0]), y[:0:-1]]),
+        ]
+    )
+    top = np.column_stack([around, rest_height(gel, around[:, 0], around[:, 1])])
+    back = np.column_stack([around, np.full(len(around), -gel.thickness)])
+    here, after, n = np.arange(len(around)), (np.arange(len(around)) + 1) % len(around), len(around)
+    sides = np.concatenate([np.stack([here + n, after + n, after], 1), np.stack([here + n, after, here], 1)])
+    floor = np.stack([np.full(n - 2, n), np.arange(n + 2, 2 * n), np.arange(n + 1, 2 * n - 1)], axis=1)
+    return np.concatenate([top, back]), np.concatenate([sides, floor])
+
+
+def _lights(spec: SensorSpec, prefix: str) -> tuple[Solid, ...]:
+    """Every LED as its rectangle, both sides, in the colour of its light."""
+    found = []
+    for led in spec.lights.leds:
+        u, v = np.asarray(led.edges)
+        half_u, half_v = 0.5 * led.size[0] * u, 0.5 * led.size[1] * v
+        corners = np.asarray(led.position) + np.array([-half_u - half_v, half_u - half_v, half_u + half_v, half_v - half_u])
+        faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
+        power = np.asarray(led.power)
+        red, green, blue = (round(60 + 195 * float(p)) for p in power / max(float(power.max()), 1e-12))
+        found.append(Solid(f"{prefix}leds/{led.name}", corners, faces, (red, green, blue)))
+    return tuple(found)
+
+
+def _box_edges(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
+    """The twelve edges of a box, (12, 2, 3)."""
+    corners = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+    pairs = [(k, k | 1 << axis) for k in range(8) for axis in range(3) if not k >> axis & 1]
+    return corners[np.array(pairs)]

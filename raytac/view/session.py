@@ -1,0 +1,183 @@
+"""What the viewer needs of whatever it shows: the ``Session`` protocol and the plain data that goes through it.
+
+A session holds the physics and knows nothing of browsers; the page draws what a session hands out and knows nothing of physics. Lengths
+are in metres in the session's world frame unless a field says otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+__all__ = ["QUANTITIES", "CameraPlace", "Control", "Lines", "Pad", "PadView", "Quantity", "Session", "Snapshot", "Solid"]
+
+Colour = tuple[int, int, int]
+"""8-bit sRGB."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number on every vertex of a coat that its colour can show."""
+
+    label: str
+    """For people, with the shown unit."""
+    factor: float
+    """Shown value of one SI unit."""
+    least: float
+    """Smallest full scale of the legend, in the shown unit, so that noise of a pad at rest is not blown up."""
+
+
+QUANTITIES = {
+    "indentation": Quantity("indentation [mm]", 1e3, 0.1),
+    "pressure": Quantity("normal traction [kPa]", 1e-3, 1.0),
+    "shear": Quantity("shear traction [kPa]", 1e-3, 1.0),
+}
+"""What colours a coat; a session may hand out fewer."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A number that a slider sets. ``low``, ``high``, ``step`` and the values handed over are in the unit of the label."""
+
+    name: str
+    label: str
+    """For people, with the unit."""
+    low: float
+    high: float
+    step: float
+    hint: str = ""
+    """A sentence that the page shows on hovering."""
+    instead_of: str = ""
+    """Name of another control that this one takes over from when it is moved, as a force does from a depth; empty is none."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A triangle mesh: made once, then placed by ``Snapshot.poses`` or reshaped by ``Snapshot.reshaped``."""
+
+    name: str
+    """Unique among solids; slashes make a tree."""
+    vertices: np.ndarray
+    """Shape (V, 3) [m], in the frame that its pose places."""
+    faces: np.ndarray
+    """Shape (F, 3), counter-clockwise from outside."""
+    colour: Colour
+    opacity: float = 1.0
+    hides_pads: bool = False
+    """Whether it lies over what pads feel; the page can make such solids see-through."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Line segments, placed as a solid is."""
+
+    name: str
+    segments: np.ndarray
+    """Shape (N, 2, 3) [m]."""
+    colour: Colour
+    width: float = 1.5
+    """On the screen [px]."""
+
+
+@dataclass(frozen=True)
+class Pad:
+    """A gel pad whose coat is coloured by what it feels."""
+
+    name: str
+    """The sensor's; unique among pads."""
+    faces: np.ndarray
+    """Triangles of the coat, shape (F, 3), counter-clockwise seen from the object."""
+    quantities: tuple[str, ...] = ("indentation",)
+    """Keys of ``QUANTITIES`` that ``PadView.values`` will hold."""
+
+
+@dataclass(frozen=True)
+class PadView:
+    """One pad and its sensor at one instant."""
+
+    world_from_pad: np.ndarray
+    """Shape (4, 4)."""
+    vertices: np.ndarray
+    """Coat, pad frame [m], shape (V, 3)."""
+    values: Mapping[str, np.ndarray]
+    """SI value of each quantity at the vertices, shape (V,)."""
+    rgb: np.ndarray | None = None
+    """Tactile image, shape (H, W, 3), uint8; None if the session makes none."""
+    markers_px: tuple[np.ndarray, np.ndarray] | None = None
+    """Markers at rest and their displacement, pixels of ``rgb``, shapes (M, 2); NaN for one that is not seen."""
+    wrench: np.ndarray | None = None
+    """Force [N] and torque about the pad frame's origin [N m] on the pad, pad frame, shape (6,)."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that the page draws of one instant."""
+
+    pads: Mapping[str, PadView]
+    poses: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """``world_from_solid`` (4, 4) by name of solid or lines; those that are missing stay where they are."""
+    reshaped: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """New vertices (V, 3) [m] of solids that deform."""
+    controls: Mapping[str, float] = field(default_factory=dict)
+    """Where each control stands: what was asked for where one drives, else what is so."""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Lines of the read-out, by label."""
+    warning: str = ""
+    """What the user should know of this state; empty is nothing."""
+    time_ms: Mapping[str, float] = field(default_factory=dict)
+    """Wall time of what was computed [ms]."""
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where the eye of the 3-D view starts, world frame [m]; z is up."""
+
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float]
+
+
+class Session(Protocol):
+    """Something that can be played, stepped, driven and drawn. Every method is called by one thread only, one at a time."""
+
+    title: str
+    """One line: scene, sensor, physics and optics."""
+    units_per_metre: float
+    """Scale of the 3-D view, so that what matters is about 1 unit large."""
+    camera: CameraPlace
+    controls: tuple[Control, ...]
+    is_driven_at_rest: bool
+    """Whether a control that is moved moves the scene at once, though it is paused: True for what is quasi-static."""
+    solids: tuple[Solid, ...]
+    lines: tuple[Lines, ...]
+    pads: tuple[Pad, ...]
+
+    def reset(self) -> None:
+        """Back to the start; all controls let go."""
+        ...
+
+    def resume(self) -> None:
+        """Go on with the scene's own motion, from its start if it has ended or was left for the controls."""
+        ...
+
+    def drive(self, targets: Mapping[str, float]) -> None:
+        """Set where controls shall take the scene; ``advance`` goes there.
+
+        Raises:
+            RaytacError: a target that cannot be.
+        """
+        ...
+
+    def advance(self) -> bool:
+        """Compute the next state; False if there was none left to compute.
+
+        Raises:
+            RaytacError: the physics broke down, or cannot go on; the session stays usable after ``reset``.
+        """
+        ...
+
+    def snapshot(self) -> Snapshot:
+        """The state now, with images; only this computes images."""
+        ...

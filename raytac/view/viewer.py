@@ -1,0 +1,107 @@
+"""``Viewer``: a web server, its page and the thread that runs the session, from start to a clean end."""
+
+from __future__ import annotations
+
+import importlib.util
+import socket
+from types import TracebackType
+
+from raytac.errors import BackendError, InputError
+from raytac.view.page import Page
+from raytac.view.player import Player
+from raytac.view.session import Session
+
+__all__ = ["Viewer", "check_address", "check_viewer"]
+
+_PATIENCE = 10.0
+"""How long the end waits for the state that is being computed [s]; the thread is a daemon and ends with the program at the latest."""
+
+
+def check_viewer() -> None:
+    """Say now, in one line, that the web server is missing.
+
+    Raises:
+        BackendError: viser is not installed.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise BackendError('the viewer needs viser, and it is not installed: `pip install "raytac[view]"`')
+
+
+class Viewer:
+    """Serves a session to any number of browsers.
+
+    .. code-block:: python
+
+        with Viewer(session, port=8080) as viewer:
+            print(viewer.url)
+            input("Enter ends")
+
+    Whoever can reach the port can move the sliders and sees what is shown; ``host="127.0.0.1"`` lets in this machine only.
+    """
+
+    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        """Start serving and compute the first state.
+
+        Args:
+            session: what is shown.
+            host: address to listen at; ``0.0.0.0`` is every network that the machine is in.
+            port: in [0, 65535]; 0 lets the system choose.
+
+        Raises:
+            BackendError: viser is not installed.
+            InputError: a port that cannot be, is taken or is not allowed, or an address that is not this machine's.
+        """
+        check_viewer()
+        check_address(host, port)
+        import viser
+
+        self._server = viser.ViserServer(host, port, verbose=False)
+        self.host, self.port = host, self._server.get_port()
+        try:
+            if port not in (0, self.port):  # taken since it was checked; viser then goes on to the next
+                raise InputError("port", value=port, rule="is taken; choose another one, or 0 for any that is free")
+            page = Page(self._server, session)
+            self.player = Player(session, page.show)
+            page.attach(self.player)
+            self.player.start()
+        except BaseException:
+            self._server.stop()
+            raise
+        self._is_open = True
+
+    @property
+    def url(self) -> str:
+        host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
+        return f"http://{host}:{self.port}"
+
+    def close(self) -> None:
+        """End the thread and the server, and free the port; a second call does nothing."""
+        if self._is_open:
+            self._is_open = False
+            self.player.close(_PATIENCE)
+            self._server.stop()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def check_address(host: str, port: int) -> None:
+    """Raises ``InputError`` for a host and port that cannot be listened at."""
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
+        raise InputError("port", value=port, rule="must be a whole number in [0, 65535]; 0 takes any that is free")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise InputError("host", value=host, rule=f"must be an address or name of this machine ({error.strerror})") from error
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just left is free
+        try:
+            probe.bind(address)
+        except PermissionError as error:
+            raise InputError("port", value=port, rule="is not allowed to this user; choose one from 1024 on") from error
+        except OSError as error:
+            name, value = ("host", host) if error.errno == 99 else ("port", port)
+            raise InputError(name, value=value, rule=f"cannot be listened at: {error.strerror}; choose another one") from error

@@ -1,0 +1,290 @@
+"""From a task scene to one MuJoCo model: robot with its sensors, bodies, and where everything starts."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from raytac.errors import InputError, MeshError, SpecError
+from raytac.gel.part import Part
+from raytac.physics.objects import object_parts
+from raytac.robots.arm import Arm
+from raytac.robots.gripper import floating_gripper
+from raytac.robots.mount import MountedSensor, mount_sensor
+from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
+from raytac.robots.pose import pose
+from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor_file import load_sensor
+from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, RobotSpec, TaskScene
+
+__all__ = ["ComposedBody", "ComposedScene", "compose", "pose_of"]
+
+_GEOMS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+}
+_PLANE = (2.0, 2.0, 0.1)
+"""Half widths and grid spacing [m] that a half-space is drawn with; it has no end."""
+_COLOUR = (0.72, 0.72, 0.7)
+_HARD = 0.2, 0.999
+"""Contacts of bodies that are rigid: ω Δt of their direct form, and its impedance d. Under a force F on a mass m they give way by
+(1 − d) F Δt² / (m 0.2²): a steel ball of 4 g under 1 N at 2 ms by 25 µm, where MuJoCo's default would by some tenths of a millimetre."""
+
+
+@dataclass(frozen=True)
+class ComposedBody:
+    """A body of the scene in the model."""
+
+    spec: BodySpec
+    parts: tuple[Part, ...]
+    """Its shape, body frame [m]: what pads sense."""
+    index: int
+    """Body of the model."""
+    mocap: int
+    """Index into ``mocap_pos`` of a body that another simulator moves, else −1."""
+    qpos: int
+    """Address of its free joint's seven positions, else −1."""
+
+    @property
+    def is_free(self) -> bool:
+        """Whether MuJoCo moves it."""
+        return self.qpos >= 0
+
+
+@dataclass(frozen=True)
+class ComposedScene:
+    """A compiled scene and the names in it."""
+
+    scene: TaskScene
+    model: mujoco.MjModel
+    sensors: tuple[MountedSensor, ...]
+    sensor_specs: tuple[SensorSpec, ...]
+    arm: Arm | None
+    """The joints that move the robot's site; None where there are none."""
+    opening: int | None
+    """Actuator of the gap between two pads; None without."""
+    bodies: dict[str, ComposedBody]
+    """Rigid bodies by name; soft ones are not MuJoCo's."""
+    start: np.ndarray
+    """Positions (nq,) at the start."""
+    ctrl: np.ndarray
+    """Controls (nu,) at the start: what position actuators hold there, 0 for motors."""
+
+
+def compose(scene: TaskScene, physics: str) -> ComposedScene:
+    """Build and compile the model of a scene.
+
+    With ``physics="ipc"`` bodies that belong to IPC are mocap bodies that touch nothing, and soft ones are left out.
+
+    Raises:
+        SpecError: a soft body with the rigid pad, a body or robot that cannot be built; names the scene's file and key.
+        InputError: MuJoCo refuses the model.
+    """
+    robot, specs = _robot(scene)
+    spec: mujoco.MjSpec = robot.spec
+    spec.option.timestep = scene.timestep
+    spec.option.gravity = scene.gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Elliptic cones have one coefficient for every direction; the noslip pass takes away the creep of MuJoCo's soft friction, which
+    # would let go of whatever is held for seconds.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.option.noslip_iterations = 4
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    shapes: dict[str, tuple[Part, ...]] = {}
+    for i, body in enumerate(scene.bodies):
+        shapes[body.name] = _parts(scene, i)
+        if body.dynamics == "soft":
+            if physics == "rigid":
+                choices = ("fixed", "free")
+                rule = "is for simulated pads, physics='ipc': with the rigid pad nothing deforms"
+                raise SpecError(rule, file=scene.source, key=f"body[{i}].dynamics", value="soft", choices=choices)
+            continue
+        if spec.body(body.name) is not None:
+            rule = "the robot has a body of this name"
+            raise SpecError(rule, file=scene.source, key=f"body[{i}].name", value=body.name)
+        _add_body(
+            spec,
+            body,
+            shapes[body.name],
+            scene.timestep,
+            mirrored=physics == "ipc" and body.dynamics == "free" and body.owner == "ipc",
+        )
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise InputError("scene", value=scene.name, rule=f"MuJoCo refuses it: {' '.join(str(error).split())}") from error
+    bodies = {b.name: _composed(model, b, shapes[b.name]) for b in scene.bodies if b.dynamics != "soft"}
+    arm = Arm(model, robot.site, robot.joints) if robot.joints else None
+    opening = None if robot.opening is None else int(model.actuator(robot.opening).id)
+    start, ctrl = _start(scene, model, arm, opening, bodies)
+    return ComposedScene(scene, model, robot.sensors, specs, arm, opening, bodies, start, ctrl)
+
+
+def pose_of(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
+    """Pose (4, 4) from a position [m] and a quaternion wxyz."""
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(quaternion, float))
+    return pose(rotation.reshape(3, 3), np.asarray(position, float))
+
+
+@dataclass(frozen=True)
+class _Robot:
+    spec: mujoco.MjSpec
+    sensors: tuple[MountedSensor, ...]
+    site: str
+    opening: str | None
+    joints: tuple[str, ...]
+
+
+def _robot(scene: TaskScene) -> tuple[_Robot, tuple[SensorSpec, ...]]:
+    """The robot of a scene, not compiled, and the sensors on it."""
+    robot = scene.robot
+    sensor = load_sensor(robot.sensor)
+    if robot.model == "panda_one_sensor":
+        made = one_sensor_panda(sensor)
+    elif robot.model == "panda_two_fingers":
+        made = two_finger_panda(sensor)
+    elif robot.model == "floating_gripper":
+        made = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
+    elif robot.model == "fixed_sensor":
+        spec = mujoco.MjSpec()
+        mounted = mount_sensor(spec, sensor, "world", pose_of(robot.position, robot.quaternion))
+        made = _Robot(spec, (mounted,), mounted.site, None, ())
+    else:
+        made = _own_robot(scene, robot, sensor)
+    return _Robot(made.spec, made.sensors, made.site, made.opening, tuple(made.joints)), (sensor,) * len(made.sensors)
+
+
+def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot:
+    try:
+        spec = mujoco.MjSpec.from_file(robot.model)
+    except ValueError as error:
+        rule = f"must be one of raytac's robots or an MJCF file that MuJoCo reads ({' '.join(str(error).split())})"
+        raise SpecError(rule, file=scene.source, key="robot.model", value=robot.model, choices=ROBOTS) from error
+    if not robot.mounts:
+        raise SpecError("a robot from a file needs a sensor", file=scene.source, key="robot.mount")
+    mounted = []
+    for i, mount in enumerate(robot.mounts):
+        placed = None if mount.position is None else pose_of(mount.position, mount.quaternion)
+        try:
+            kind = mount.kind if mount.kind in ("body", "site") else None
+            mounted.append(mount_sensor(spec, sensor, mount.at, placed, name=mount.name, kind=kind))  # type: ignore[arg-type]
+        except InputError as error:
+            key = f"robot.mount[{i}].{error.name if error.name in ('at', 'name', 'kind') else 'position_mm'}"
+            raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
+    return _Robot(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
+
+
+def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
+    body = scene.bodies[index]
+    try:
+        return object_parts(body)
+    except MeshError:
+        raise
+    except SpecError as error:
+        key = (error.key or "").replace("object", f"body[{index}]", 1)
+        raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
+
+
+def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool) -> None:
+    made = spec.worldbody.add_body(name=body.name, pos=body.position, quat=body.quaternion, mocap=mirrored)
+    free = body.dynamics == "free" and not mirrored
+    if free:
+        made.add_freejoint(name=f"{body.name}_free")
+    density = body.density
+    if free and body.mass is not None:
+        density = body.mass / _mass(parts)
+    friction = PAIR_FRICTION if body.friction is None else body.friction
+    for i, part in enumerate(parts):
+        geom = _add_geom(spec, made, part, f"{body.name}_{i}")
+        geom.density = density
+        geom.friction = (friction, 0.0, 0.0)
+        geom.priority = 1
+        rate, impedance = _HARD[0] / timestep, _HARD[1]
+        geom.solref, geom.solimp = (-(rate**2), -2.0 * rate), (impedance, impedance, 1e-3, 0.5, 2.0)
+        geom.rgba = (*(_COLOUR if body.colour is None else body.colour), 1.0)
+        if mirrored:
+            geom.contype, geom.conaffinity = 0, 0
+
+
+def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, name: str) -> mujoco.MjsGeom:
+    turn = np.empty(4)
+    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(part.object_from_part[:3, :3]).ravel())
+    place = {"name": name, "pos": part.object_from_part[:3, 3], "quat": turn}
+    if part.kind in _GEOMS:
+        size = _PLANE if part.kind == "plane" else (*part.size, 0.0, 0.0)[:3]
+        return body.add_geom(type=_GEOMS[part.kind], size=size, **place)
+    if part.kind == "mesh":
+        vertices, faces = part.vertices, part.faces
+    else:
+        from raytac.physics.part_surface import part_surface
+
+        surface = part_surface(part)
+        vertices, faces = surface.vertices, surface.faces
+    assert vertices is not None and faces is not None
+    spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel(), userface=np.asarray(faces, np.int32).ravel())
+    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **place)
+
+
+def _mass(parts: Sequence[Part]) -> float:
+    """Mass of a shape of density 1 as MuJoCo reckons it [kg]."""
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="body")
+    for i, part in enumerate(parts):
+        _add_geom(spec, body, part, f"g{i}").density = 1.0
+    return float(spec.compile().body("body").mass[0])
+
+
+def _composed(model: mujoco.MjModel, body: BodySpec, parts: tuple[Part, ...]) -> ComposedBody:
+    index = int(model.body(body.name).id)
+    joint = int(model.body_jntadr[index])
+    return ComposedBody(body, parts, index, int(model.body_mocapid[index]), -1 if joint < 0 else int(model.jnt_qposadr[joint]))
+
+
+def _start(
+    scene: TaskScene, model: mujoco.MjModel, arm: Arm | None, opening: int | None, bodies: dict[str, ComposedBody]
+) -> tuple[np.ndarray, np.ndarray]:
+    robot = scene.robot
+    start, ctrl = model.qpos0.copy(), np.zeros(model.nu)
+    if robot.keyframe is not None:
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
+        if robot.keyframe not in names:
+            rule = "must be a keyframe of the robot"
+            raise SpecError(rule, file=scene.source, key="robot.keyframe", value=robot.keyframe, choices=[n for n in names if n])
+        key = names.index(robot.keyframe)
+        start, ctrl = model.key_qpos[key].copy(), model.key_ctrl[key].copy()
+        for body in bodies.values():
+            if body.is_free:
+                start[body.qpos : body.qpos + 7] = *body.spec.position, *body.spec.quaternion
+    if arm is not None and robot.model in ("panda_one_sensor", "panda_two_fingers"):
+        joints = np.array(READY if robot.joints is None else robot.joints)
+        outside = (joints < arm.range[:, 0]) | (joints > arm.range[:, 1])
+        if outside.any():
+            i = int(np.flatnonzero(outside)[0])
+            low, high = np.degrees(arm.range[i])
+            rule = f"must be within {arm.joints[i]}'s [{low:.4g}, {high:.4g}] °"
+            raise SpecError(rule, file=scene.source, key=f"robot.joints_deg[{i}]", value=float(np.degrees(joints[i])))
+        start[arm.qpos] = joints
+    if opening is not None:
+        widest = float(model.actuator_ctrlrange[opening, 1])
+        gap = widest if robot.opening is None else robot.opening
+        if not 0.0 <= gap <= widest:
+            rule = f"must be in [0, {widest * 1e3:g}] mm, as wide as the gripper opens"
+            raise SpecError(rule, file=scene.source, key="robot.opening_mm", value=gap * 1e3)
+        ctrl[opening] = gap
+        tendon = int(model.actuator_trnid[opening, 0])
+        first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+        for joint in model.wrap_objid[first : first + count]:
+            start[model.jnt_qposadr[joint]] = gap / count
+    return start, ctrl

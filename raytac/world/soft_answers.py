@@ -1,0 +1,73 @@
+"""What a soft scene answers to MuJoCo after each of its steps: wrenches, and contacts with bounds of their stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from raytac.physics.soft_scene import SoftScene
+from raytac.world.coupling import FreePartner, Touching
+
+__all__ = ["Answer", "soft_answers"]
+
+Answer = tuple[np.ndarray, list[Touching], dict[str, FreePartner]]
+"""Wrenches (n, 6), contacts and partners of one environment, as ``Coupling.update`` takes them."""
+_HARD = 2e5
+"""Stiffness of contact between bodies without gel [N/m], as hard as a gel's whole face (a guess)."""
+
+
+def soft_answers(scene: SoftScene, links: Mapping[str, int]) -> list[Answer]:
+    """Answers of every environment after a step of ``scene``.
+
+    Args:
+        links: MuJoCo's body under the frame of every pad and driven body that MuJoCo moves, by name; the order is that of the
+            wrenches. Driven bodies left out stand still.
+    """
+    wrench = np.stack([scene.wrench(name) if name in scene.pads else scene.body_wrench(name) for name in links], axis=1)
+    pressing = scene.world.pressing()
+    bounds = {name: scene.stiffness(name) for name in scene.pads if any(name in pair for pair in pressing)}
+    free = {
+        name: _partners(scene, name)
+        for name, body in scene.bodies.items()
+        if not body.is_driven and any(name in p for p in pressing)
+    }
+    answers: list[Answer] = []
+    for b in range(scene.num_envs):
+        contacts = []
+        for (one, two), (force, place) in pressing.items():
+            size = float(np.linalg.norm(force[b]))
+            sides = [links.get(name, name if name in free else None) for name in (one, two)]
+            if size == 0.0 or sides == [None, None]:
+                continue
+            first, other, push = sides[0], sides[1], force[b]
+            if first is None:
+                first, other, push = sides[1], None, -force[b]
+            pads = [bounds[name][b] for name in (one, two) if name in bounds]
+            stiffness = _weakest(pads) if pads else np.diag([_HARD] * 3 + [0.0] * 3)
+            assert first is not None
+            contacts.append(Touching(first, stiffness, place[b], other, push))
+        answers.append((wrench[:, :][b], contacts, {name: partners[b] for name, partners in free.items()}))
+    return answers
+
+
+def _weakest(bounds: list[np.ndarray]) -> np.ndarray:
+    """Two pads against each other give way one after the other; one bound is enough, and safe."""
+    return min(bounds, key=np.trace)
+
+
+def _partners(scene: SoftScene, name: str) -> list[FreePartner]:
+    motion, gravity = scene.world.rigid_motion(name), scene.gravity
+    wrench = scene.body_wrench(name)
+    force = wrench[:, :3] + motion.mass * gravity
+    torque = wrench[:, 3:] + np.cross(scene.pose(name)[:, :3, 3] - motion.centre, wrench[:, :3])
+    return [
+        FreePartner(
+            motion.mass,
+            motion.inertia[b],
+            motion.centre[b],
+            np.concatenate([motion.velocity[b], motion.spin[b]]),
+            np.concatenate([force[b], torque[b]]),
+        )
+        for b in range(scene.num_envs)
+    ]

@@ -1,0 +1,317 @@
+"""Simulated pads in a MuJoCo world: one contact solver for all gels and what touches them, MuJoCo for robot and the rest.
+
+Every ``soft_timestep`` MuJoCo goes ahead with what the pads did to the robot, then the solver follows: cases and MuJoCo's bodies are led to
+where MuJoCo has them, what belongs to the solver moves by itself and is mirrored in MuJoCo as mocap bodies.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import mujoco
+import numpy as np
+
+import ipc
+from raytac.errors import SpecError
+from raytac.gel.part import Part
+from raytac.gel.surface import PadGrid
+from raytac.gel.traction import CoatTraction
+from raytac.physics.objects import object_parts
+from raytac.physics.pad_reading import PadReading
+from raytac.physics.part_surface import object_surface
+from raytac.physics.soft_bodies import SceneBody, scene_body
+from raytac.physics.soft_mesh import pad_mesh
+from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
+from raytac.robots.pose import pose, world_from_site
+from raytac.specs.task import PAIR_FRICTION, TaskScene
+from raytac.world.compose import ComposedScene, pose_of
+from raytac.world.coupling import Coupling
+from raytac.world.soft_answers import soft_answers
+from raytac.world.state import Controller, is_lost
+
+__all__ = ["SoftPads"]
+
+_TOUCH = 1e-5
+"""A vertex of a soft body so near to the body that holds it is held [m]."""
+_CELLS = 8
+"""Cells of a soft body along its longest edge where the scene does not say."""
+
+
+class SoftPads:
+    """All pads of a world, B environments, as one ``SoftScene``."""
+
+    def __init__(
+        self,
+        composed: ComposedScene,
+        datas: Sequence[mujoco.MjData],
+        *,
+        level: str,
+        coupling: str,
+        pitch: float,
+        device: str,
+    ) -> None:
+        """Put the pads of all environments into the solver where MuJoCo has them.
+
+        Args:
+            composed: the scene; ``datas``: its state in every environment.
+            level: how finely pads are cut, one of ``PADS``.
+            coupling: one of ``COUPLINGS``.
+            pitch: spacing of the grid that surfaces are read on [m].
+            device: of the solver.
+
+        Raises:
+            SpecError: a body that the solver cannot hold.
+            OverlapError: bodies overlap at the start.
+        """
+        self.composed, self.model = composed, composed.model
+        scene = composed.scene
+        pads = [
+            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), pitch)
+            for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
+        ]
+        self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
+        self._sites = [int(self.model.site(m.site).id) for m in composed.sensors]
+        self._own = [b for b in composed.bodies.values() if b.mocap >= 0]
+        """Bodies that belong to the solver."""
+        self._led = [b for b in composed.bodies.values() if b.is_free]
+        """Bodies that belong to MuJoCo."""
+        bodies = [_solver_body(scene, i) for i in range(len(scene.bodies))]
+        starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
+        self.soft = SoftScene(
+            pads,
+            bodies,
+            self._pad_poses(datas),
+            starts,
+            dt=scene.soft_timestep,
+            gravity=scene.gravity,
+            friction=_pair_friction(scene),
+            ignored=[(b.name, b.held_by) for b in scene.bodies if b.held_by is not None],
+            num_envs=len(datas),
+            device=device,
+        )
+        self._coupling = None
+        if coupling == "two_way":
+            felt = self._links + [b.index for b in self._led]
+            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._led)], felt, strict=True))
+            self._coupling = Coupling(self.model, felt, len(datas))
+        self._last_cases = self._pad_poses(datas)
+        self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
+        self._traction: dict[str, CoatTraction] = {}
+        self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
+        self.report: dict[str, np.ndarray] = {}
+
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
+        """Put environments back to the start: gels at rest, bodies where they began, no forces."""
+        self.soft.reset(list(envs))
+        cases = self._pad_poses(datas)
+        for b in envs:
+            self._last_cases[b] = cases[b]
+            for body in self._led:
+                self._last_led[body.spec.name][b] = pose_of(body.spec.position, body.spec.quaternion)
+            for wrench in self._wrench.values():
+                wrench[b] = 0.0
+            for values in self.report.values():
+                values[b] = 0
+            if self._coupling is not None:
+                self._coupling.reset(b, datas[b])
+            self._mirror(datas, [b])
+
+    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
+
+        Raises:
+            InputError: a motion too fast to be resolved near something that it may touch; the world must be reset then.
+        """
+        scene = self.composed.scene
+        interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
+        steps = round(scene.control_timestep / scene.timestep)
+        for step in range(1, steps + 1):
+            for b, data in enumerate(datas):
+                if not failed[b]:
+                    failed[b] = not self._ahead(data, b, controllers[b])
+            since += 1
+            cases, led = self._now(datas, failed)
+            # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
+            early = (
+                self._coupling is not None
+                and since < interval
+                and step < steps
+                and not self.soft.is_small(cases, led, since * scene.timestep)
+            )
+            if since == interval or step == steps or early:
+                reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
+                since = 0
+        self.report = _joined(reports)
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Names of all that the solver has a surface of."""
+        return (*self.soft.pads, *(name for name, body in self.soft.bodies.items() if not isinstance(body.solid, ipc.HalfSpace)))
+
+    def wrench(self, name: str) -> np.ndarray:
+        """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
+        return self._wrench[name].copy()
+
+    def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
+        """Surface and forces of one sensor, for all environments."""
+        reading = self.soft.reading(name)
+        wrench = np.where(failed[:, None], np.nan, self._wrench[name])
+
+        def traction() -> np.ndarray:
+            if name not in self._traction:
+                self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
+            return self._traction[name](reading.forces)
+
+        return PadReading(reading.surface, wrench, failed.copy(), traction)
+
+    def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
+        """None: the solver refuses a start in which bodies overlap."""
+        return []
+
+    def _ahead(self, data: mujoco.MjData, b: int, control: Controller) -> bool:
+        """One step of MuJoCo; returns whether the state is still sound."""
+        mujoco.mj_step1(self.model, data)
+        control(data, float(data.time))
+        if self._coupling is not None:
+            self._coupling.apply(data, b)
+        mujoco.mj_step2(self.model, data)
+        if is_lost(data):
+            return False
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        return True
+
+    def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Where MuJoCo has cases and its own bodies; an environment that failed stays where it was last."""
+        cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
+        led = {}
+        for body in self._led:
+            at = np.stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in datas])
+            led[body.spec.name] = np.where(failed[:, None, None], self._last_led[body.spec.name], at)
+        return cases, led
+
+    def _follow(
+        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, led: dict[str, np.ndarray], dt: float
+    ) -> SceneReport:
+        """The solver's step to where MuJoCo is now."""
+        report = self.soft.step(cases, led, dt)
+        self._last_cases, self._last_led = cases, led
+        failed |= report.failed
+        alive = np.flatnonzero(~failed)
+        self._mirror(datas, alive)
+        if self._coupling is not None:
+            answers = soft_answers(self.soft, self._felt)
+            for b in alive:
+                self._coupling.update(datas[b], b, *answers[b])
+        for k, mounted in enumerate(self.composed.sensors):
+            turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
+            split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
+            self._wrench[mounted.name] = np.concatenate(split, axis=1)
+        return report
+
+    def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
+        """Show MuJoCo where the solver has its bodies."""
+        for body in self._own:
+            poses = self.soft.pose(body.spec.name)
+            for b in envs:
+                datas[b].mocap_pos[body.mocap] = poses[b, :3, 3]
+                mujoco.mju_mat2Quat(datas[b].mocap_quat[body.mocap], np.ascontiguousarray(poses[b, :3, :3]).ravel())
+        if self._own:
+            for b in envs:
+                mujoco.mj_kinematics(self.model, datas[b])
+
+    def _pad_poses(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
+        """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
+        return np.stack([np.stack([world_from_site(data, site) for site in self._sites]) for data in datas])
+
+
+def _solver_body(scene: TaskScene, index: int) -> SceneBody:
+    body = scene.bodies[index]
+    parts = object_parts(body)
+    if body.kind == "plane":
+        return scene_body(body.name, (), "half_space", friction=body.friction)
+    if body.dynamics == "fixed" or (body.dynamics == "free" and body.owner == "mujoco"):
+        return scene_body(body.name, parts, "kinematic", friction=body.friction)
+    if body.dynamics == "free":
+        density = body.density if body.mass is None else body.mass / _volume(parts)
+        return scene_body(body.name, parts, "affine", density=density, friction=body.friction)
+    held = None if body.held_by is None else _holder(scene, index)
+    low, high = _extent(parts)
+    return scene_body(
+        body.name,
+        parts,
+        "soft",
+        density=body.density,
+        youngs_modulus=body.youngs_modulus,
+        poisson_ratio=body.poisson_ratio,
+        cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
+        held=held,
+        friction=body.friction,
+    )
+
+
+def _pair_friction(scene: TaskScene) -> dict[tuple[str, str], float]:
+    """Between bodies the larger of both, as MuJoCo has it; with pads the solver's own rule."""
+    known = {b.name: PAIR_FRICTION if b.friction is None else b.friction for b in scene.bodies}
+    return {(a, b): max(known[a], known[b]) for a, b in combinations(known, 2)}
+
+
+def _extent(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
+    vertices = object_surface(parts).vertices
+    return vertices.min(axis=0), vertices.max(axis=0)
+
+
+def _volume(parts: Sequence[Part]) -> float:
+    """Of the surface that the solver gives a body [m³]."""
+    surface = object_surface(parts)
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Which vertices (n, 3) of a soft body, in its frame, are held by the fixed body that it names."""
+    body = scene.bodies[index]
+    fixed = scene.body(str(body.held_by))
+    fixed_from_body = np.linalg.inv(pose_of(fixed.position, fixed.quaternion)) @ pose_of(body.position, body.quaternion)
+    parts = object_parts(fixed)
+    known = ("plane", "box", "sphere", "cylinder")
+    for part in parts:
+        if part.kind not in known:
+            rule = "cannot hold a soft body: its shape must be made of these"
+            raise SpecError(rule, file=scene.source, key=f"body[{index}].held_by", value=fixed.name, choices=known)
+
+    def held(vertices: np.ndarray) -> np.ndarray:
+        inside = np.zeros(len(vertices), bool)
+        for part in parts:
+            to_part = np.linalg.inv(part.object_from_part) @ fixed_from_body
+            inside |= _inside(part, vertices @ to_part[:3, :3].T + to_part[:3, 3])
+        return inside
+
+    return held
+
+
+def _inside(part: Part, at: np.ndarray) -> np.ndarray:
+    """Whether points (n, 3), part frame, lie in a part or within ``_TOUCH`` of it."""
+    if part.kind == "plane":
+        return np.asarray(at[:, 2] <= _TOUCH)
+    if part.kind == "box":
+        return np.all(np.abs(at) <= np.asarray(part.size) + _TOUCH, axis=1)
+    if part.kind == "sphere":
+        return np.linalg.norm(at, axis=1) <= part.size[0] + _TOUCH
+    return (np.hypot(at[:, 0], at[:, 1]) <= part.size[0] + _TOUCH) & (np.abs(at[:, 2]) <= part.size[1] + _TOUCH)
+
+
+def _joined(reports: Sequence[SceneReport]) -> dict[str, np.ndarray]:
+    """One report of several steps."""
+    return {
+        "min_gap": np.min([r.min_gap for r in reports], axis=0),
+        "min_det": np.min([r.min_det for r in reports], axis=0),
+        "blocked": np.max([r.blocked for r in reports], axis=0),
+        "converged": np.all([r.converged for r in reports], axis=0),
+        "newton": np.sum([r.newton for r in reports], axis=0),
+        "substeps": np.full(len(reports[0].failed), sum(r.substeps for r in reports)),
+    }

@@ -1,0 +1,48 @@
+"""What a world is like after a step, and how it is steered."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+__all__ = ["Control", "Controller", "WorldState", "is_lost"]
+
+_LARGEST_SPEED = 1e4
+"""Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
+
+Controller = Callable[[mujoco.MjData, float], None]
+"""Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
+and bias forces are up to date."""
+Control = Controller | Sequence[Controller] | np.ndarray
+"""One controller for all environments, one for each, or constant controls (nu,) or (B, nu)."""
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """B environments at one instant, world frame unless said otherwise. An environment that failed holds NaN."""
+
+    time: np.ndarray
+    """Since the reset [s], shape (B,)."""
+    joints: np.ndarray | None
+    """Positions of the arm's joints [rad or m], shape (B, n); None without an arm."""
+    world_from_pad: dict[str, np.ndarray]
+    """Pose (B, 4, 4) of every sensor's pad frame."""
+    world_from_body: dict[str, np.ndarray]
+    """Pose (B, 4, 4) of every rigid body."""
+    wrench: dict[str, np.ndarray]
+    """Force of what touches on each pad [N] and its torque about the pad frame's origin [N m], **pad frame**, shape (B, 6)."""
+    failed: np.ndarray
+    """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
+    report: dict[str, np.ndarray] = field(default_factory=dict)
+    """What the pads' solver says of this step, each (B,); empty with the rigid pad."""
+
+
+def is_lost(data: mujoco.MjData) -> bool:
+    """Whether a state of MuJoCo is beyond use: a number is not finite, or a joint runs away."""
+    return not ((np.abs(data.qvel) < _LARGEST_SPEED).all() and np.isfinite(data.qpos).all())

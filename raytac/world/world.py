@@ -1,0 +1,279 @@
+"""``TactileWorld``: a task scene, stepped by MuJoCo with its pads, and read by tactile sensors."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from raytac.device import resolve_device
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
+from raytac.markers.contacts import chosen_envs
+from raytac.physics.solver import check_solver
+from raytac.robots.arm import Arm
+from raytac.robots.impedance import JointImpedance
+from raytac.robots.pose import pose
+from raytac.sensor import TactileSensor
+from raytac.sensor.options import check_physics, check_whole
+from raytac.specs.press import PADS
+from raytac.specs.task import COUPLINGS, TaskScene
+from raytac.specs.task_file import load_task
+from raytac.world.compose import compose
+from raytac.world.rigid_pads import RigidPads
+from raytac.world.state import Control, Controller, WorldState
+
+if TYPE_CHECKING:
+    from raytac.world.soft_pads import SoftPads
+
+__all__ = ["TactileWorld"]
+
+_OVERLAP = 1e-4
+"""How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
+
+
+class TactileWorld:
+    """A robot with tactile sensors among bodies; B environments of one model.
+
+    .. code-block:: python
+
+        world = TactileWorld("ball_rolling", markers="fots", optics="taxim")
+        for _ in range(100):
+            state = world.step(world.hold)
+        frame = world.observe()["sensor"]  # only now are images and markers computed
+
+    Attributes:
+        scene: the task scene.
+        physics: ``rigid`` or ``ipc``.
+        model, data: MuJoCo's model, and its state in every environment.
+        arm: the joints that move the robot's site; None without.
+        composed: names and indices of what the scene is made of.
+    """
+
+    def __init__(
+        self,
+        scene: str | Path | TaskScene,
+        *,
+        physics: str | None = None,
+        pad: str | None = None,
+        coupling: str | None = None,
+        outputs: Sequence[str] | str = ("rgb", "wrench"),
+        markers: str | None = None,
+        optics: str = "raytrace",
+        resolution: tuple[int, int] | str | None = None,
+        num_envs: int = 1,
+        device: str = "auto",
+        seed: int = 0,
+        sensor_options: dict[str, Any] | None = None,
+    ) -> None:
+        """Compose the scene and put it at its start; sensors are made when they are asked for.
+
+        Args:
+            scene: name of a shipped task scene, path of a scene file, or a scene.
+            physics: ``rigid`` or ``ipc``; None is as the scene says, else ``rigid``.
+            pad: how finely a simulated pad is cut, one of ``PADS``; None is as the scene says, else ``coarse``.
+            coupling: ``two_way`` or ``one_way``; None is as the scene says. The rigid pad acts both ways always.
+            outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
+            num_envs: number of environments B.
+            seed: of every random number.
+            sensor_options: further keyword arguments of ``TactileSensor``, such as ``integrator``.
+
+        Raises:
+            InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses.
+            SpecError: the scene breaks a rule.
+            BackendError: the solver or a renderer is not installed.
+        """
+        check_physics(physics, pad)
+        check_whole("num_envs", num_envs)
+        if coupling is not None and coupling not in COUPLINGS:
+            raise InputError("coupling", value=coupling, rule="must be a known coupling", choices=COUPLINGS)
+        self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
+        self.physics = physics or ("ipc" if pad is not None else self.scene.physics or "rigid")
+        self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]
+        self.coupling = coupling or self.scene.coupling
+        self.num_envs, self.device, self.seed = num_envs, device, seed
+        self._sensor_settings: dict[str, Any] = {
+            "outputs": outputs,
+            "markers": markers,
+            "optics": optics,
+            "resolution": resolution,
+            "device": device,
+            "num_envs": num_envs,
+            "physics": self.physics,
+            **(sensor_options or {}),
+        }
+        self._sensors: dict[str, TactileSensor] = {}
+        self.composed = compose(self.scene, self.physics)
+        self.model = self.composed.model
+        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        self.arm: Arm | None = self.composed.arm
+        self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
+        self._failed = np.zeros(num_envs, bool)
+        self._start_over(range(num_envs))
+        self._pads = self._make_pads()
+        self._check_start()
+
+    def _make_pads(self) -> RigidPads | SoftPads:
+        if self.physics == "rigid":
+            return RigidPads(self.composed, self.num_envs)
+        check_solver("physics='ipc'")
+        from raytac.world.soft_pads import SoftPads
+
+        return SoftPads(
+            self.composed,
+            self.data,
+            level=self.pad,
+            coupling=self.coupling,
+            pitch=self.sensors[self.sensor_names[0]].pitch,
+            device=resolve_device(self.device, ray_tracing=False),
+        )
+
+    @property
+    def sensors(self) -> dict[str, TactileSensor]:
+        """Every sensor by its name, made on first use."""
+        for i, (mounted, spec) in enumerate(zip(self.composed.sensors, self.composed.sensor_specs, strict=True)):
+            if mounted.name not in self._sensors:
+                self._sensors[mounted.name] = TactileSensor(spec, seed=self.seed + i, **self._sensor_settings)
+        return self._sensors
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensors; asking for them makes none."""
+        return tuple(mounted.name for mounted in self.composed.sensors)
+
+    def reset(self, envs: np.ndarray | list[int] | None = None) -> WorldState:
+        """Put environments (a mask (B,), a list, or None for all) back to the start: joints, bodies, pads, markers and time.
+
+        Raises ``InputError`` for an environment that does not exist.
+        """
+        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        self._start_over(chosen)
+        self._pads.reset(chosen, self.data)
+        for sensor in self._sensors.values():
+            if sensor.markers is not None:
+                sensor.reset_markers(chosen)
+        return self.state()
+
+    def _start_over(self, envs: Iterable[int]) -> None:
+        """MuJoCo's part of a reset."""
+        for b in envs:
+            data = self.data[b]
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
+            mujoco.mj_forward(self.model, data)
+            self._failed[b] = False
+
+    def step(self, control: Control | None = None) -> WorldState:
+        """Advance every environment by ``scene.control_timestep``.
+
+        Args:
+            control: how the actuators are driven (see ``Control``); None is ``hold``.
+
+        Raises:
+            InputError: controls of the wrong shape or number, or not finite.
+        """
+        self._pads.advance(self.data, self._controllers(self.hold if control is None else control), self._failed)
+        return self.state()
+
+    def hold(self, data: mujoco.MjData, time: float) -> None:
+        """The controller that keeps the robot where it starts."""
+        data.ctrl[:] = self.composed.ctrl
+        if self._law is not None and self.arm is not None:
+            self.arm.drive(data, self._law.torque(data, self.composed.start[self.arm.qpos]).torque)
+
+    def state(self) -> WorldState:
+        """What the world is like now."""
+        arm, names = self.arm, self.composed.bodies
+        lost = self._failed
+        pads = {m.name: _stack([m.world_from_pad(d) for d in self.data], lost) for m in self.composed.sensors}
+        bodies = {
+            name: _stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in self.data], lost)
+            for name, body in names.items()
+        }
+        joints = None if arm is None else _stack([d.qpos[arm.qpos] for d in self.data], lost)
+        wrench = {name: np.where(lost[:, None], np.nan, self._pads.wrench(name)) for name in self.sensor_names}
+        return WorldState(
+            np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
+        )
+
+    def observe(self, sensors: Sequence[str] | None = None) -> dict[str, TactileFrame]:
+        """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
+
+        Markers that follow a contact's history (``fots``) see only what is observed: call it every control step if they are asked for.
+
+        Raises:
+            InputError: an unknown sensor; as ``TactileSensor.update``.
+        """
+        chosen = self.sensor_names if sensors is None else tuple(sensors)
+        for name in chosen:
+            if name not in self.sensor_names:
+                raise InputError("sensors", value=name, rule="must be a sensor of the scene", choices=self.sensor_names)
+        frames = {}
+        for name in chosen:
+            sensor = self.sensors[name]
+            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
+        return frames
+
+    def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of a body or of a simulated pad as it is: vertices (B, n, 3) [m], world frame, and faces (F, 3).
+
+        Raises ``InputError`` for a name that is not there, or a half-space, which has no end.
+        """
+        if self.physics == "ipc" and name in self._pads.meshes:  # type: ignore[union-attr]
+            return self._pads.soft.mesh(name)  # type: ignore[union-attr]
+        body = self.composed.bodies.get(name)
+        if body is None or body.spec.kind == "plane":
+            there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
+            there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
+            rule = "must be the name of a body or a simulated pad, and no half-space"
+            raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
+        from raytac.physics.part_surface import object_surface
+
+        surface = object_surface(body.parts)
+        poses = self.state().world_from_body[name]
+        return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
+
+    def _controllers(self, control: Control) -> list[Controller]:
+        if isinstance(control, np.ndarray):
+            values = np.asarray(control, float)
+            if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
+                rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
+                raise InputError("control", value=values.shape, rule=rule)
+            return [_constant(row) for row in np.broadcast_to(values, (self.num_envs, self.model.nu))]
+        if callable(control):
+            return [control] * self.num_envs
+        if len(control) != self.num_envs:
+            raise InputError("control", value=len(control), rule=f"must be one controller, or one for each of {self.num_envs}")
+        return list(control)
+
+    def _check_start(self) -> None:
+        """Refuse a start in which bodies overlap."""
+        data, model = self.data[0], self.model
+        for contact in data.contact[: data.ncon]:
+            if contact.dist < -_OVERLAP:
+                names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
+                rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
+                raise InputError("bodies", value=tuple(names), rule=rule)
+        for sensor, body, depth in self._pads.overlap(data):
+            if depth > _OVERLAP:
+                rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
+                raise InputError("body", value=body, rule=rule)
+
+
+def _constant(values: np.ndarray) -> Controller:
+    def write(data: mujoco.MjData, time: float) -> None:
+        data.ctrl[:] = values
+
+    return write
+
+
+def _stack(rows: list[np.ndarray], failed: np.ndarray) -> np.ndarray:
+    stacked = np.stack(rows).astype(float)
+    stacked[failed] = np.nan
+    return stacked

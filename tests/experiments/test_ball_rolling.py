@@ -1,0 +1,24 @@
+"""The ball reaches its goal by touch, rolls half as far as the pad, and stays under it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from experiments.ball_rolling import Args, main
+from raytac.io.metrics import read_metrics
+
+
+def test_a_short_stroke_with_the_rigid_pad(tmp_path: Path) -> None:
+    main(Args(physics=("rigid",), quick=True, out=tmp_path / "run"))
+    found = read_metrics(tmp_path / "run" / "metrics.json")
+
+    def value(key: str) -> float:
+        return float(found[f"ball_rolling.rigid.{key}"])
+
+    assert value("goals_reached") == value("goals") == 1
+    assert value("goal_error_mm") < 1.0 and value("ball_off_pad_centre_max_mm") < 5.5
+    # Between two parallel planes a ball that slips on neither goes exactly half as far; the dome and the dent take a little off.
+    assert value("ball_over_pad_way") == pytest.approx(0.5, abs=0.03)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"metrics.json", "rigid.png", "rigid.gif", "rigid_strip.png"}

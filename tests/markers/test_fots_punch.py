@@ -1,0 +1,198 @@
+"""The punch form of FOTS: an independent loop, the closed forms of contact mechanics, and what every frame of reference must agree on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.gel.surface import PadGrid
+from raytac.markers.calibration import PUBLISHED, model_errors
+from raytac.markers.contacts import ContactCells
+from raytac.optics.marker_motion import FotsConstants, FotsKernel
+from raytac.specs import PunchSpec, SensorSpec
+from tests.markers.pads import MOTION, fots_presses
+
+NU = 0.48
+HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e9)
+"""An elastic half-space on which nothing slips."""
+PAD = PunchSpec(0.7, 6e-3, 1e3)
+PLACES = np.random.default_rng(0).uniform(-8e-3, 8e-3, (200, 2))
+
+
+def moved(
+    grid: PadGrid,
+    punch: PunchSpec | None,
+    contacts: list[tuple[float, ...]],
+    markers: np.ndarray = PLACES,
+    *,
+    gain: float = 0.0,
+    depth: np.ndarray | None = None,
+) -> np.ndarray:
+    """Markers (M, 2) moved by contacts (G_x, G_y, Δs_x, Δs_y, Δθ, T_xx, T_xy, T_yy, h̄), by the kernel."""
+    cells = ContactCells.over(grid)
+    kernel = FotsKernel(cells.x, cells.y, device="cpu")
+    table = np.array(contacts)[None]
+    parts = np.ones(table.shape[:2], bool), table[..., :2], table[..., 2:4], table[..., 4], table[..., 5:8], table[..., 8]
+    nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
+    samples = nothing if depth is None else depth[None].astype(np.float32)
+    box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
+    constants = FotsConstants(gain, 1e5, 0.8e5, 1e-3, 1.2e5, 0.5, punch)
+    return kernel.displacement(markers[None], samples, box, parts, constants)[0].astype(float)
+
+
+def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, gain: float, depth: np.ndarray) -> np.ndarray:
+    """Contact by contact, marker by marker and cell by cell, with the confocal coordinate by bisection."""
+    cells, found = ContactCells.over(grid), []
+    for mx, my in PLACES:
+        shears, twists, es, et = np.zeros(2), np.zeros(2), 0.0, 0.0
+        for gx, gy, sx, sy, theta, xx, xy, yy, mean in contacts:
+            shape = np.array([[xx, xy], [xy, yy]])
+            radius = np.linalg.det(shape) ** 0.25
+            way, most = np.array([sx, sy]), punch.slip * mean * radius
+            if np.hypot(*way) > most:
+                way = way * most / np.hypot(*way)
+            x = np.array([mx, my]) - (np.array([gx, gy]) - way)
+            low, high = 0.0, float(x @ x)
+            for _ in range(80):
+                middle = 0.5 * (low + high)
+                if x @ np.linalg.solve(shape + middle * np.eye(2), x) > 1:
+                    low = middle
+                else:
+                    high = middle
+            r = math.sqrt(radius**2 + low)
+            t = radius / r
+            g = t * math.sqrt(max(1 - t * t, 0.0))
+            fade = math.exp(-(r - radius) / punch.reach)
+            hat = x / max(np.hypot(*x), 1e-12)
+            shears += (
+                2 / math.pi * fade * ((math.asin(t) - punch.anisotropy * g) * way + 2 * punch.anisotropy * g * hat * (hat @ way))
+            )
+            es += 2 / math.pi * fade * math.asin(t)
+            widest = 9 * math.pi / 32 / 1.5 * most / radius
+            theta = min(max(theta, -widest), widest)
+            w = 2 / math.pi * (math.asin(t) - g)
+            twists += w * np.array(
+                [math.cos(theta) * x[0] - math.sin(theta) * x[1] - x[0], math.sin(theta) * x[0] + math.cos(theta) * x[1] - x[1]]
+            )
+            et += w
+        drag = shears / max(1.0, es) + twists / max(1.0, et)
+        total = drag.copy()
+        for j, i in zip(*np.nonzero(depth), strict=True):
+            e = np.array([mx, my]) + drag - (cells.x[i], cells.y[j])
+            total += gain * cells.area * depth[j, i] * e * math.exp(-1e5 * (e @ e))
+        found.append(total)
+    return np.array(found)
+
+
+def disc(radius: float, *, way: tuple[float, float] = (0.0, 0.0), twist: float = 0.0, mean: float = 3e-4) -> tuple[float, ...]:
+    """A round contact about the origin, where the skin was at rest."""
+    return way[0], way[1], *way, twist, radius**2, 0.0, radius**2, mean
+
+
+def test_it_equals_a_loop(grid: PadGrid) -> None:
+    contacts = [
+        (1e-3, -5e-4, 3e-4, -4e-4, -0.15, 9e-6, 3e-6, 2.5e-6, 3e-4),
+        (-3e-3, 2e-3, -5e-4, 6e-4, 0.6, 1e-6, 0.0, 1e-6, 1.5e-4),  # past its slip, sideways and around
+    ]
+    cells = ContactCells.over(grid)
+    depth = np.where((cells.x[None] - 1e-3) ** 2 + (cells.y[:, None] + 5e-4) ** 2 < 4e-6, 3e-4, 0.0)
+    expected = by_loop(PAD, contacts, grid, 2e8, depth)
+    assert np.linalg.norm(expected, axis=1).max() > 3e-4
+    np.testing.assert_allclose(moved(grid, PAD, contacts, gain=2e8, depth=depth), expected, atol=2e-8)
+
+
+def test_under_the_contact_the_skin_is_the_object(grid: PadGrid) -> None:
+    """Shear: as far as the object; twist: a rotation, no linear cross product, at 0.5 rad."""
+    inside = PLACES[np.linalg.norm(PLACES, axis=1) < 3e-3]
+    assert len(inside) > 10
+    still = PunchSpec(0.7, 6e-3, 1e5)
+    way = (3e-4, -2e-4)
+    np.testing.assert_allclose(moved(grid, still, [disc(3.4e-3, way=way)], inside), np.tile(way, (len(inside), 1)), atol=1e-9)
+    c, s = math.cos(0.5), math.sin(0.5)
+    turned = inside @ np.array([[c, s], [-s, c]]) - inside
+    np.testing.assert_allclose(moved(grid, still, [disc(3.4e-3, twist=0.5)], inside), turned, atol=2e-9)
+
+
+def test_far_away_it_is_the_point_load_of_cerruti(grid: PadGrid) -> None:
+    """u = F / (2π G r) ((1 − ν) s + ν x̂ (x̂ · s)), with the force of the disc, F = 8 G A Δs / (2 − ν) (Johnson §3.2, 3.6)."""
+    radius, way = 0.4e-3, np.array([2e-4, 1e-4])
+    far = PLACES[np.linalg.norm(PLACES, axis=1) > 5e-3]
+    r = np.linalg.norm(far, axis=1, keepdims=True)
+    hat = far / r
+    point = 8 * radius / (2 - NU) / (2 * math.pi * r) * ((1 - NU) * way + NU * hat * (hat @ way)[:, None])
+    found = moved(grid, HALF_SPACE, [disc(radius, way=(way[0], way[1]))], far)
+    np.testing.assert_allclose(found, point, atol=0.01 * np.linalg.norm(point, axis=1).max())
+
+
+def test_far_away_a_twist_is_the_couple_on_a_point(grid: PadGrid) -> None:
+    """u_θ = T / (4π G r²) with T = 16/3 G A³ Δθ (Reissner and Sagoci)."""
+    radius, angle = 0.8e-3, 0.05
+    far = PLACES[np.linalg.norm(PLACES, axis=1) > 6e-3]
+    r = np.linalg.norm(far, axis=1)
+    found = moved(grid, HALF_SPACE, [disc(radius, twist=angle)], far)
+    around = (found * np.stack([-far[:, 1], far[:, 0]], axis=1)).sum(axis=1) / r
+    np.testing.assert_allclose(around, 16 / 3 * radius**3 * angle / (4 * math.pi * r**2), rtol=0.02)
+
+
+def test_turning_the_load_turns_the_field(grid: PadGrid) -> None:
+    c, s = math.cos(0.9), math.sin(0.9)
+    turn = np.array([[c, -s], [s, c]])
+    way, shape = np.array([4e-4, 1e-4]), np.diag((9e-6, 1e-6))
+    turned_way, turned_shape = turn @ way, turn @ shape @ turn.T
+
+    def field(way: np.ndarray, shape: np.ndarray, markers: np.ndarray) -> np.ndarray:
+        return moved(grid, PAD, [(*way, *way, 0.1, shape[0, 0], shape[0, 1], shape[1, 1], 3e-4)], markers)
+
+    plain = field(way, shape, PLACES)
+    assert np.linalg.norm(plain, axis=1).max() > 3e-4
+    np.testing.assert_allclose(field(turned_way, turned_shape, PLACES @ turn.T), plain @ turn.T, atol=3e-9)
+    # Without it: a sheared disc alone already moves farther along than across.
+    assert np.abs(field(turned_way, shape, PLACES @ turn.T) - plain @ turn.T).max() > 1e-5
+
+
+@pytest.mark.parametrize("punch", [None, PAD, replace(PAD, anisotropy=0.0), replace(PAD, slip=0.0)])
+def test_no_load_moves_nothing(punch: PunchSpec | None, grid: PadGrid) -> None:
+    """Also a marker at the very centre, a touch of no depth, and a contact of one cell."""
+    markers = np.concatenate([PLACES, np.zeros((1, 2))])
+    for contact in (disc(2e-3), disc(2e-3, mean=0.0), disc(1e-5)):
+        assert not moved(grid, punch, [contact], markers).any()
+    sheared = moved(grid, punch, [disc(2e-3, way=(1e-12, 0.0), twist=1e-12)], markers)
+    assert np.isfinite(sheared).all() and np.abs(sheared).max() < 2e-12
+    large = moved(grid, punch, [disc(2e-3, way=(1e-3, 0.0), twist=1.0)], markers)
+    assert np.isfinite(large).all()
+
+
+def test_it_stops_where_it_slips(grid: PadGrid) -> None:
+    """Way up to c h̄ A, and half of that at half the indentation; a spin likewise."""
+    centre = np.zeros((1, 2))
+    for mean, most in ((3e-4, 6e-4), (1.5e-4, 3e-4)):
+        for way, followed in ((0.5 * most, 0.5 * most), (most, most), (2 * most, most)):
+            contact = (way, 0.0, way, 0.0, 0.0, 4e-6, 0.0, 4e-6, mean)
+            assert moved(grid, PAD, [contact], centre)[0, 0] == pytest.approx(followed, rel=1e-5)
+        edge = np.array([[1.9e-3, 0.0]])
+        spun = [np.linalg.norm(moved(grid, PAD, [disc(2e-3, twist=t, mean=mean)], edge)) for t in (0.05, 0.8, 1.6)]
+        assert spun[0] == pytest.approx(2 * math.sin(0.025) * 1.9e-3, rel=1e-4) and spun[1] == pytest.approx(spun[2], rel=1e-6)
+        assert spun[1] == pytest.approx(2 * math.sin(0.5 * 3 * math.pi / 16 * most / 2e-3) * 1.9e-3, rel=1e-4)
+
+
+def test_alike_in_all_directions_and_as_published(grid: PadGrid) -> None:
+    """κ = 0 moves all markers along the shear; without the punch the published Gaussians come out to rounding."""
+    way, contact = np.array([3e-4, 1e-4]), disc(2e-3, way=(3e-4, 1e-4))
+    even = moved(grid, replace(PAD, anisotropy=0.0), [contact])
+    assert np.abs(even[:, 0] * way[1] - even[:, 1] * way[0]).max() < 1e-12 and np.abs(even).max() > 2e-4
+    r2 = (PLACES**2).sum(axis=1)
+    np.testing.assert_allclose(moved(grid, None, [contact]), np.exp(-0.8e5 * r2)[:, None] * way, atol=1e-10)
+
+
+def test_errors_of_the_published_form_are_those_without_the_punch(sensor: SensorSpec, grid: PadGrid) -> None:
+    with_punch = replace(sensor, marker_motion=replace(MOTION, punch=PAD))
+    frames = fots_presses(with_punch, grid)
+    errors, times = model_errors(with_punch, frames, grid, models=("fots", PUBLISHED), device="cpu")
+    plain, _ = model_errors(sensor, frames, grid, models=("fots",), device="cpu")
+    by = {(e.model, e.load): e.mean for e in errors}
+    for row in plain:
+        assert by[PUBLISHED, row.load] == row.mean
+    assert by["fots", "shear"] < 0.1 * by[PUBLISHED, "shear"] and set(times) == {"surface", "fots", PUBLISHED}

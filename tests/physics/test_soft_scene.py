@@ -1,0 +1,139 @@
+"""Soft scenes: several pads and bodies, driven by poses; contact seen by each pad; motions cut where they must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError, OverlapError
+from raytac.gel.part import primitive
+from raytac.physics.soft_approach import STEP, Mover, allowed_share
+from raytac.physics.soft_bodies import scene_body
+from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.soft_scene import ScenePad, SoftScene
+from raytac.specs import load_sensor
+
+SENSOR = load_sensor("gelsight_mini")
+MESH = pad_mesh(SENSOR.gelpad, PadLevel(3e-3, 2, 1.5, 1.5, 5e-5))
+HALF = 5e-3
+LEFT = np.column_stack([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+RIGHT = np.column_stack([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+
+
+def pose(rotation=None, position=(0.0, 0.0, 0.0)):
+    matrix = np.eye(4)
+    if rotation is not None:
+        matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    return matrix
+
+
+def fingers(gap, z=0.0, x=0.0):
+    """Two pads that look at each other along y, their middles ``gap`` off the faces of a cube of 10 mm."""
+    return np.stack([pose(LEFT, (x, -HALF - gap, z)), pose(RIGHT, (x, HALF + gap, z))])
+
+
+def two_pads(kind="affine", mass=0.01, gravity=(0.0, 0.0, 0.0), num_envs=None, gap=0.2e-3, **settings):
+    cube = scene_body("cube", (primitive("box", (HALF,) * 3),), kind, density=mass / (2 * HALF) ** 3, **settings)
+    pads = [ScenePad("left", SENSOR, MESH), ScenePad("right", SENSOR, MESH)]
+    return SoftScene(pads, [cube], fingers(gap), {"cube": np.eye(4)}, gravity=gravity, num_envs=num_envs)
+
+
+def test_a_cube_between_two_pads_is_pressed_by_both_alike_and_seen_by_each():
+    scene = two_pads()
+    for gap in (0.1e-3, 0.0, -0.1e-3, -0.1e-3):
+        report = scene.step(fingers(gap))
+    assert report.converged.all() and not report.failed.any() and report.min_gap[0] > 0.0 and report.min_det[0] > 0.5
+    left, right = scene.wrench("left")[0], scene.wrench("right")[0]
+    assert left[1] < -1.0 and left[:3] == pytest.approx(-right[:3], abs=2e-3 * abs(left[1]))
+    assert np.abs(scene.body_wrench("cube")[0, :3] + left[:3] + right[:3]).max() < 1e-6 * abs(left[1])
+    for name in ("left", "right"):
+        bond = scene.bond_wrench(name)[0]
+        assert bond[:3] == pytest.approx(scene.wrench(name)[0, :3], abs=0.01 * abs(left[1]))
+        reading = scene.reading(name)
+        touched = reading.surface.contact[0]
+        assert touched.sum() * 1e-8 == pytest.approx((2 * HALF) ** 2, rel=0.3)
+        assert reading.forces[0, :, 2].sum() == pytest.approx(-abs(left[1]), rel=1e-3)
+        # The flat face is shown where the coat is, and at the pose that the reading names.
+        assert np.abs(reading.underside[0] - reading.surface.height[0])[touched].max() < 2e-5
+
+
+def test_travel_through_the_air_leaves_pads_as_they_are():
+    """Far from everything one step may go any way; the gel keeps its shape but for its own inertia."""
+    scene = two_pads(gap=5e-3)
+    rest = scene.coat("left")
+    away = fingers(5e-3, z=0.3, x=-0.1)
+    report = scene.step(away)
+    assert report.substeps == 1 and scene.pose("left")[0] == pytest.approx(away[0], abs=1e-12)
+    for _ in range(5):
+        scene.step(away)
+    assert np.abs(scene.coat("left") - rest).max() < 1e-7
+
+
+def test_a_fast_approach_is_cut_and_a_too_fast_one_refused_before_anything_moves():
+    scene = two_pads(kind="kinematic", gap=1e-3, friction=0.0)
+    before = scene.save()
+    with pytest.raises(InputError, match=r"world_from_pad.*takes left and cube too far.*6\.4 mm"):
+        scene.step(np.stack([pose(LEFT, (0.0, 6e-3, 0.0)), pose(RIGHT, (0.0, 30e-3, 0.0))]))
+    after = scene.save()
+    assert np.array_equal(before.world.y, after.world.y) and np.array_equal(before.world_from_pad, after.world_from_pad)
+    report = scene.step(fingers(-0.2e-3))
+    assert report.substeps > 2 and report.blocked[0] == 0.0
+    gentle = two_pads(kind="kinematic", gap=1e-3, friction=0.0)
+    for gap in np.linspace(0.9e-3, -0.2e-3, 12):
+        gentle.step(fingers(gap))
+    for _ in range(2):
+        scene.step(fingers(-0.2e-3))
+        gentle.step(fingers(-0.2e-3))
+    assert scene.wrench("left")[0, 1] == pytest.approx(gentle.wrench("left")[0, 1], rel=1e-2)
+
+
+def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
+    box = np.full((1, 3), 1e-3)
+    one = Mover(np.eye(4)[None], pose(position=(10e-3, 0, 0))[None], -box, box)
+    far, near = (pose(position=(d, 0.0, 0.0))[None] for d in (7e-3, 2.05e-3))
+    assert allowed_share({"a": one, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.5)
+    assert allowed_share({"a": one, "b": Mover(near, near, -box, box)}, [("a", "b")], 1e-4)[0] == pytest.approx(STEP / 10e-3)
+    through = Mover(np.eye(4)[None], pose(position=(0.1, 0, 0))[None], -box, box)
+    assert allowed_share({"a": through, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.05)
+    aside = pose(position=(0.0, 50e-3, 0.0))[None]
+    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (1.0, None)
+
+
+def test_environments_have_their_own_poses_and_reset_alone():
+    scene = two_pads(num_envs=2)
+    both = np.stack([fingers(-0.05e-3), fingers(0.15e-3)])
+    for _ in range(2):
+        scene.step(both)
+    force = scene.wrench("left")[:, 1]
+    assert force[0] < -0.2 and force[1] == 0.0
+    start = two_pads()
+    scene.reset([0])
+    assert scene.coat("left")[0] == pytest.approx(start.coat("left")[0], abs=1e-15)
+    scene.step(fingers(-0.05e-3))
+    single = two_pads()
+    single.step(fingers(-0.05e-3))
+    assert scene.wrench("left")[0] == pytest.approx(single.wrench("left")[0], rel=1e-9, abs=1e-9)
+    scene.reset([1], world_from_body={"cube": np.stack([pose(position=(0.0, 0.0, 2e-3))] * 2)})
+    assert scene.pose("cube")[1, 2, 3] == pytest.approx(2e-3) and abs(scene.pose("cube")[0, 2, 3]) < 1e-6
+
+
+def test_what_cannot_be_is_named():
+    with pytest.raises(OverlapError, match=r"bodies overlap where they start.*left.*cube"):
+        two_pads(gap=-1e-3)
+    scene = two_pads()
+    with pytest.raises(InputError, match=r"pad = 'middle'.*left, right"):
+        scene.wrench("middle")
+    with pytest.raises(InputError, match=r"name = 'ball'.*cube"):
+        scene.pose("ball")
+    with pytest.raises(InputError, match=r"driven = 'cube'.*moves freely"):
+        scene.step(fingers(0.1e-3), {"cube": np.eye(4)})
+    with pytest.raises(InputError, match=r"world_from_pad.*shape"):
+        scene.step(np.eye(4))
+    with pytest.raises(InputError, match=r"world_from_pad.*rigid"):
+        scene.step(2.0 * fingers(0.1e-3))
+    with pytest.raises(InputError, match=r"kind = 'jelly'.*kinematic, affine, soft, half_space"):
+        scene_body("x", (primitive("box", (HALF,) * 3),), "jelly")
+    with pytest.raises(OverlapError, match="reset"):
+        scene.reset(world_from_pad=fingers(-1e-3))
+    scene.step(fingers(0.1e-3))

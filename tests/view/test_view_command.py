@@ -1,0 +1,74 @@
+"""``raytac view`` as a program: it serves, tells where, and ends on Ctrl-C; what cannot be is one line."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.view.page_client import PageClient
+
+ROOT = Path(__file__).parents[2]
+
+
+def command(*args: str, cwd: Path) -> subprocess.Popen[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    run = [sys.executable, "-m", "raytac", "view", *args]
+    return subprocess.Popen(run, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_it_serves_until_ctrl_c(tmp_path):
+    running = command("sphere", "--optics", "phong", "--resolution", "80x60", "--port", "0", cwd=tmp_path)
+    try:
+        assert running.stdout is not None
+        for line in running.stdout:
+            found = re.search(r"open http://127\.0\.0\.1:(\d+) ", line)
+            if found:
+                break
+        else:
+            raise AssertionError(running.stderr.read() if running.stderr else "")
+        client = PageClient(int(found[1]))
+        client.until(lambda: "sphere · gelsight_mini · rigid+phong" in client.texts(), "the title", 60.0)
+        client.until(lambda: "paused" in client.texts(), "the first image", 60.0)
+        client.set("depth [mm]", 0.5)
+        client.until(lambda: "held by the sliders" in client.texts() and "0.500 mm" in client.texts(), "the press", 60.0)
+        client.close()
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=30.0)
+    finally:
+        running.kill()
+    assert running.returncode == 0 and "viewer closed" in out and "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []  # nothing is written
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("spheer",), "did you mean 'sphere'"),
+        (("sphere", "--port", "99999"), r"port = 99999: must be a whole number in \[0, 65535\]"),
+        (("sphere", "--optics", "pong"), "did you mean 'phong'"),
+        (("sphere", "--physics", "soft"), "choose from: rigid, ipc"),
+        (("sphere", "--resolution", "big"), "WIDTHxHEIGHT"),
+        (("sphere", "--markers", "fots"), "markers"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_nothing_is_served(tmp_path, args, said):
+    done = command(*args, cwd=tmp_path)
+    out, err = done.communicate(timeout=60.0)
+    assert done.returncode == 2 and re.search(said, err) and len(err.strip().splitlines()) == 1, err
+    assert "http" not in out
+
+
+def test_a_port_that_is_taken_is_said(tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        done = command("sphere", "--port", str(other.getsockname()[1]), cwd=tmp_path)
+        _, err = done.communicate(timeout=60.0)
+    assert done.returncode == 2 and "in use" in err and "choose another one" in err
