@@ -13,6 +13,7 @@ import numpy as np
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.errors import InputError
+from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver
 from raytac.robots.pose import pose_error
 from raytac.specs.task_file import load_task
@@ -22,6 +23,9 @@ __all__ = ["Outcome", "TaskBatch"]
 
 _LENGTH, _SPEED = 0.1, 1.0
 """What positions [m] and speeds [m/s, rad/s] in observations are divided by."""
+
+_PITCH = 0.4e-3
+"""Spacing of the gel's nodes where no image asks for less [m]."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class TaskBatch:
         device: str = "auto",
         seed: int = 0,
         scene: str | Path | None = None,
-        pitch: float | None = 0.2e-3,
+        pitch: float | None = None,
     ) -> None:
         """Compose the world; episodes begin with ``reset``.
 
@@ -78,7 +82,8 @@ class TaskBatch:
             max_episode_steps: after which an episode is truncated; None is as the task has it.
             seed: of what is drawn once a world, and of streams that no ``reset`` has seeded.
             scene: another task scene with the same names in it, name or path.
-            pitch: spacing of the grid that the gel's surface is computed on [m]; None is as fine as the image.
+            pitch: spacing of the grid that the gel's surface is computed on [m]; None is 0.4 mm, or that of the
+                images if they are finer.
 
         Raises:
             InputError: a value out of its choices; as ``TactileWorld``.
@@ -97,7 +102,7 @@ class TaskBatch:
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
         if settings is not None:
             options = probe.world_options()
-        options["sensor_options"] = {**options["sensor_options"], "pitch": pitch}
+        options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
         self.world = TactileWorld(loaded, physics=physics, pad=pad, device=device, **options)
         self.observers: dict[str, TactileObserver] = {}
         if settings is not None:
@@ -235,6 +240,13 @@ class TaskBatch:
             env = int(np.flatnonzero(~self._begun)[0])
             raise InputError("environment", value=env, rule="must be reset before it is stepped")
         return np.clip(values, -1.0, 1.0)
+
+
+def _pitch(observer: TactileObserver) -> float:
+    """As fine as the images, where there are any, between the sensor's own limit and ``_PITCH``."""
+    if "rgb" not in observer.settings.modalities:
+        return _PITCH
+    return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
 
 
 def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:

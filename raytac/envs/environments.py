@@ -26,14 +26,13 @@ def _action_space(size: int) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
 
 
-class TactileEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class TactileEnv(gymnasium.Env):
     """One environment of a task; subclasses name the task, and their docstring specifies it.
 
     Keyword arguments are those of ``TaskBatch``, but for ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
     reward), ``success`` and ``failed``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
     task: ClassVar[type[Task]]
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
@@ -43,7 +42,7 @@ class TactileEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.batch = TaskBatch(self.task(), num_envs=1, **options)
         self.observation_space = gymnasium_space(self.batch.arrays)
         self.action_space = _action_space(self.batch.steering.size)
-        self.metadata = {**self.metadata, "render_fps": 1.0 / self.batch.control_timestep}
+        self.metadata = {"render_modes": [], "render_fps": 1.0 / self.batch.control_timestep}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -203,8 +203,6 @@ class TactileObserver:
         return self._scaled("wrench", _given(frame.wrench, "wrench"))
 
     def _map(self, frame: TactileFrame, values: np.ndarray) -> np.ndarray:
-        if self.settings.map_shape is None:
-            return values
         if self._cells is None or self._cells.nodes != frame.surface.grid.shape:
             self._cells = CellMeans(frame.surface.grid.shape, self.settings.map_shape)
         return self._cells(values)

@@ -49,8 +49,9 @@ class ObservationSettings:
     """The image is rendered this many times as large along both sides and averaged."""
     difference: bool = False
     """``rgb`` becomes (255 + image − image at rest) // 2, which is 127 where nothing has changed and cannot overflow."""
-    map_shape: tuple[int, int] | None = (32, 32)
-    """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad; None is the pad's own grid."""
+    map_shape: tuple[int, int] = (32, 32)
+    """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad, no more than
+    its grid has nodes."""
     stack: int = 1
     """Number of last observations: images lie one behind the other in the channels, all else along a new first axis, oldest first. After
     a reset all are the first one."""
@@ -78,11 +79,10 @@ class ObservationSettings:
         object.__setattr__(self, "resolution", checked_resolution(self.resolution))
         for name in ("downscale", "stack"):
             _check_count(name, getattr(self, name))
-        if self.map_shape is not None:
-            if not isinstance(self.map_shape, (tuple, list)) or len(self.map_shape) != 2:
-                raise InputError("map_shape", value=self.map_shape, rule="must be (rows, columns), or None for the pad's grid")
-            for count in self.map_shape:
-                _check_count("map_shape", count)
+        if not isinstance(self.map_shape, (tuple, list)) or len(self.map_shape) != 2:
+            raise InputError("map_shape", value=self.map_shape, rule="must be (rows, columns)")
+        for count in self.map_shape:
+            _check_count("map_shape", count)
         if self.crop != "centre":
             sides = self.crop
             if (

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.errors import BackendError, InputError
-from raytac.gel.pad import grid_pitch, make_grid
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.specs.sensor import SensorSpec
 
@@ -38,18 +37,14 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
         raise InputError("modalities", value="markers", rule=f"needs a sensor with markers; {sensor.name} has none")
-    layout = image_layout(sensor, settings)
-    width, height = layout.observed
-    rows_columns = settings.map_shape
-    if rows_columns is None:
-        rows_columns = make_grid(sensor.gelpad, grid_pitch(sensor.camera.pitch_at(layout.rendered))).shape
+    width, height = image_layout(sensor, settings).observed
     found = {
         "rgb": ArraySpec((height, width, 3), np.uint8, 0, 255),
         "markers": ArraySpec((count, 2), np.float32, -np.inf, np.inf),
         "marker_visible": ArraySpec((count,), np.int8, 0, 1),
-        "height": ArraySpec(tuple(rows_columns), np.float32, -np.inf, np.inf),
-        "indentation": ArraySpec(tuple(rows_columns), np.float32, -np.inf, np.inf),
-        "contact": ArraySpec(tuple(rows_columns), np.float32, 0.0, 1.0),
+        "height": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
+        "indentation": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
+        "contact": ArraySpec(tuple(settings.map_shape), np.float32, 0.0, 1.0),
         "wrench": ArraySpec((6,), np.float32, -np.inf, np.inf),
     }
     return {name: _stacked(name, found[name], settings.stack) for name in settings.modalities}
