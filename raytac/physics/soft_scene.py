@@ -28,7 +28,7 @@ CREEP = 5e-5
 """ε_v [m/s]: under a share r of the greatest friction, what sticks creeps at ε_v (1 − √(1 − r)); r = 0.75: 0.05 mm in two seconds."""
 _CLOSE = 2e-8
 """A step is solved when no vertex would move further than this [m]; forces of what sticks want it small against ε_v dt."""
-_LINEAR = 1e-4
+_LINEAR = 1e-6
 """Residual of the linear solve [-]: a grasped body that travels must come along to a small share of ε_v dt, or friction would slip."""
 _REACH = 4.0
 """Bodies closer than so many d̂ are near."""
