@@ -12,7 +12,7 @@ import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import PadGrid
-from raytac.physics.rotation import between, inverse, nearest_rotation, quaternion, quaternions
+from raytac.physics.rotation import between, inverse, nearest_rotation, quaternion, quaternions, rotations
 from raytac.physics.soft_approach import STEP, TURN, Mover, allowed_share
 from raytac.physics.soft_bodies import SceneBody, pad_body
 from raytac.physics.soft_mesh import PadMesh
@@ -401,19 +401,37 @@ class SoftScene:
         one = np.ones((self.num_envs, 1))
         if isinstance(solid, ipc.HalfSpace):
             return Mover(self._target[1][name], goals[name], 0.0 * one, 0.0 * one, is_plane=True)
+        start = self._target[1][name] if body.is_driven else self.pose(name)
         if isinstance(solid, ipc.SoftBody):
-            start = self._target[1][name] if body.is_driven else self.pose(name)
             at = np.einsum("bji,bnj->bni", start[:, :3, :3], self.world.positions(name) - start[:, None, :3, 3])
             low, high = at.min(axis=1), at.max(axis=1)
-        else:
-            start = self._target[1][name] if body.is_driven else self.pose(name)
-            vertices = solid.surface.vertices
-            low, high = one * vertices.min(axis=0), one * vertices.max(axis=0)
-        if body.is_driven:
-            return Mover(start, goals[name], low, high)
-        end = start.copy()
-        end[:, :3, 3] += left * self.velocity(name)
-        return Mover(start, end, low, high)
+            end = self._pulled(solid, start, goals[name], left) if body.is_driven else self._carried(name, start, left)
+            return Mover(start, end, low, high)
+        vertices = solid.surface.vertices
+        low, high = one * vertices.min(axis=0), one * vertices.max(axis=0)
+        return Mover(start, goals[name] if body.is_driven else self._carried(name, start, left), low, high)
+
+    def _carried(self, name: str, start: np.ndarray, left: float) -> np.ndarray:
+        """Where a free body's momentum takes its pose in the time ``left`` [s]."""
+        motion = self.world.rigid_motion(name)
+        return _moved(start, motion.centre, left * motion.velocity, left * motion.spin)
+
+    def _pulled(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, left: float) -> np.ndarray:
+        """The same of a soft body that is held somewhere: its places in contact, as they move now; without any, it is where it is held."""
+        load = np.linalg.norm(self.world.contact_forces(solid.name), axis=2)
+        touched = load.sum(axis=1) > 0.0
+        if not touched.any():
+            return goal
+        nodes = self.world.surface(solid.name)[0]
+        x, v = self.world.positions(solid.name)[:, nodes], self.world.velocities(solid.name)[:, nodes]
+        share = load / np.where(touched, load.sum(axis=1), 1.0)[:, None]
+        centre, velocity = np.einsum("bn,bni->bi", share, x), np.einsum("bn,bni->bi", share, v)
+        arm = x - centre[:, None]
+        second = np.einsum("bn,bni,bnj->bij", share, arm, arm) + 1e-12 * np.eye(3)
+        inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+        momentum = np.einsum("bn,bni->bi", share, np.cross(arm, v - velocity[:, None]))
+        spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
+        return np.where(touched[:, None, None], _moved(start, centre, left * velocity, left * spin), goal)
 
     def _refuse(self, pair: tuple[str, str] | None, begun: tuple, goals: tuple) -> None:
         ways = [np.linalg.norm(goals[0][:, k, :3, 3] - begun[0][:, k, :3, 3], axis=1).max() for k in range(len(self.pads))]
@@ -545,6 +563,14 @@ def _batch(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]
     given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
     given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
     return given[0][0] if given else 1
+
+
+def _moved(poses: np.ndarray, centre: np.ndarray, way: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Poses (B, 4, 4) after a turn about a centre (B, 3) [m] and a way, (B, 3) each."""
+    rotation, found = rotations(turn), poses.copy()
+    found[:, :3, :3] = rotation @ poses[:, :3, :3]
+    found[:, :3, 3] = centre + way + np.einsum("bij,bj->bi", rotation, poses[:, :3, 3] - centre)
+    return found
 
 
 def _still(a: Mover, b: Mover) -> bool:
