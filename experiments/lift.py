@@ -85,7 +85,7 @@ class Record:
 def main(args: Args) -> None:
     start = time.perf_counter()
     if args.quick:
-        args = replace(args, height_mm=1.0)
+        args = replace(args, height_mm=0.5, gap_mm=0.2)
     out = args.out if args.out is not None else Path("runs") / "lift"
     runs = [
         (case, physics)
@@ -131,9 +131,9 @@ def kind_of(case: str) -> tuple[str, float | None]:
 
 
 def times_of(args: Args) -> Times:
-    lift = 0.15 if args.quick else 0.6
-    hold = lift + (0.1 if args.quick else 0.5)
-    return Times(lift, hold, hold + (0.1 if args.quick else args.hold_s))
+    lift = 0.06 if args.quick else 0.6
+    hold = lift + (0.06 if args.quick else 0.5)
+    return Times(lift, hold, hold + (0.05 if args.quick else args.hold_s))
 
 
 def make_world(args: Args, case: str, physics: str) -> TactileWorld:
@@ -181,7 +181,7 @@ def lift(world: TactileWorld, args: Args, times: Times) -> tuple[Record, list]:
         note(record, world, state, time.perf_counter() - began)
         if state.failed[0]:
             raise RaytacError(f"the physics broke down at {state.time[0]:.3f} s")
-        if step % max(steps // 24, 1) == 0 or step == steps - 1:
+        if step % max(steps // (5 if args.quick else 24), 1) == 0 or step == steps - 1:
             pictures.append(snapshot(world, [*world.sensor_names, OBJECT], f"{state.time[0]:.2f} s"))
     return record, pictures
 

@@ -75,7 +75,7 @@ class Record:
 def main(args: Args) -> None:
     start = time.perf_counter()
     if args.quick:
-        args = replace(args, twist_deg=5.0, stretch_mm=0.5, rest_s=0.02, force=1.0)
+        args = replace(args, twist_deg=5.0, stretch_mm=0.5, rest_s=0.02, force=1.0, gap_mm=0.2)
     out = args.out if args.out is not None else Path("runs") / "twist"
     with result_folder(out) as folder:
         world = make_world(args)
@@ -106,7 +106,7 @@ def make_world(args: Args) -> TactileWorld:
 
 def twist(world: TactileWorld, args: Args) -> tuple[Record, list, tuple[float, ...]]:
     """Close, twist, stretch, wait."""
-    close = 0.08 if args.quick else 0.35
+    close = 0.05 if args.quick else 0.35
     twisted = close + max(np.deg2rad(args.twist_deg) / 2.5, 0.05)
     stretched = twisted + max(args.stretch_mm / 60.0, 0.05)
     end = stretched + args.rest_s
@@ -151,7 +151,7 @@ def twist(world: TactileWorld, args: Args) -> tuple[Record, list, tuple[float, .
             values.append(state.report[key][0].item())
         record.converged.append(bool(state.report["converged"][0]))
         record.seconds.append(time.perf_counter() - began)
-        if step % max(steps // 30, 1) == 0 or step == steps - 1:
+        if step % max(steps // (5 if args.quick else 30), 1) == 0 or step == steps - 1:
             pictures.append(snapshot(world, [*world.sensor_names, BEAM, "plate"], f"{state.time[0]:.2f} s"))
     return record, pictures, (close, twisted, stretched, end)
 
