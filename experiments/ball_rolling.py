@@ -94,6 +94,8 @@ def main(args: Args) -> None:
 
 OPTICS = {"rigid": "taxim", "ipc": "raytrace"}
 """How the image is made: by the table with the rigid pad, by fast ray tracing with the simulated one."""
+STROKES = {"rigid": Strokes(), "ipc": Strokes(roll_speed=0.015, press_speed=0.005, lift_speed=0.02, travel_speed=0.05)}
+"""The simulated pad is solved in one go where it moves by 0.1 mm or less against the ball in 10 ms."""
 PITCH = 1e-4
 """Spacing of the nodes of the gel's surface [m]: a ball needs no finer ones."""
 MARKERS = {"rigid": "fots", "ipc": "surface"}
@@ -119,7 +121,7 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
     (name,) = world.sensor_names
     state = world.reset()
     goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
-    controller = RollingController(world, 0, goals, Strokes())
+    controller = RollingController(world, 0, goals, STROKES[world.physics])
     record = Record([], [], [], [], [], [], [], [], [], [])
     frame = world.observe()[name]  # kernels are compiled here
     next_picture = 0.0

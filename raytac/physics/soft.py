@@ -22,9 +22,9 @@ from raytac.physics.press_plan import (
     per_environment,
     scene_parts,
 )
-from raytac.physics.soft_approach import STEP, TURN
 from raytac.physics.soft_bodies import object_body
 from raytac.physics.soft_contact import SoftContact
+from raytac.physics.soft_drive import SoftDrive
 from raytac.physics.soft_mesh import PadMesh, pad_mesh
 from raytac.physics.soft_places import SoftPlaces
 from raytac.physics.soft_reading import SoftReader, SoftReading
@@ -33,17 +33,8 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["SoftPad", "SoftState"]
 
-_LIFT = 3.0
-"""A release may go in steps so many times as long."""
-_CLOSE = 1e-6
-"""A depth is reached within this [m]."""
-_TIGHT = 5e-4
-"""A force is reached within this share."""
 _SAG = 0.1
 """How far the object's facets may lie inside it, in units of d̂."""
-_PATIENCE, _REFINEMENTS = 120, 4
-_STILL = 2e-5
-"""Speed below which a free object lies still [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -111,18 +102,19 @@ class SoftPad:
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
-        self._bar = tqdm(disable=True)
         self.solver: SoftContact | None = None
         """Pad and object in the contact solver; None without an object."""
-        self._is_free = scene.object.dynamics == "affine"
-        self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
-        self._lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
+        lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
         if self._depths is not None:
-            self._lost = self._lost | ~np.isfinite(self._depths)
-        self._forget()
+            lost = lost | ~np.isfinite(self._depths)
+        self._drive: SoftDrive | None = None
         if self.parts:
-            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, self._offsets, self._lost)
-            self.solver = SoftContact(sensor, self.mesh, self._body(), self._poses(), device)
+            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, self._offsets, lost)
+            above = self._places.poses(
+                np.full(num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((num_envs, 2)), np.zeros(num_envs)
+            )
+            self.solver = SoftContact(sensor, self.mesh, self._body(), above, device)
+            self._drive = SoftDrive(scene, self.solver, self._reader, self._places, self._depths, lost)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -131,9 +123,9 @@ class SoftPad:
 
         Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
         depth: what the barrier keeps between it and the object is added to the object's height; on the way the coat is there within some
-        micrometres, and never deeper than the stage's end. One to a force moves the object until
-        the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to rest. A
-        ``release`` lifts the object ``CLEARANCE`` above the gel.
+        micrometres, and never deeper than the stage's end; in a shear or twist that follows, it stays there. One to a force moves the
+        object until the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to
+        rest. A ``release`` lifts the object ``CLEARANCE`` above the gel.
 
         ``progress``: on a terminal, a bar of the solver's steps with the stage beside it; how many a search takes is not known before.
 
@@ -143,10 +135,12 @@ class SoftPad:
         if steps_per_stage < 1:
             raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
         self.reset()
-        with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as self._bar:
+        with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as bar:
+            if self._drive is not None:
+                self._drive.bar = bar
             yield self._state(-1, "start", 1.0)
             for index, stage in enumerate(self.scene.trajectory):
-                self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
+                bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
                 yield from self._through(index, stage, steps_per_stage)
 
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[SoftState]:
@@ -198,169 +192,28 @@ class SoftPad:
 
     def reset(self) -> None:
         """Forget all history: the pad at rest, the object above it."""
-        self._forget()
-        if self.solver is not None:
-            self.solver.reset()
+        self._last = None
+        if self._drive is not None:
+            self._drive.reset()
 
-    # --- driving ---------------------------------------------------------------------------------------------------------------
-
-    def _forget(self) -> None:
-        batch = self.num_envs
-        self._depth = np.full(batch, -CLEARANCE)
-        self._shear, self._twist = np.zeros((batch, 2)), np.zeros(batch)
-        self._force = np.full(batch, np.nan)
-        """Normal force that is being kept [N]; NaN while a depth is."""
-        self._kept = np.full(batch, self.mesh.d_hat)
-        """Clearance that the object is held higher by [m]: at first as far as the barrier reaches, then as it was last read."""
-        self._last: SoftReading | None = None
-        self._stiffness = np.full(batch, np.nan)
-        self._failed: np.ndarray = self._lost.copy()
+    # --- states ----------------------------------------------------------------------------------------------------------------
 
     def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[SoftState]:
         """``steps`` states through a stage; ``index``: its number in the scene, −1 if it is none of the scene's."""
-        before = self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy()
+        assert self._drive is not None
+        begun = self._drive.start()
         for step in range(1, steps + 1):
-            self._advance(stage, step / steps, *before)
+            self._drive.advance(stage, step / steps, begun)
             yield self._state(index, stage.kind, step / steps)
-
-    def _advance(
-        self, stage: StageSpec, fraction: float, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, force: np.ndarray
-    ) -> None:
-        """From where the stage began (``depth`` …) to ``fraction`` of it."""
-        if stage.kind == "shear":
-            self._go(self._depth, shear + fraction * (np.asarray(stage.shear) - shear), self._twist)
-            self._step()
-        elif stage.kind == "twist":
-            self._go(self._depth, self._shear, twist + fraction * (stage.twist - twist))
-            self._step()
-        elif stage.kind == "release":
-            self._force[:] = np.nan
-            self._release(depth, fraction)
-        elif stage.force is not None:
-            begun = np.where(np.isfinite(force), force, 0.0)
-            self._force[:] = begun + fraction * (stage.force - begun)
-            self._load()
-        else:
-            self._force[:] = np.nan
-            target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
-            start = np.maximum(depth, 0.0)
-            end = np.where(np.isfinite(target), target, 0.0)
-            self._indent(start + fraction * (end - start), is_last=fraction == 1.0)
-
-    def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
-        """Drive the coat to a depth, without passing it on the way; exactly there at the stage's end."""
-        assert self.solver is not None
-        way = depth - np.maximum(self._depth, -self.mesh.d_hat)
-        if self._last is not None:
-            # Follow the clearance, but never so fast that the object would stand still or turn back.
-            off = np.nan_to_num(self._last.clearance - self._kept)
-            self._kept = self._kept + np.clip(off, -self.mesh.d_hat, 0.5 * np.abs(way))
-        short = np.clip(way, 0.0, self.mesh.d_hat) if is_last else 0.0
-        self._go(depth - short, self._shear, self._twist)
-        if is_last:
-            clearance = self._reader.clearance(self.solver.seen(self._poses()))
-            self._kept = np.where(np.isfinite(clearance) & ~self._failed, clearance, self._kept)
-            self._depth = depth
-            self._step()
-            self._settle_depth()
-        if (way < 0.0).any():
-            self._settle_friction()
-
-    def _go(self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0) -> None:
-        """Drive straight to a place in steps short enough; a force that is kept is kept on the way."""
-        begun = np.maximum(self._depth, -self.mesh.d_hat) if stretch == 1.0 else self._depth
-        ways = np.abs(depth - begun), np.linalg.norm(shear - self._shear, axis=1), np.abs(twist - self._twist) * (STEP / TURN)
-        steps = max(int(np.ceil(max(way.max() for way in ways) / (STEP * stretch) - 1e-9)), 1)
-        old_shear, old_twist = self._shear, self._twist
-        for step in range(1, steps + 1):
-            share = step / steps
-            self._shear, self._twist = old_shear + share * (shear - old_shear), old_twist + share * (twist - old_twist)
-            self._depth = begun + share * (depth - begun)
-            self._step()
-            if np.isfinite(self._force).any():
-                self._load()
-                begun = depth = self._depth
-
-    def _step(self) -> None:
-        assert self.solver is not None
-        self._failed |= self.solver.drive(self._poses(), self._case())
-        self._bar.update()
-
-    def _settle_friction(self) -> None:
-        assert self.solver is not None
-        self._failed |= self.solver.settle_friction(self._poses(), self._case(), self._failed)
-
-    def _settle_depth(self) -> None:
-        """Correct until the coat, not the barrier's shell, is at the depth."""
-        assert self.solver is not None
-        for _ in range(_REFINEMENTS):
-            clearance = self._reader.clearance(self.solver.seen(self._poses()))
-            off = np.where(np.isfinite(clearance) & ~self._failed, clearance - self._kept, 0.0)
-            if np.abs(off).max() < _CLOSE:
-                return
-            self._kept = self._kept + off
-            self._step()
-
-    def _release(self, depth: np.ndarray, fraction: float) -> None:
-        assert self.solver is not None
-        lift = self._places.lift(self._shear, self._twist)
-        if self._is_free:
-            if fraction == 1.0:
-                self.solver.reset()
-                self._depth = lift - CLEARANCE
-            return
-        self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
-        self._settle_friction()
-
-    def _load(self) -> None:
-        """Let the contact bear ``self._force``: a free object by its weight, a driven one by a secant search of its depth."""
-        if self._is_free:
-            self._lie()
-            return
-        self._depth = np.maximum(self._depth, -self.mesh.d_hat)
-        if not np.isfinite(self._stiffness).all():
-            wanted = np.nan_to_num(self._force)
-            self._stiffness = np.array([self._places.stiffness(b, self._twist[b], wanted[b]) for b in range(self.num_envs)])
-        borne = self._normal_force()
-        for _ in range(_PATIENCE):
-            missing = np.where(np.isfinite(self._force) & ~self._failed, self._force - borne, 0.0)
-            if (np.abs(missing) <= _TIGHT * np.nan_to_num(self._force)).all():
-                return
-            way = np.clip(missing / self._stiffness, -STEP, STEP)
-            self._depth = self._depth + way
-            self._step()
-            before, borne = borne, self._normal_force()
-            moved = np.abs(way) > 1e-9
-            found = (borne - before)[moved] / way[moved]
-            usable = found > 0.1 * self._stiffness[moved]
-            self._stiffness[moved] = np.where(usable, found, self._stiffness[moved])
-        self._failed |= np.abs(missing) > _TIGHT * np.nan_to_num(self._force)
-
-    def _lie(self) -> None:
-        """Let a free object come to rest under its weight."""
-        assert self.solver is not None and self._weight > 0.0
-        self.solver.weigh(float(self._force[0]) / self._weight)
-        for _ in range(4 * _PATIENCE):
-            self._failed |= self.solver.drive(self._poses())
-            self._bar.update()
-            if (self.solver.speed()[~self._failed] < _STILL).all() and (self._normal_force()[~self._failed] > 0.0).all():
-                return
-        self._failed |= self.solver.speed() >= _STILL
-
-    # --- reading ---------------------------------------------------------------------------------------------------------------
 
     def _reading(self, state: ContactState) -> SoftReading:
         if not isinstance(state, SoftState) or state.reading is None:
             raise InputError("state", value=type(state).__name__, rule="must be a state that this pad's run() gave")
         return state.reading
 
-    def _normal_force(self) -> np.ndarray:
-        assert self.solver is not None
-        return -self.solver.forces()[:, :, 2].sum(axis=1)
-
     def _state(self, stage: int, kind: str, fraction: float) -> SoftState:
         batch = self.num_envs
-        if self.solver is None:
+        if self._drive is None or self.solver is None:
             poses, zero = np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
             rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
             coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
@@ -370,9 +223,10 @@ class SoftPad:
             return SoftState(
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
             )
-        failed: np.ndarray = self._failed.copy()
-        reading = self._reader.read(self.solver.seen(self._poses()), failed)
+        failed: np.ndarray = self._drive.failed.copy()
+        reading = self._reader.read(self.solver.seen(self._drive.poses()), failed)
         self._last = reading
+        self._drive.read(reading.clearance)
         surface, forces = reading.surface, reading.forces
         assert surface.coat is not None
         total = forces.sum(axis=1)
@@ -381,7 +235,7 @@ class SoftPad:
         cell = self.grid.pitch[0] * self.grid.pitch[1]
         area = np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)
         depth = np.where(failed, np.nan, self._places.origin[:, 2] - reading.poses[0][:, 2, 3])
-        case = self._case()
+        case = self._drive.case()
         case = np.tile(np.eye(4), (batch, 1, 1)) if case is None else case
         case[failed] = np.nan
         return SoftState(
@@ -400,18 +254,6 @@ class SoftPad:
             reading,
         )
 
-    # --- places ----------------------------------------------------------------------------------------------------------------
-
-    def _poses(self) -> np.ndarray:
-        """``pad_from_object`` as driven: higher than the depth says by the clearance; (B, 4, 4)."""
-        return self._places.poses(self._kept - self._depth, self._shear, self._twist)
-
-    def _case(self) -> np.ndarray | None:
-        """``world_from_pad`` (B, 4, 4) if the case moves."""
-        if self.scene.moves != "case":
-            return None
-        return self._places.case(self._kept - self._depth, self._shear, self._twist)
-
     @property
     def _deepest(self) -> float:
         """Depth that the object's surface was made for [m]; a force may go as deep as the pad."""
@@ -420,7 +262,7 @@ class SoftPad:
 
     def _body(self):
         settings = {
-            "weight": self._weight,
+            "weight": max((stage.force or 0.0 for stage in self.scene.trajectory), default=0.0),
             "edge_length": 0.75 * float(np.diff(self.mesh.coat.lines_x).mean()),
             "lowest": self._deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
             "sag": _SAG * self.mesh.d_hat,

@@ -24,6 +24,9 @@ _CREEP = 1e-6
 """What sticks may creep by so much a step [m]."""
 _BLOCKED = 1e-3
 """Share of a step's motion that may be left undone."""
+_STIFFER, _STIFFENINGS = 4.0, 4
+"""The barrier is made so many times as stiff, at most so often in one step, where a contact so sharp (a cone's tip on one facet of the
+coat) jams: the pressure that a barrier can bear is bounded as long as surfaces keep apart, and the force is borne by few small facets."""
 _UNSETTLED, _SETTLINGS = 0.01, 60
 """Friction has settled when the coat's forces change by less than this share in a step; so many steps are tried."""
 _SLIGHT = 1e-5
@@ -74,7 +77,17 @@ class SoftContact:
             self._world_from_pad = world_from_pad.copy()
         driven = {OBJECT: self._world_from_pad @ pad_from_object} if self.body.is_driven else {}
         report = self.scene.advance(self._world_from_pad[:, None], driven)
-        return report.failed | (report.blocked > _BLOCKED)
+        failed = report.failed
+        for _ in range(_STIFFENINGS):
+            jammed = ~failed & (report.blocked > _BLOCKED)
+            if not jammed.any():
+                return failed
+            state = self.world.save()
+            state.kappa[jammed] *= _STIFFER
+            self.world.restore(state)
+            report = self.scene.advance(self._world_from_pad[:, None], driven)
+            failed = failed | report.failed
+        return failed | (report.blocked > _BLOCKED)
 
     def settle_friction(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None, failed: np.ndarray) -> np.ndarray:
         """Stand still until friction is that of the contacts there are; poses as for ``drive``.

@@ -91,7 +91,7 @@ class SoftReader:
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
         self._rest = grid.rest.astype(np.float32)
         self._gelpad = gelpad
-        self._fine_pad = make_grid(gelpad, max(_FINE, *grid.pitch))
+        self._fine_pad = grid if min(grid.pitch) > 0.9 * _FINE else make_grid(gelpad, _FINE)
         self._fine: tuple[FineContact, FineGrid] | None = None
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._stand_off = StandOff(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
@@ -133,7 +133,8 @@ class SoftReader:
             smooth = self._surface.rise(places, upwards)
             near = self._underside(seen, b, self._fine_pad, fit.clearance, fine.here.lattice(smooth) + self._fine_pad.rest)
             shape = fine.solve(places, upwards, load, near - self._fine_pad.rest)
-            under = undersides[b] = self._underside(seen, b, self.grid, fit.clearance, height[b])
+            same = self._fine_pad is self.grid
+            under = undersides[b] = near if same else self._underside(seen, b, self.grid, fit.clearance, height[b])
             height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
             centre[b] = load @ coat[b, :, :2] / load.sum()
         deformed = DeformedCoat(self.mesh.coat, coat)

@@ -51,7 +51,8 @@ class SceneReport:
 
     failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
     min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. substeps: parts of the step.
+    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
+    end [J]. substeps: parts of the step.
     """
 
     failed: np.ndarray
@@ -60,6 +61,8 @@ class SceneReport:
     min_det: np.ndarray
     blocked: np.ndarray
     newton: np.ndarray
+    elastic: np.ndarray
+    barrier: np.ndarray
     substeps: int
 
 
@@ -160,11 +163,11 @@ class SoftScene:
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
-    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None) -> bool:
-        """Whether the way to these poses (as for ``step``) is one that ``step`` would make in one go."""
+    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
+        """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
         cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
         goals = self._target[1] | self._named(driven or {})
-        return self._part(0, self._target, (cases, goals))[0] == MOST_SUBSTEPS
+        return self._part(0, (cases, goals), dt or self.settings.dt)[0] == MOST_SUBSTEPS
 
     def step(
         self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
@@ -186,7 +189,7 @@ class SoftScene:
         before: SceneState | None = None
         done, total = 0, None
         while done < MOST_SUBSTEPS:
-            part, pair = self._part(done, begun, (cases, goals))
+            part, pair = self._part(done, (cases, goals), dt or self.settings.dt)
             if part == 0:
                 if before is not None:
                     self.restore(before)
@@ -212,7 +215,15 @@ class SoftScene:
         report = self.world.step(dt)
         self._failed = report.failed
         return SceneReport(
-            report.failed, report.converged, report.min_gap, report.min_det, report.blocked, report.newton, substeps=1
+            report.failed,
+            report.converged,
+            report.min_gap,
+            report.min_det,
+            report.blocked,
+            report.newton,
+            report.elastic,
+            report.barrier,
+            substeps=1,
         )
 
     # --- reading ---------------------------------------------------------------------------------------------------------------
@@ -350,9 +361,9 @@ class SoftScene:
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
 
-    def _part(self, done: int, begun: tuple, goals: tuple) -> tuple[int, tuple[str, str] | None]:
+    def _part(self, done: int, goals: tuple, dt: float) -> tuple[int, tuple[str, str] | None]:
         """Sixty-fourths of the step that may be made next, a power of two that ``done`` is a multiple of; 0 if that is too few."""
-        movers = self._movers(begun, goals, 1.0 - done / MOST_SUBSTEPS)
+        movers = self._movers(goals, dt * (1.0 - done / MOST_SUBSTEPS))
         pairs = [(a, b) for a, b in self._pairs() if not _still(movers[a], movers[b])]
         share, pair = allowed_share(movers, pairs, _REACH * self.world.d_hat)
         room = (MOST_SUBSTEPS - done) * share
@@ -374,7 +385,7 @@ class SoftScene:
             ]
         return found
 
-    def _movers(self, begun: tuple, goals: tuple, left: float) -> dict[str, Mover]:
+    def _movers(self, goals: tuple, left: float) -> dict[str, Mover]:
         found = {}
         for k, (name, pad) in enumerate(self.pads.items()):
             rest = pad.mesh.tets.vertices
@@ -401,7 +412,7 @@ class SoftScene:
         if body.is_driven:
             return Mover(start, goals[name], low, high)
         end = start.copy()
-        end[:, :3, 3] += self.settings.dt * left * self.velocity(name)
+        end[:, :3, 3] += left * self.velocity(name)
         return Mover(start, end, low, high)
 
     def _refuse(self, pair: tuple[str, str] | None, begun: tuple, goals: tuple) -> None:
@@ -548,5 +559,7 @@ def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
         np.minimum(one.min_det, two.min_det),
         np.maximum(one.blocked, two.blocked),
         one.newton + two.newton,
+        two.elastic,
+        two.barrier,
         one.substeps + two.substeps,
     )

@@ -260,7 +260,7 @@ def _solve(
         ]
         if not any(pulls):
             return c
-        for k in np.flatnonzero(pulls):
+        for k in np.flatnonzero(pulls).tolist():
             closed[k] = False
             push = contacts[k].push
             assert push is not None

@@ -81,19 +81,27 @@ class _Pad:
         self.highest = float(self.coarse.rest.max())
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
 
-    def touch(self, parts: Sequence, pad_from_body: np.ndarray) -> Touch | None:
-        """How a body at a pose (4, 4) overlaps the resting pad; None where it does not."""
+    def touch(self, parts: Sequence, pad_from_body: np.ndarray, radius: float) -> Touch | None:
+        """How a body at a pose (4, 4) overlaps the resting pad; None where it does not. ``radius`` [m] of a ball that holds the body."""
         grid = self.coarse
-        under = object_height(parts, pad_from_body[None], grid.x, grid.y, below=self.highest)[0]
-        gap = under - grid.rest
+        columns, rows = (
+            slice(*np.searchsorted(line, (at - radius, at + radius)))
+            for line, at in zip((grid.x, grid.y), pad_from_body[:2, 3], strict=True)
+        )
+        x, y = grid.x[columns], grid.y[rows]
+        if len(x) < 2 or len(y) < 2:
+            return None
+        under = object_height(parts, pad_from_body[None], x, y, below=self.highest)[0]
+        gap = under - grid.rest[rows, columns]
         least = float(gap.min())
         if not least < 0.0:
             return None
         j, i = (gap < 0.0).nonzero()
         share = gap[j, i]
         share = share / share.sum()
-        centre = np.array([share @ grid.x[i], share @ grid.y[j], share @ under[j, i]])
-        normal = np.array([-(share @ self.slope_x[j, i]), -(share @ self.slope_y[j, i]), 1.0])
+        centre = np.array([share @ x[i], share @ y[j], share @ under[j, i]])
+        slope = share @ self.slope_x[rows, columns][j, i], share @ self.slope_y[rows, columns][j, i]
+        normal = np.array([-slope[0], -slope[1], 1.0])
         return Touch(-_refined(gap, least), centre, normal / math.sqrt(normal @ normal), gap)
 
     def law(self, touch: Touch) -> LoadLaw:
@@ -117,6 +125,8 @@ class RigidPads:
         self._friction = [body.spec.friction for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
+        self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
+        """Body that each pad showed deepest last; −1: none."""
         self._contact = mujoco.MjContact()
         self._force = np.empty(6)
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
@@ -126,8 +136,8 @@ class RigidPads:
         """Forget what environments went through."""
         for b in envs:
             self._laws[b] = {}
-            for wrench in self._wrench.values():
-                wrench[b] = 0.0
+            for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
+                wrench[b], pressed[b] = 0.0, -1
 
     def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
@@ -187,7 +197,7 @@ class RigidPads:
                 height[b] = np.nan
                 continue
             world_from_pad = world_from_site(data, pad.site)
-            deepest = 0.0
+            deepest, pressed = 0.0, -1
             for i, body in enumerate(self.bodies):
                 pad_from_body = _relative(world_from_pad, data, body.index)
                 if not self._is_near(pad, pad_from_body, i):
@@ -195,8 +205,12 @@ class RigidPads:
                 under = object_height(body.parts, pad_from_body[None], grid.x, grid.y, below=highest)[0]
                 depth = float((grid.rest - under).max())
                 if depth > deepest:
-                    deepest, poses[b] = depth, pad_from_body
+                    deepest, pressed, poses[b] = depth, i, pad_from_body
                 np.minimum(height[b], under, out=height[b])
+            # From one body to another is no motion of either.
+            if pressed != self._pressed[name][b] and self._pressed[name][b] >= 0:
+                poses[b] = np.nan
+            self._pressed[name][b] = pressed
         surface = self._shown[name][1].surface(height, poses)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
         return PadReading(surface, wrench, failed.copy(), lambda: _traction(surface, wrench))
@@ -211,7 +225,8 @@ class RigidPads:
 
     def _touch(self, data: mujoco.MjData, pad: _Pad, i: int) -> Touch | None:
         pad_from_body = _relative(world_from_site(data, pad.site), data, self.bodies[i].index)
-        return pad.touch(self.bodies[i].parts, pad_from_body) if self._is_near(pad, pad_from_body, i) else None
+        near = self._is_near(pad, pad_from_body, i)
+        return pad.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
 
     def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]]:
         """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact)."""

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import ipc
-from raytac.errors import InputError, SpecError
+from raytac.errors import SpecError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
@@ -29,6 +29,8 @@ from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
 from raytac.robots.pose import pose, world_from_site
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
+from raytac.world.coupling import Coupling
+from raytac.world.soft_answers import soft_answers
 from raytac.world.state import Controller, is_lost
 
 __all__ = ["SoftPads"]
@@ -91,9 +93,11 @@ class SoftPads:
             num_envs=len(datas),
             device=device,
         )
-        if coupling == "two_way":
-            raise InputError("coupling", value=coupling, rule="is not there yet for simulated pads", choices=("one_way",))
         self._coupling = None
+        if coupling == "two_way":
+            felt = self._links + [b.index for b in self._led]
+            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._led)], felt, strict=True))
+            self._coupling = Coupling(self.model, felt, len(datas))
         self._last_cases = self._pad_poses(datas)
         self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
         self._traction: dict[str, CoatTraction] = {}
@@ -113,7 +117,7 @@ class SoftPads:
             for values in self.report.values():
                 values[b] = 0
             if self._coupling is not None:
-                self._coupling.reset(b)
+                self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
 
     def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
@@ -123,12 +127,24 @@ class SoftPads:
             InputError: a motion too fast to be resolved near something that it may touch; the world must be reset then.
         """
         scene = self.composed.scene
-        reports = []
-        for _ in range(round(scene.control_timestep / scene.soft_timestep)):
+        interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
+        steps = round(scene.control_timestep / scene.timestep)
+        for step in range(1, steps + 1):
             for b, data in enumerate(datas):
                 if not failed[b]:
                     failed[b] = not self._ahead(data, b, controllers[b])
-            reports.append(self._follow(datas, failed))
+            since += 1
+            cases, led = self._now(datas, failed)
+            # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
+            early = (
+                self._coupling is not None
+                and since < interval
+                and step < steps
+                and not self.soft.is_small(cases, led, since * scene.timestep)
+            )
+            if since == interval or step == steps or early:
+                reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
+                since = 0
         self.report = _joined(reports)
 
     @property
@@ -157,34 +173,43 @@ class SoftPads:
         return []
 
     def _ahead(self, data: mujoco.MjData, b: int, control: Controller) -> bool:
-        """MuJoCo's steps of one ``soft_timestep``; returns whether the state is still sound."""
-        scene, model = self.composed.scene, self.model
-        for _ in range(round(scene.soft_timestep / scene.timestep)):
-            mujoco.mj_step1(model, data)
-            if self._coupling is not None:
-                self._coupling.apply(data, b)
-            control(data, float(data.time))
-            mujoco.mj_step2(model, data)
-            if is_lost(data):
-                return False
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
+        """One step of MuJoCo; returns whether the state is still sound."""
+        mujoco.mj_step1(self.model, data)
+        control(data, float(data.time))
+        if self._coupling is not None:
+            self._coupling.apply(data, b)
+        mujoco.mj_step2(self.model, data)
+        if is_lost(data):
+            return False
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
         return True
 
-    def _follow(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> SceneReport:
-        """The solver's step to where MuJoCo is now."""
-        # An environment that failed stays where it was last.
+    def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Where MuJoCo has cases and its own bodies; an environment that failed stays where it was last."""
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        led = {b.spec.name: np.stack([pose(d.xmat[b.index].reshape(3, 3), d.xpos[b.index]) for d in datas]) for b in self._led}
-        led = {name: np.where(failed[:, None, None], self._last_led[name], at) for name, at in led.items()}
-        report = self.soft.step(cases, led)
+        led = {}
+        for body in self._led:
+            at = np.stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in datas])
+            led[body.spec.name] = np.where(failed[:, None, None], self._last_led[body.spec.name], at)
+        return cases, led
+
+    def _follow(
+        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, led: dict[str, np.ndarray], dt: float
+    ) -> SceneReport:
+        """The solver's step to where MuJoCo is now."""
+        report = self.soft.step(cases, led, dt)
         self._last_cases, self._last_led = cases, led
         failed |= report.failed
-        self._mirror(datas, np.flatnonzero(~failed))
-        felt = [self.soft.wrench(m.name) for m in self.composed.sensors]
-        for mounted, world, case in zip(self.composed.sensors, felt, np.moveaxis(cases, 1, 0), strict=True):
-            turn = case[:, :3, :3]
-            split = [np.einsum("bji,bj->bi", turn, world[:, k : k + 3]) for k in (0, 3)]
+        alive = np.flatnonzero(~failed)
+        self._mirror(datas, alive)
+        if self._coupling is not None:
+            answers = soft_answers(self.soft, self._felt)
+            for b in alive:
+                self._coupling.update(datas[b], b, *answers[b])
+        for k, mounted in enumerate(self.composed.sensors):
+            turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
+            split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
             self._wrench[mounted.name] = np.concatenate(split, axis=1)
         return report
 

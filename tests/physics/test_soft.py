@@ -196,6 +196,59 @@ def test_twist_turns_with_the_object():
     assert turned == pytest.approx(math.radians(4.0), rel=0.1)
 
 
+def test_a_depth_is_kept_through_shear_and_twist():
+    """The clearance changes while gel is drawn along; what is at the depth is the coat, in every state."""
+    stages = indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), StageSpec("shear", shear=(0.4e-3, 0.0))
+    pad = soft(press(*stages, kind="cylinder"))
+    for state in list(pad.run(2))[2:]:
+        assert state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
+        assert pad.surface(state).indentation.max() == pytest.approx(0.5e-3, abs=4e-6)
+
+
+def test_a_flat_face_imprints_flat_under_twist():
+    """No pits under the rim, no holes in the contact, nothing in the object: what the coat's cells of a millimetre used to leave."""
+    pad = SoftPad(SENSOR, press(indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), kind="cylinder"), pitch=0.1e-3)
+    surface = pad.surface(pad.peak(pad.run()))
+    under = pad.object_height(surface)
+    assert under is not None and (under - surface.height).min() > -1e-8
+    rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
+    assert surface.contact[0][rho < 2.9e-3].all() and not surface.contact[0][rho > 3.1e-3].any()
+    assert np.ptp(surface.height[0][rho < 2.9e-3]) < 2e-6
+    assert surface.indentation.max() < 0.5e-3 + 4e-6
+
+
+def test_a_straight_edge_leaves_a_straight_furrow():
+    """Across cells of a millimetre, at an angle to them: along the furrow's bottom and beside it the height does not vary."""
+    half = math.radians(15.0) / 2.0
+    spec = ObjectSpec("edge", {"side": 8e-3}, (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half)), 0.05)
+    pad = SoftPad(SENSOR, PressScene("edge", spec, (indent(0.6e-3),)), pitch=0.1e-3)
+    state = pad.peak(pad.run())
+    height = pad.surface(state).height[0]
+    along, most = np.linspace(-2.5e-3, 2.5e-3, 101), {}
+    for aside in (0.0, 0.5e-3, 1.0e-3):
+        x = along * math.cos(2 * half) - aside * math.sin(2 * half)
+        y = along * math.sin(2 * half) + aside * math.cos(2 * half)
+        # Linear between nodes along x and y; the dome and the edge's ends bend the line, lumps of a cell's length do not.
+        column, row = (np.clip(np.searchsorted(line, t) - 1, 0, len(line) - 2) for line, t in ((pad.grid.x, x), (pad.grid.y, y)))
+        u, v = (x - pad.grid.x[column]) / pad.grid.pitch[0], (y - pad.grid.y[row]) / pad.grid.pitch[1]
+        line = (
+            (1 - u) * (1 - v) * height[row, column]
+            + u * (1 - v) * height[row, column + 1]
+            + (1 - u) * v * height[row + 1, column]
+            + u * v * height[row + 1, column + 1]
+        )
+        most[aside] = np.abs(line - np.polyval(np.polyfit(along, line, 2), along)).max()
+    assert most[0.0] < 30e-6  # half a node's spacing on walls of 45 degrees
+    assert most[0.5e-3] < 6e-6 and most[1.0e-3] < 6e-6
+
+
+def test_a_sharp_cone_can_be_pressed():
+    spec = ObjectSpec("cone", {"radius": 5e-3, "height": 5e-3, "tip_radius": 0.3e-3}, (0.0, 0.0, 0.0), IDENTITY, 0.05)
+    pad = soft(PressScene("cone", spec, (indent(0.8e-3),)))
+    state = pad.peak(pad.run())
+    assert not state.failed[0] and state.depth[0] == pytest.approx(0.8e-3, abs=2e-6)
+
+
 def test_case_and_object_give_the_same_press():
     stages = indent(0.4e-3), StageSpec("shear", shear=(0.2e-3, -0.1e-3)), StageSpec("twist", twist=0.05)
     one, two = (soft(press(*stages, moves=moves)) for moves in ("object", "case"))

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from raytac.errors import InputError, OverlapError
-from raytac.specs import BodySpec, RobotSpec, TaskScene
+from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
 G = 9.81
@@ -119,3 +120,45 @@ def test_a_mesh_is_asked_for_by_a_name_that_is_there(resting: TactileWorld) -> N
     assert gel[0, :, 2].max() <= 0.0
     with pytest.raises(InputError, match="must be the name of"):
         resting.mesh("bal")
+
+
+def test_a_ball_rests_alike_whoever_owns_it(resting: TactileWorld) -> None:
+    """Quasi-static: MuJoCo's ball, led in the solver and held up by the wrench that comes back, against the solver's own."""
+    world = TactileWorld(replace(UP, coupling="two_way", bodies=(replace(BALL, owner="mujoco"),)), outputs=("wrench",))
+    assert world.composed.bodies["ball"].is_free
+    for _ in range(60):
+        state = world.step()
+    own = resting.state()
+    assert np.abs(world.data[0].qvel).max() < 1e-3
+    np.testing.assert_allclose(state.wrench["sensor"][0, 2], -0.05 * G, rtol=0.01)
+    assert state.world_from_body["ball"][0, 2, 3] == pytest.approx(own.world_from_body["ball"][0, 2, 3], abs=5e-6)
+
+
+PRESS = """
+<mujoco><worldbody><body name="head" pos="0 0 0.0405"><joint name="z" type="slide" axis="0 0 1"/><geom size="0.01" mass="0.5"
+contype="0" conaffinity="0"/></body></worldbody>
+<actuator><position joint="z" name="z" kp="{kp}" kv="{kv}"/></actuator></mujoco>
+"""
+
+
+def test_two_way_is_one_way_for_a_stiff_arm_and_a_spring_for_a_soft_one(tmp_path: Path) -> None:
+    """A pad on a servo is pressed on a fixed ball, 0.3 mm in if it does not give way: the servo's spring and the contact share the way."""
+
+    def press(kp: float, coupling: str, steps: int) -> tuple[float, float]:
+        """Force [N] and how far the servo is off its target [m]."""
+        (tmp_path / "press.xml").write_text(PRESS.format(kp=kp, kv=2.0 * (kp * 0.52) ** 0.5), "utf-8")
+        mount = MountSpec("sensor", "head", position=(0.0, 0.0, -0.03), quaternion=(0.0, 1.0, 0.0, 0.0))
+        robot = RobotSpec(str(tmp_path / "press.xml"), mounts=(mount,))
+        ball = replace(BALL, position=(0.0, 0.0, 0.005), dynamics="fixed")
+        scene = TaskScene("press", robot, (ball,), physics="ipc", timestep=0.001, gravity=(0.0, 0.0, 0.0))
+        world = TactileWorld(scene, coupling=coupling, outputs=("wrench",))
+        for k in range(steps):
+            state = world.step(np.array([-0.0008 * min(1.0, (k + 1) / 10)]))
+        return -float(state.wrench["sensor"][0, 2]), float(world.data[0].qpos[0]) + 0.0008
+
+    held, off = press(1e6, "one_way", 16)
+    assert off < 1e-7
+    assert press(1e6, "two_way", 16)[0] == pytest.approx(held, rel=0.01)
+    given, off = press(500.0, "two_way", 40)
+    # What the servo bears is what the pad feels, and the link has moved by it.
+    assert 500.0 * off == pytest.approx(given, rel=0.01) and given < 0.9 * held

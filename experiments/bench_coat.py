@@ -1,0 +1,155 @@
+"""How near is the shown coat to the truth around sharp features, on pads whose cells are far wider than they are?
+
+    python experiments/bench_coat.py --out runs/bench_coat          # some minutes on two cores
+
+An edge (the cube of the scene "edge", along x, 0.8 mm deep) and a bar 3 mm wide with sharp rims (0.5 mm deep) are pressed into the GelSight
+Mini's pad. Both are the same all along x in the middle, so that a pad can be refined across y alone until nothing changes: the truth
+is the vertices of such a mesh, with cells of ``--cell-um`` at the sharp line (nothing is interpolated or corrected).
+
+``<shape>.<level>.near_um``, ``ring_um``, ``far_um``: root mean square of the shown height less the truth, on the line x = 0, within 1 mm
+of the edge or rim, 1 to 2 mm, 2 to 4 mm; ``mesh_near_um`` …: the same of the solver's vertices joined by straight lines, which is what
+there was to see; ``force_n`` of each, and ``truth_force_n``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import ipc
+from raytac.errors import InputError, RaytacError
+from raytac.gel.coat_mesh import CoatMesh
+from raytac.io.folder import result_folder
+from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.options import CommonOptions, parse_names
+from raytac.physics.soft import SoftPad
+from raytac.physics.soft_mesh import PadMesh, pad_mesh
+from raytac.sensor import PADS
+from raytac.specs import SensorSpec, load_sensor
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+
+SHAPES = {"edge": 0.0, "bar": 1.5e-3}
+"""y of the sharp line [m]."""
+RANGES = {"near": (0.02e-3, 1e-3), "ring": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
+_GROWTH, _DOWN = 0.14, 0.25
+"""How much a cell grows for each unit of distance from the sharp line, across and downwards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Measure the shown coat around an edge and a bar against a pad refined across."""
+
+    levels: str = "coarse,medium"
+    """Levels to measure, joined by commas."""
+    shapes: str = ",".join(SHAPES)
+    """Of edge, bar."""
+    cell_um: float = 60.0
+    """Cells of the truth at the sharp line [µm]."""
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+
+    def run(self) -> int:
+        start = time.perf_counter()
+        levels, shapes = parse_names(self.levels, "levels"), parse_names(self.shapes, "shapes")
+        for value, name, choices in [(v, "levels", PADS) for v in levels] + [(v, "shapes", SHAPES) for v in shapes]:
+            if value not in choices:
+                raise InputError(name, value=value, rule="must be known", choices=tuple(choices))
+        spec = load_sensor(self.sensor)
+        metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um}
+        with result_folder(self.out or Path("runs") / "bench_coat", ("metrics.json",)) as folder:
+            for shape in shapes:
+                mesh = refined(spec, SHAPES[shape], self.cell_um * 1e-6)
+                truth, metrics[f"{shape}.truth_force_n"], _ = pressed(spec, shape, mesh)
+                metrics[f"{shape}.truth_vertices"] = len(mesh.tets.vertices)
+                for level in levels:
+                    found, metrics[f"{shape}.{level}.force_n"], shown = pressed(spec, shape, pad_mesh(spec.gelpad, level))
+                    for kind, section in (("", shown), ("mesh_", found)):
+                        for name, (low, high) in RANGES.items():
+                            at = SHAPES[shape] + np.linspace(low, high, 200)
+                            off = np.interp(at, *section) - np.interp(at, *truth)
+                            metrics[f"{shape}.{level}.{kind}{name}_um"] = 1e6 * float(np.sqrt((off**2).mean()))
+            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
+            write_metrics(folder / "metrics.json", metrics)
+        for key, value in metrics.items():
+            if not key.startswith("versions"):
+                print(f"{key} = {value:.5g}" if isinstance(value, float) else f"{key} = {value}")
+        return 0
+
+
+Section = tuple[np.ndarray, np.ndarray]
+"""y and z [m] along the line x = 0, y ascending."""
+
+
+def pressed(spec: SensorSpec, shape: str, mesh: PadMesh) -> tuple[Section, float, Section]:
+    """Vertices of the coat on x = 0, normal force [N], shown surface on x = 0."""
+    with tempfile.TemporaryDirectory() as folder:
+        pad = SoftPad(spec, scene(shape, Path(folder)), pitch=0.05e-3, pad=mesh)
+        state = pad.peak(pad.run())
+    assert pad.solver is not None
+    rows, columns = mesh.coat.shape
+    line = pad.solver.scene.coat("pad")[0].reshape(rows, columns, 3)[:, columns // 2]
+    shown = pad.surface(state).height[0][:, pad.grid.shape[1] // 2].astype(float)
+    return (line[:, 1], line[:, 2]), float(state.normal_force[0]), (pad.grid.y, shown)
+
+
+def scene(shape: str, folder: Path) -> PressScene:
+    upright = (1.0, 0.0, 0.0, 0.0)
+    if shape == "edge":
+        spec = ObjectSpec("edge", {"side": 8e-3}, (0.0, 0.0, 0.0), upright, 0.05)
+        return PressScene("edge", spec, (StageSpec("indent", depth=0.8e-3),))
+    import trimesh
+
+    bar = trimesh.creation.box((8e-3, 2.0 * SHAPES["bar"], 4e-3))
+    bar.export(folder / "bar.stl")
+    spec = ObjectSpec("mesh", {"path": str(folder / "bar.stl"), "scale": 1.0}, (0.0, 0.0, 0.0), upright, 0.05)
+    return PressScene("bar", spec, (StageSpec("indent", depth=0.5e-3),))
+
+
+def refined(spec: SensorSpec, sharp: float, cell: float) -> PadMesh:
+    """The pad with cells of ``cell`` [m] across y at ``sharp`` [m] and under the face, wide ones along x."""
+    gelpad = spec.gelpad
+    half = 0.5 * gelpad.size[1]
+    inwards, outwards = steps(cell, sharp, _GROWTH) if sharp else np.zeros(1), steps(cell, half - sharp, _GROWTH)
+    right = np.concatenate([sharp - inwards[::-1], sharp + outwards[1:]])
+    y = np.concatenate([-right[:0:-1], right])
+    along = ipc.graded(0.5 * gelpad.size[0], 7, 2.5 ** (1 / 6))
+    x = np.concatenate([-along[:0:-1], along])
+    z = -steps(cell, gelpad.thickness, _DOWN)[::-1]
+    tets = ipc.box_mesh(x, y, z, cut="mirrored")
+    vertices = tets.vertices.copy()
+    vertices[:, 2] -= gelpad.sag(vertices[:, 0], vertices[:, 1]) * (1.0 + vertices[:, 2] / gelpad.thickness)
+    per_layer = len(x) * len(y)
+    on_coat = np.arange(len(vertices) - per_layer, len(vertices))
+    top = tets.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+    top = top[(top >= on_coat[0]).all(axis=1)]
+    a, b, c = (vertices[top[:, k], :2] for k in range(3))
+    turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    top[turned] = top[turned][:, ::-1]
+    coat = CoatMesh(vertices[on_coat], (top - on_coat[0]).astype(np.int32), x, y)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, on_coat, np.arange(per_layer), cell / 8.0)
+
+
+def steps(first: float, length: float, growth: float) -> np.ndarray:
+    """0 to ``length`` in steps that start near ``first`` [m] and grow by ``growth`` times the way that is done."""
+    at = [0.0]
+    while at[-1] < length:
+        at.append(at[-1] + first + growth * at[-1])
+    return np.asarray(at) * (length / at[-1])
+
+
+def main() -> int:
+    try:
+        return tyro.cli(Args).run()
+    except (InputError, RaytacError) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

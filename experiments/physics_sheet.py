@@ -1,0 +1,182 @@
+"""What does each physics of the pad show? Every press scene under the rigid pad and under the simulated one, on one sheet.
+
+    python experiments/physics_sheet.py --out runs/physics_sheet              # both pads, nine scenes: some minutes on two cores
+    python experiments/physics_sheet.py --pad medium --out runs/physics_sheet_medium
+
+One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's.
+``metrics.json``: ``<scene>.<physics>.`` ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``force_n``, ``contact_mm2``,
+``press_s``; and ``<scene>.contact_um``, ``ring_um``, ``image``: height of the simulated pad less that of the rigid one, root mean square
+where both touch and within 2 mm of that, and mean absolute difference of the images (of 255).
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from raytac.errors import InputError, RaytacError
+from raytac.frame import TactileFrame
+from raytac.io.folder import result_folder
+from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.options import CommonOptions, parse_names
+from raytac.sensor import PADS, TactileSensor
+from raytac.specs import load_press
+
+SCENES = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
+RING = 2e-3
+DIFFERENCE_MM = 0.2
+"""Height differences are shown up to so much, either way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Press scenes under both physics and draw them side by side."""
+
+    scenes: str = ",".join(SCENES)
+    """Names of shipped press scenes or paths of scene files, joined by commas."""
+    pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "coarse"
+    """Level of the simulated pad."""
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file."""
+    quick: bool = False
+    """Small images of the first scene only: enough to see that all works."""
+
+    def run(self) -> int:
+        start = time.perf_counter()
+        names = parse_names(self.scenes, "scenes")
+        if self.pad not in PADS:
+            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
+        names = names[:1] if self.quick else names
+        out = self.out or Path("runs") / "physics_sheet"
+        with result_folder(out, ("sheet.png", "metrics.json")) as folder:
+            metrics: dict[str, Metric] = {"command": "physics_sheet", "pad": self.pad, "seed": self.seed}
+            sensors = {
+                physics: TactileSensor(
+                    self.sensor,
+                    physics=physics,
+                    pad=self.pad if physics == "ipc" else None,
+                    outputs=("rgb", "wrench"),
+                    device=self.device,
+                    seed=self.seed,
+                    resolution=(80, 60) if self.quick else None,
+                )
+                for physics in ("rigid", "ipc")
+            }
+            rows = []
+            for name in names:
+                frames = {}
+                for physics, sensor in sensors.items():
+                    began = time.perf_counter()
+                    pad = sensor.load(load_press(name))
+                    frames[physics] = frame = sensor.update(pad.peak(pad.run()))
+                    metrics |= {f"{name}.{physics}.{key}": value for key, value in measured(frame).items()}
+                    metrics[f"{name}.{physics}.press_s"] = time.perf_counter() - began
+                metrics |= {f"{name}.{key}": value for key, value in compared(frames["rigid"], frames["ipc"]).items()}
+                rows.append((name, frames["rigid"], frames["ipc"]))
+                print(f"{name}: done after {time.perf_counter() - start:.0f} s", flush=True)
+            draw(rows, sensors["ipc"], folder / "sheet.png", self.pad)
+            metrics |= {"device": sensors["ipc"].device_used, "wall_s": time.perf_counter() - start}
+            write_metrics(folder / "metrics.json", metrics | versions((*VERSIONED, "warp-lang")))
+        print(out / "sheet.png")
+        return 0
+
+
+def measured(frame: TactileFrame) -> dict[str, Metric]:
+    surface = frame.surface
+    found: dict[str, Metric] = {
+        "imprint_mm": 1e3 * float(surface.indentation.max()),
+        "bulge_mm": -1e3 * float(surface.indentation.min()),
+        "contact_mm2": 1e6 * float(surface.contact[0].sum()) * surface.grid.pitch[0] * surface.grid.pitch[1],
+    }
+    if frame.force is not None:
+        found["force_n"] = -float(frame.force[0, 2])
+    return found
+
+
+def compared(rigid: TactileFrame, soft: TactileFrame) -> dict[str, Metric]:
+    one, two = rigid.surface, soft.surface
+    off = 1e6 * (two.height[0].astype(float) - one.height[0])
+    both = one.contact[0] & two.contact[0]
+    ring = widened(both, RING, one.grid.pitch) & ~one.contact[0] & ~two.contact[0]
+    found: dict[str, Metric] = {
+        key: float(np.sqrt((off[where] ** 2).mean())) if where.any() else float("nan")
+        for key, where in (("contact_um", both), ("ring_um", ring))
+    }
+    assert rigid.rgb is not None and soft.rgb is not None
+    found["image"] = float(np.abs(rigid.rgb[0].astype(float) - soft.rgb[0]).mean())
+    return found
+
+
+def widened(mask: np.ndarray, by: float, pitch: tuple[float, float]) -> np.ndarray:
+    """Nodes within ``by`` [m] of the mask along x and y, (Ny, Nx)."""
+    out = mask.copy()
+    for axis, step in ((1, pitch[0]), (0, pitch[1])):
+        grown = out.copy()
+        for k in range(1, round(by / step) + 1):
+            ahead, back = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], back[axis] = slice(k, None), slice(None, -k)
+            grown[tuple(ahead)] |= out[tuple(back)]
+            grown[tuple(back)] |= out[tuple(ahead)]
+        out = grown
+    return out
+
+
+def draw(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSensor, path: Path, pad: str) -> None:
+    import matplotlib
+
+    from raytac.report.preview import camera_extent_mm
+
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    left, right, bottom, top = camera_extent_mm(sensor.spec.camera)
+    titles = (
+        "image, rigid pad",
+        f"image, ipc ({pad})",
+        "indentation, rigid [mm]",
+        f"indentation, ipc ({pad}) [mm]",
+        "ipc − rigid [mm]",
+    )
+    figure = Figure(figsize=(13.0, 2.12 * len(rows) + 0.35), layout="constrained", dpi=80)
+    axes = np.atleast_2d(figure.subplots(len(rows), len(titles), squeeze=False))
+    for line, (name, rigid, soft) in zip(axes, rows, strict=True):
+        grid = rigid.surface.grid
+        extent = [1e3 * v for v in (grid.x[0], grid.x[-1], grid.y[-1], grid.y[0])]
+        dents = [1e3 * frame.surface.indentation[0] for frame in (rigid, soft)]
+        deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
+        for axis, frame in zip(line[:2], (rigid, soft), strict=True):
+            assert frame.rgb is not None
+            axis.imshow(frame.rgb[0], extent=(left, right, bottom, top))
+        for axis, dent in zip(line[2:4], dents, strict=True):
+            shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
+        figure.colorbar(shown, ax=list(line[2:4]), shrink=0.85, pad=0.01)
+        off = dents[0] - dents[1]
+        shown = line[4].imshow(off, extent=extent, cmap="PuOr", vmin=-DIFFERENCE_MM, vmax=DIFFERENCE_MM)
+        figure.colorbar(shown, ax=line[4], shrink=0.85, pad=0.02)
+        for axis in line:
+            axis.set(xlim=(left, right), ylim=(bottom, top), xticks=(-5, 0, 5), yticks=(-5, 0, 5))
+            axis.tick_params(labelsize=7, length=2)
+        line[0].set_ylabel(f"{name}\ny [mm]", fontsize=9)
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("x [mm]", fontsize=8)
+    figure.savefig(path)
+
+
+def main() -> int:
+    try:
+        return tyro.cli(Args).run()
+    except (InputError, RaytacError) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

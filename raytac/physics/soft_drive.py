@@ -1,0 +1,230 @@
+"""How a press drives the simulated pad: to a depth of the coat, to a force, sideways, about z, and off again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+from raytac.physics.press_plan import CLEARANCE
+from raytac.physics.soft_approach import STEP, TURN
+from raytac.physics.soft_contact import SoftContact
+from raytac.physics.soft_places import SoftPlaces
+from raytac.physics.soft_reading import SoftReader
+from raytac.specs.press import PressScene, StageSpec
+
+__all__ = ["SoftDrive", "StageStart"]
+
+_LIFT = 3.0
+"""A release may go in steps so many times as long."""
+_CLOSE = 1e-6
+"""A depth is reached within this [m]."""
+_TIGHT = 5e-4
+"""A force is reached within this share."""
+_PATIENCE, _REFINEMENTS = 120, 4
+_STILL = 2e-5
+"""Speed below which a free object lies still [m/s]."""
+
+
+@dataclass(frozen=True)
+class StageStart:
+    """Where B environments were when a stage began."""
+
+    depth: np.ndarray
+    """[m], (B,)."""
+    shear: np.ndarray
+    """[m], (B, 2)."""
+    twist: np.ndarray
+    """[rad], (B,)."""
+    force: np.ndarray
+    """That is kept [N], (B,); NaN where none is."""
+
+
+class SoftDrive:
+    """Takes the object of a press along its stages, for B environments together; knows where it is, not what the pad looks like."""
+
+    def __init__(
+        self,
+        scene: PressScene,
+        solver: SoftContact,
+        reader: SoftReader,
+        places: SoftPlaces,
+        depths: np.ndarray | None,
+        lost: np.ndarray,
+    ) -> None:
+        """``depths`` [m], (B,): of every stage to a depth, in place of the scene's; ``lost``, (B,): environments that never were."""
+        self._scene, self._solver, self._reader, self._places = scene, solver, reader, places
+        self._depths, self._lost, self.num_envs = depths, lost, len(lost)
+        self._d_hat = reader.mesh.d_hat
+        self._is_free = scene.object.dynamics == "affine"
+        self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
+        self.bar = tqdm(disable=True)
+        """Counts the solver's steps."""
+        self._forget()
+
+    def reset(self) -> None:
+        """Back to the start: the pad at rest, the object above it."""
+        self._forget()
+        self._solver.reset()
+
+    def start(self) -> StageStart:
+        """Where the next stage begins."""
+        return StageStart(self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy())
+
+    def read(self, clearance: np.ndarray) -> None:
+        """Take note of the clearance [m], (B,), in the state that was read last."""
+        self._seen = clearance
+
+    def poses(self) -> np.ndarray:
+        """``pad_from_object`` as driven: higher than the depth says by the clearance; (B, 4, 4)."""
+        return self._places.poses(self._kept - self._depth, self._shear, self._twist)
+
+    def case(self) -> np.ndarray | None:
+        """``world_from_pad`` (B, 4, 4) if the case moves."""
+        if self._scene.moves != "case":
+            return None
+        return self._places.case(self._kept - self._depth, self._shear, self._twist)
+
+    def advance(self, stage: StageSpec, fraction: float, begun: StageStart) -> None:
+        """From wherever it is to ``fraction`` of a stage that began at ``begun``."""
+        depth, shear, twist, force = begun.depth, begun.shear, begun.twist, begun.force
+        if stage.kind in ("shear", "twist"):
+            to_shear, to_twist = self._shear, self._twist
+            if stage.kind == "shear":
+                to_shear = shear + fraction * (np.asarray(stage.shear) - shear)
+            else:
+                to_twist = twist + fraction * (stage.twist - twist)
+            self._go(self._depth, to_shear, to_twist, follow=True)
+            self._step()
+            if not np.isfinite(self._force).any():
+                self._settle_depth()
+                self._step()  # so that friction is bounded by the forces at the depth that was settled on
+        elif stage.kind == "release":
+            self._force[:] = np.nan
+            self._release(depth, fraction)
+        elif stage.force is not None:
+            borne = np.where(np.isfinite(force), force, 0.0)
+            self._force[:] = borne + fraction * (stage.force - borne)
+            self._load()
+        else:
+            self._force[:] = np.nan
+            target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
+            start = np.maximum(depth, 0.0)
+            end = np.where(np.isfinite(target), target, 0.0)
+            self._indent(start + fraction * (end - start), is_last=fraction == 1.0)
+
+    def _forget(self) -> None:
+        batch = self.num_envs
+        self._depth = np.full(batch, -CLEARANCE)
+        self._shear, self._twist = np.zeros((batch, 2)), np.zeros(batch)
+        self._force = np.full(batch, np.nan)
+        """Normal force that is being kept [N]; NaN while a depth is."""
+        self._kept = np.full(batch, self._d_hat)
+        """Clearance that the object is held higher by [m]: at first as far as the barrier reaches, then as it was last read."""
+        self._seen = np.full(batch, np.nan)
+        """Clearance in the state that was read last [m]; NaN out of contact."""
+        self._stiffness = np.full(batch, np.nan)
+        self.failed: np.ndarray = self._lost.copy()
+
+    def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
+        """Drive the coat to a depth, without passing it on the way; exactly there at the stage's end."""
+        way = depth - np.maximum(self._depth, -self._d_hat)
+        # Follow the clearance, but never so fast that the object would stand still or turn back.
+        off = np.nan_to_num(self._seen - self._kept)
+        self._kept = self._kept + np.clip(off, -self._d_hat, 0.5 * np.abs(way))
+        short = np.clip(way, 0.0, self._d_hat) if is_last else 0.0
+        self._go(depth - short, self._shear, self._twist)
+        if is_last:
+            self._kept = self._kept + self._off()
+            self._depth = depth
+            self._step()
+            self._settle_depth()
+        if (way < 0.0).any():
+            self._settle_friction()
+
+    def _go(self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0, *, follow: bool = False) -> None:
+        """Drive straight to a place in steps short enough; a force that is kept is kept on the way, and a depth if asked to ``follow``."""
+        begun = np.maximum(self._depth, -self._d_hat) if stretch == 1.0 else self._depth
+        ways = np.abs(depth - begun), np.linalg.norm(shear - self._shear, axis=1), np.abs(twist - self._twist) * (STEP / TURN)
+        steps = max(int(np.ceil(max(way.max() for way in ways) / (STEP * stretch) - 1e-9)), 1)
+        old_shear, old_twist = self._shear, self._twist
+        for step in range(1, steps + 1):
+            share = step / steps
+            self._shear, self._twist = old_shear + share * (shear - old_shear), old_twist + share * (twist - old_twist)
+            self._depth = begun + share * (depth - begun)
+            self._step()
+            if np.isfinite(self._force).any():
+                self._load()
+                begun = depth = self._depth
+            elif follow and step < steps:
+                self._kept = self._kept + np.clip(self._off(), -STEP, STEP)
+
+    def _step(self) -> None:
+        self.failed |= self._solver.drive(self.poses(), self.case())
+        self.bar.update()
+
+    def _settle_friction(self) -> None:
+        self.failed |= self._solver.settle_friction(self.poses(), self.case(), self.failed)
+
+    def _off(self) -> np.ndarray:
+        """How much more the barrier keeps than the object is held higher by [m], (B,); 0 out of contact, or where a force is kept."""
+        clearance = self._reader.clearance(self._solver.seen(self.poses()))
+        return np.where(np.isfinite(clearance) & ~self.failed & ~np.isfinite(self._force), clearance - self._kept, 0.0)
+
+    def _settle_depth(self) -> None:
+        """Correct until the coat, not the barrier's shell, is at the depth."""
+        for _ in range(_REFINEMENTS):
+            off = self._off()
+            if np.abs(off).max() < _CLOSE:
+                return
+            self._kept = self._kept + np.clip(off, -STEP, STEP)
+            self._step()
+
+    def _release(self, depth: np.ndarray, fraction: float) -> None:
+        lift = self._places.lift(self._shear, self._twist)
+        if self._is_free:
+            if fraction == 1.0:
+                self._solver.reset()
+                self._depth = lift - CLEARANCE
+            return
+        self._go(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, _LIFT)
+        self._settle_friction()
+
+    def _load(self) -> None:
+        """Let the contact bear ``self._force``: a free object by its weight, a driven one by a secant search of its depth."""
+        if self._is_free:
+            self._lie()
+            return
+        self._depth = np.maximum(self._depth, -self._d_hat)
+        if not np.isfinite(self._stiffness).all():
+            wanted = np.nan_to_num(self._force)
+            self._stiffness = np.array([self._places.stiffness(b, self._twist[b], wanted[b]) for b in range(self.num_envs)])
+        borne = self._normal_force()
+        for _ in range(_PATIENCE):
+            missing = np.where(np.isfinite(self._force) & ~self.failed, self._force - borne, 0.0)
+            if (np.abs(missing) <= _TIGHT * np.nan_to_num(self._force)).all():
+                return
+            way = np.clip(missing / self._stiffness, -STEP, STEP)
+            self._depth = self._depth + way
+            self._step()
+            before, borne = borne, self._normal_force()
+            moved = np.abs(way) > 1e-9
+            found = (borne - before)[moved] / way[moved]
+            usable = found > 0.1 * self._stiffness[moved]
+            self._stiffness[moved] = np.where(usable, found, self._stiffness[moved])
+        self.failed |= np.abs(missing) > _TIGHT * np.nan_to_num(self._force)
+
+    def _lie(self) -> None:
+        """Let a free object come to rest under its weight."""
+        assert self._weight > 0.0
+        self._solver.weigh(float(self._force[0]) / self._weight)
+        for _ in range(4 * _PATIENCE):
+            self.failed |= self._solver.drive(self.poses())
+            self.bar.update()
+            if (self._solver.speed()[~self.failed] < _STILL).all() and (self._normal_force()[~self.failed] > 0.0).all():
+                return
+        self.failed |= self._solver.speed() >= _STILL
+
+    def _normal_force(self) -> np.ndarray:
+        return -self._solver.forces()[:, :, 2].sum(axis=1)

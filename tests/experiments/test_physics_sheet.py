@@ -1,0 +1,54 @@
+"""The sheet of both physics, small: one scene, both pads, numbers of each."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.io.metrics import read_metrics
+from raytac.io.png import read_png
+from raytac.sensor import TactileSensor
+from tests.conftest import Shader
+
+
+@pytest.fixture
+def physics_sheet(monkeypatch):
+    path = Path(__file__).parents[2] / "experiments" / "physics_sheet.py"
+    spec = importlib.util.spec_from_file_location("physics_sheet", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "physics_sheet", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_quick_is_one_scene_under_both_pads(physics_sheet, tmp_path, monkeypatch):
+    monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
+    assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere,coin").run() == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "sheet.png"]
+    assert read_png(tmp_path / "sheet.png").shape[2] == 3
+    read = read_metrics(tmp_path / "metrics.json")
+    assert not any(key.startswith("coin") for key in read)
+    metrics = {key: float(value) for key, value in read.items() if key.startswith("sphere")}
+    for physics in ("rigid", "ipc"):
+        assert metrics[f"sphere.{physics}.imprint_mm"] == pytest.approx(0.8, rel=0.02)
+    assert metrics["sphere.ipc.bulge_mm"] > 0.005 > metrics["sphere.rigid.bulge_mm"]
+    assert metrics["sphere.contact_um"] < 5.0 < metrics["sphere.ring_um"] < 60.0
+
+
+def test_widening_reaches_as_far_as_asked(physics_sheet):
+    mask = np.zeros((21, 31), bool)
+    mask[10, 15] = True
+    wide = physics_sheet.widened(mask, 0.5e-3, (0.1e-3, 0.25e-3))
+    assert wide.sum() == 11 * 5 and wide[8:13, 10:21].all()
+
+
+def test_an_unknown_level_is_named(physics_sheet, tmp_path):
+    from raytac.errors import InputError
+
+    with pytest.raises(InputError, match=r"pad.*'huge'.*coarse"):
+        physics_sheet.Args(out=tmp_path, pad="huge").run()

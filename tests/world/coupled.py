@@ -1,0 +1,93 @@
+"""Small MuJoCo models coupled to a soft scene, without the rest of a task scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import mujoco
+import numpy as np
+
+from raytac.physics.soft_bodies import SceneBody
+from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.soft_scene import ScenePad, SoftScene
+from raytac.specs import load_sensor
+from raytac.world.coupling import Coupling
+from raytac.world.soft_answers import soft_answers
+
+SENSOR = load_sensor("gelsight_mini")
+MESH = pad_mesh(SENSOR.gelpad, PadLevel(3e-3, 2, 1.5, 1.5, 5e-5))
+
+
+def pose(rotation=None, position=(0.0, 0.0, 0.0)) -> np.ndarray:
+    matrix = np.eye(4)
+    if rotation is not None:
+        matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    return matrix
+
+
+class Coupled:
+    """Bodies of one MuJoCo model that carry pads (their frames are the pads'), and bodies of a soft scene; one environment."""
+
+    def __init__(
+        self,
+        xml: str,
+        pads: list[str],
+        bodies: list[SceneBody],
+        places: Mapping[str, np.ndarray],
+        *,
+        led: list[str] | None = None,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        interval: float = 0.01,
+        law: bool = True,
+        two_way: bool = True,
+        speed: float = 0.0,
+    ) -> None:
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+        self.data.qvel[0] = speed
+        mujoco.mj_forward(self.model, self.data)
+        self.pads, self.led, self.interval, self.law, self.two_way = pads, led or [], interval, law, two_way
+        self.links = {name: int(self.model.body(name).id) for name in [*pads, *self.led]}
+        self.scene = SoftScene(
+            [ScenePad(name, SENSOR, MESH, 0.2e-3) for name in pads], bodies, self.cases(), places, gravity=gravity, dt=interval
+        )
+        self.coupling = Coupling(self.model, list(self.links.values()))
+        self.wrench = np.zeros((len(self.links), 6))
+
+    def at(self, name: str) -> np.ndarray:
+        index = self.model.body(name).id
+        return pose(self.data.xmat[index].reshape(3, 3), self.data.xpos[index])
+
+    def cases(self) -> np.ndarray:
+        return np.stack([self.at(name) for name in self.pads])
+
+    def run(self, seconds: float, control: Callable[[mujoco.MjData], None] | None = None) -> list[float]:
+        """The energy of both simulators after every exchange [J], without that of controls."""
+        h, energies = self.model.opt.timestep, []
+        per, done, steps = round(self.interval / h), 0, round(seconds / h)
+        while done < steps:
+            for k in range(1, per + 1):
+                mujoco.mj_step1(self.model, self.data)
+                if control is not None:
+                    control(self.data)
+                self.coupling.apply(self.data, 0)
+                mujoco.mj_step2(self.model, self.data)
+                mujoco.mj_kinematics(self.model, self.data)
+                if k == per or not self.scene.is_small(self.cases(), self._led()):
+                    break
+            done += k
+            mujoco.mj_comPos(self.model, self.data)
+            report = self.scene.step(self.cases(), self._led(), dt=k * h)
+            assert not report.failed[0] and report.min_gap[0] > 0.0 and report.min_det[0] > 0.0
+            wrench, contacts, partners = soft_answers(self.scene, self.links)[0]
+            self.wrench = wrench
+            if self.two_way:
+                self.coupling.update(self.data, 0, wrench, contacts if self.law else [], partners if self.law else {})
+            mujoco.mj_energyPos(self.model, self.data)
+            mujoco.mj_energyVel(self.model, self.data)
+            energies.append(float(self.data.energy.sum() + report.elastic[0] + report.barrier[0]))
+        return energies
+
+    def _led(self) -> dict[str, np.ndarray]:
+        return {name: self.at(name) for name in self.led}
