@@ -20,6 +20,8 @@ __all__ = ["SceneView"]
 _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 
+_AMBIENT = 1.0
+"""Light from everywhere beside viser's own from above, so that the colours of a coat that looks down are seen."""
 _NEAR_A_PAD = (0.035, 0.06, 0.06)
 """Where an eye looks at a pad from, pad frame [m]: obliquely, from beyond the fingertips of a gripper."""
 _THIN = 0.35
@@ -37,6 +39,7 @@ class SceneView:
         scene, scale = server.scene, self._scale
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
+        scene.add_light_ambient("/ambient", intensity=_AMBIENT)
         server.initial_camera.position = scale * np.asarray(session.camera.position)
         server.initial_camera.look_at = scale * np.asarray(session.camera.look_at)
         server.initial_camera.fov = _FIELD_OF_VIEW
