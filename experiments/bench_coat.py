@@ -61,7 +61,7 @@ class Args(CommonOptions):
             if value not in choices:
                 raise InputError(name, value=value, rule="must be known", choices=tuple(choices))
         spec = load_sensor(self.sensor)
-        metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um}
+        metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um, "seed": self.seed, "device": "cpu"}
         with result_folder(self.out or Path("runs") / "bench_coat", ("metrics.json",)) as folder:
             for shape in shapes:
                 mesh = refined(spec, SHAPES[shape], self.cell_um * 1e-6)

@@ -54,7 +54,7 @@ class FineGrid:
         self.border_y = SplineAxis(mesh.lines_y).matrix(y).astype(np.float32)
         self.border_x = SplineAxis(mesh.lines_x).matrix(x).T.astype(np.float32)
         self._rise_y, self._rise_x = (m.astype(np.float32) for m in contact.surface.matrices(x, y))
-        self._hat_y, self._hat_x = hat_matrix(contact.y, y).astype(np.float32), hat_matrix(contact.x, x).T.astype(np.float32)
+        self._nearest = tuple(np.abs(line[:, None] - fine).argmin(axis=1) for line, fine in ((y, contact.y), (x, contact.x)))
 
     def rise(self, shape: FineShape) -> np.ndarray:
         """Height over rest [m], (Ny, Nx)."""
@@ -66,8 +66,8 @@ class FineGrid:
         return sandwich(self._rise_y, rise, self._rise_x)
 
     def touching(self, shape: FineShape) -> np.ndarray:
-        """Where there is pressure, (Ny, Nx), bool: where most of the fine grid's nodes around have some."""
-        return sandwich(self._hat_y, shape.pressure > 0.0, self._hat_x) > 0.5
+        """Where there is pressure, (Ny, Nx), bool: where the nearest node of the fine grid has some."""
+        return (shape.pressure > 0.0)[np.ix_(*self._nearest)]
 
     def lay(self, height: np.ndarray, shape: FineShape, underside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The coat laid on the object between the nodes of the fine grid, and where it touches; both (Ny, Nx).
@@ -153,9 +153,9 @@ class FineContact:
         if near.any():
             rows, columns = (_span(np.asarray(near.any(axis=k))) for k in (1, 0))
             window = _Window(self, rows, columns)
-            pressure[rows, columns] = window.press(overlap[rows, columns].astype(np.float32), start[rows, columns])
-        everywhere = _Window(self, slice(None), slice(None))
-        return FineShape(rise, pressure, *everywhere.respond(pressure))
+            found = pressure[rows, columns] = window.press(overlap[rows, columns].astype(np.float32), start[rows, columns])
+            return FineShape(rise, pressure, *window.respond(found))
+        return FineShape(rise, pressure, np.zeros_like(pressure), np.zeros(self.surface.mesh.shape, np.float32))
 
     def _extended(self, upwards: np.ndarray, touching: np.ndarray) -> np.ndarray:
         """Heights (V,) that the mesh takes, by linear elasticity, if forces on ``touching`` vertices give them the heights they have."""

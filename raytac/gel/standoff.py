@@ -97,14 +97,14 @@ class StandOff:
             counted = (near | (there & (gap < 0.0))).astype(np.float32)
             share = sandwich(self._hat_y.T, counted, self._hat_x)
             mean = sandwich(self._hat_y.T, counted * gap, self._hat_x) / np.maximum(share, 1e-6)
-            shift += (np.clip(share / self._everywhere / _COVERED, 0.0, 1.0) * mean).ravel()
+            shift += (np.clip(share / np.maximum(self._everywhere, 1e-6) / _COVERED, 0.0, 1.0) * mean).ravel()
         return ContactFit(clearance, shift)
 
     def _bulge(self, underside: np.ndarray, there: np.ndarray) -> np.ndarray:
         """How far the object lies below its mean over a cell around [m], (Ny, Nx), 0 where it lies above."""
         highest = underside[there].min() + _CUT
         cut = np.minimum(np.where(there, underside, highest), highest).astype(np.float32)
-        mean = sandwich(self._hat_y.T, cut, self._hat_x) / self._everywhere
+        mean = sandwich(self._hat_y.T, cut, self._hat_x) / np.maximum(self._everywhere, 1e-6)
         return np.maximum(sandwich(self._hat_y, mean, self._hat_x.T) - cut, 0.0)
 
 

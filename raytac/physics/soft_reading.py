@@ -130,8 +130,10 @@ class SoftReader:
             load = np.maximum(-forces[b, :, 2], 0.0)
             fine, to_grid = self._fine_contact()
             upwards = seen.coat[b, :, 2] - self.mesh.coat.rest[:, 2]
-            smooth = self._surface.rise(places, upwards)
-            near = self._underside(seen, b, self._fine_pad, fit.clearance, fine.here.lattice(smooth) + self._fine_pad.rest)
+            smooth = None
+            if len(seen.objects) > 1:
+                smooth = self._fine_pad.rest + fine.here.lattice(self._surface.rise(places, upwards))
+            near = self._underside(seen, b, self._fine_pad, fit.clearance, smooth)
             shape = fine.solve(places, upwards, load, near - self._fine_pad.rest)
             same = self._fine_pad is self.grid
             under = undersides[b] = near if same else self._underside(seen, b, self.grid, fit.clearance, height[b])
