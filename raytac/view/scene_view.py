@@ -20,7 +20,7 @@ __all__ = ["SceneView"]
 _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 
-_AMBIENT = 1.0
+_AMBIENT = 0.5
 """Light from everywhere beside viser's own from above, so that the colours of a coat that looks down are seen."""
 _NEAR_A_PAD = (0.035, 0.06, 0.06)
 """Where an eye looks at a pad from, pad frame [m]: obliquely, from beyond the fingertips of a gripper."""
