@@ -76,7 +76,7 @@ def test_a_fast_approach_is_cut_and_a_too_fast_one_refused_before_anything_moves
     with pytest.raises(InputError, match=r"world_from_pad.*takes left and cube too far.*6\.4 mm"):
         scene.step(np.stack([pose(LEFT, (0.0, 6e-3, 0.0)), pose(RIGHT, (0.0, 30e-3, 0.0))]))
     after = scene.save()
-    assert np.array_equal(before.world.y, after.world.y) and np.array_equal(before.world_from_pad, after.world_from_pad)
+    assert np.array_equal(before.world.y, after.world.y) and np.array_equal(before.poses.pads, after.poses.pads)
     report = scene.step(fingers(-0.2e-3))
     assert report.substeps > 2 and report.blocked[0] == 0.0
     gentle = two_pads(kind="kinematic", gap=1e-3, friction=0.0)
