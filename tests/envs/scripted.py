@@ -51,10 +51,10 @@ def lift_cube(batch: TaskBatch) -> np.ndarray:
     tool, cube, goal = batch._tool[:, :3, 3], batch._body[:, :3, 3], batch._goal
     force = np.minimum(*(-batch.world.state().wrench[name][:, 2] for name in ("left", "right")))
     off = cube - tool
-    over, held = np.linalg.norm(off[:, :2], axis=1) < 3e-3, force > 0.5
+    over, held = np.linalg.norm(off[:, :2], axis=1) < 4e-3, force > 4.0
     down = tool[:, 2] < cube[:, 2] + 3e-3
     target = np.where(held[:, None], goal - cube, np.where(over[:, None], off, off * [1.0, 1.0, 0.0]))
     action = np.zeros((len(tool), 4))
     action[:, :3] = np.clip(target / 5e-3, -1.0, 1.0) * np.where(held, 0.4, 1.0)[:, None]
-    action[:, 3] = np.where(held, np.clip(0.3 * (force - 3.0), -0.3, 0.3), np.where(over & down, -0.5, 0.0))
+    action[:, 3] = np.where(held, np.where(force > 12.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
     return action

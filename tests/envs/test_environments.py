@@ -52,13 +52,13 @@ def test_the_docstring_says_the_shapes_that_there_are() -> None:
     for kind in ENVS:
         text = " ".join((kind.__doc__ or "").split())
         env = kind()
-        for name, space in env.observation_space.spaces.items():
+        for name, spec in env.batch.arrays.items():
             if name != "body":
-                shown = f"({space.shape[0]},)" if len(space.shape) == 1 else f"({space.shape[0]}, {space.shape[1]})"
+                shown = f"({spec.shape[0]},)" if len(spec.shape) == 1 else f"({spec.shape[0]}, {spec.shape[1]})"
                 assert f"`{name}`" in text and shown in text, (kind, name, shown)
-        assert f"Box(-1, 1, ({env.action_space.shape[0]},))" in text and f"{kind.task.max_episode_steps} steps" in text
+        assert f"Box(-1, 1, ({env.batch.steering.size},))" in text and f"{kind.task.max_episode_steps} steps" in text
         env.reset(seed=0)
-        info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
+        info = env.step(np.zeros(env.batch.steering.size, np.float32))[4]
         assert all(f"`{term}`" in text for term in info["reward_terms"])
 
 
@@ -215,7 +215,7 @@ def test_bad_input_names_the_environment() -> None:
         ({"autoreset_mode": "never"}, "autoreset_mode"),
     ):
         with pytest.raises(InputError, match=text):
-            RollBallVectorEnv(2, **options)
+            RollBallVectorEnv(2, **options)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="3 environments"):
         many.reset(seed=[1, 2])
     with pytest.raises(InputError, match="mask"):
