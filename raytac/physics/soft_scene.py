@@ -12,10 +12,12 @@ import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import PadGrid
+from raytac.physics.batch_check import batch_of, env_mask, rigid_poses
 from raytac.physics.rotation import inverse, nearest_rotation, quaternion, quaternions
 from raytac.physics.soft_bodies import SceneBody, pad_body
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_reading import SeenObject, SeenPad, SoftReader, SoftReading
+from raytac.physics.soft_report import SceneReport
 from raytac.physics.soft_stiffness import pad_stiffness
 from raytac.physics.soft_travel import MOST_SUBSTEPS, Poses, Travel
 from raytac.specs.sensor import SensorSpec
@@ -39,27 +41,6 @@ class ScenePad:
     mesh: PadMesh
     pitch: float = 0.1e-3
     """Spacing of the grid that its surface is read on [m]."""
-
-
-@dataclass(frozen=True)
-class SceneReport:
-    """One step of B environments, all of its parts together; every array has shape (B,).
-
-    failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
-    min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
-    end [J]. substeps: parts of the step.
-    """
-
-    failed: np.ndarray
-    converged: np.ndarray
-    min_gap: np.ndarray
-    min_det: np.ndarray
-    blocked: np.ndarray
-    newton: np.ndarray
-    elastic: np.ndarray
-    barrier: np.ndarray
-    substeps: int
 
 
 @dataclass(frozen=True)
@@ -124,8 +105,8 @@ class SoftScene:
         self.bodies = {body.name: body for body in bodies}
         self._check_names(pads, bodies)
         self.gravity = np.asarray(gravity, float)
-        self.num_envs = num_envs or _batch(world_from_pad, 4, world_from_body)
-        self._start = self._poses("world_from_pad", world_from_pad, len(pads)), self._of_bodies(world_from_body)
+        self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
+        self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._of_bodies(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
         self.settings = settings or ipc.Settings(
             dt=dt,
@@ -191,7 +172,7 @@ class SoftScene:
             done += part
             at = begun.towards(goal, done / MOST_SUBSTEPS)
             found = self.advance(at.pads, at.bodies, (dt or self.settings.dt) * part / MOST_SUBSTEPS)
-            total = found if total is None else _joined(total, found)
+            total = found if total is None else total.then(found)
         assert total is not None
         return total
 
@@ -316,7 +297,7 @@ class SoftScene:
 
     def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
         """Put environments, a mask (B,) or a list, None for all, back to a saved state; there are no contact forces until the next step."""
-        mask = self._mask(envs)
+        mask = env_mask(envs, self.num_envs)
         self.world.restore(state.world, mask)
         self._now.pads[mask] = state.poses.pads[mask]
         for name, pose in state.poses.bodies.items():
@@ -334,11 +315,15 @@ class SoftScene:
         Raises:
             OverlapError: bodies overlap at these poses; nothing has changed then.
         """
-        mask = self._mask(envs)
+        mask = env_mask(envs, self.num_envs)
         if world_from_pad is None and world_from_body is None:
             self.restore(SceneState(self._begin, Poses(self._start[0], self._driven(self._start[1]))), mask)
             return
-        cases = self._start[0] if world_from_pad is None else self._poses("world_from_pad", world_from_pad, len(self.pads))
+        cases = (
+            self._start[0]
+            if world_from_pad is None
+            else rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
+        )
         places = self._start[1] | self._named(world_from_body or {}, free=True)
         before = self.save()
         try:
@@ -386,7 +371,7 @@ class SoftScene:
         return found
 
     def _goal(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None) -> Poses:
-        pads = self._poses("world_from_pad", world_from_pad, len(self.pads))
+        pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         return Poses(pads, self._now.bodies | self._named(driven or {}))
 
     def _spread(self, cases: np.ndarray, places: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
@@ -432,24 +417,12 @@ class SoftScene:
             raise InputError("name", value=name, rule="must be the name of a body of this scene", choices=self.bodies)
         return self.bodies[name]
 
-    def _mask(self, envs: ArrayLike | None) -> np.ndarray:
-        if envs is None:
-            return np.ones(self.num_envs, bool)
-        chosen = np.asarray(envs)
-        if chosen.dtype == bool and chosen.shape == (self.num_envs,):
-            return chosen.copy()
-        if chosen.dtype == bool or (chosen.size and not (chosen.min() >= 0 and chosen.max() < self.num_envs)):
-            raise InputError("envs", value=envs, rule=f"must be a mask ({self.num_envs},) or numbers below {self.num_envs}")
-        mask = np.zeros(self.num_envs, bool)
-        mask[chosen.astype(int)] = True
-        return mask
-
     def _named(self, poses: Mapping[str, ArrayLike], free: bool = False) -> dict[str, np.ndarray]:
         for name in poses:
             if not (self._body(name).is_driven or free):
                 driven = [n for n, body in self.bodies.items() if body.is_driven]
                 raise InputError("driven", value=name, rule="moves freely and takes no pose", choices=driven)
-        return {name: self._poses(name, pose) for name, pose in poses.items()}
+        return {name: rigid_poses(name, pose, self.num_envs) for name, pose in poses.items()}
 
     def _of_bodies(self, poses: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
         for name in poses:
@@ -457,36 +430,4 @@ class SoftScene:
         for name in self.bodies:
             if name not in poses:
                 raise InputError("world_from_body", value=list(poses), rule=f"must say where {name!r} starts")
-        return {name: self._poses(name, poses[name]) for name in self.bodies}
-
-    def _poses(self, what: str, values: ArrayLike, count: int | None = None) -> np.ndarray:
-        """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis."""
-        array = np.asarray(values, float)
-        shape = (4, 4) if count is None else (count, 4, 4)
-        if array.shape not in (shape, (self.num_envs, *shape)):
-            raise InputError(what, value=array.shape, rule=f"must have shape {shape} or {(self.num_envs, *shape)}")
-        off = np.abs(np.swapaxes(array[..., :3, :3], -1, -2) @ array[..., :3, :3] - np.eye(3)).max(initial=0.0)
-        if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
-            raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
-        return np.broadcast_to(array, (self.num_envs, *shape)).copy()
-
-
-def _batch(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
-    """Environments that poses with a first axis speak of; 1 if none has one."""
-    given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
-    given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
-    return given[0][0] if given else 1
-
-
-def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
-    return SceneReport(
-        one.failed | two.failed,
-        one.converged & two.converged,
-        np.minimum(one.min_gap, two.min_gap),
-        np.minimum(one.min_det, two.min_det),
-        np.maximum(one.blocked, two.blocked),
-        one.newton + two.newton,
-        two.elastic,
-        two.barrier,
-        one.substeps + two.substeps,
-    )
+        return {name: rigid_poses(name, poses[name], self.num_envs) for name in self.bodies}
