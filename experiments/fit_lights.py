@@ -58,6 +58,8 @@ class Args(CommonOptions):
     """What is fitted: all but every third press, those on one half of the pad, the shallower half, or all (none held out)."""
     sides: str | None = None
     """Numbers of red, green and blue LEDs, joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    gamma: float | None = None
+    """Where the fit of gamma starts; None is the sensor's own."""
     refine: bool = True
     """Fit the contact circles too; those of held-out presses with the finished lights."""
     surround_scale: float = 1.0
@@ -138,6 +140,10 @@ def split_presses(shots: Photographs, split: str) -> tuple[Photographs, Photogra
 def main(args: Args) -> None:
     began = time.perf_counter()
     start = load_sensor(args.sensor)
+    if args.gamma is not None:
+        if not 1 <= args.gamma <= 2.4:
+            raise InputError("gamma", value=args.gamma, rule="must be in [1, 2.4]")
+        start = dataclasses.replace(start, response=dataclasses.replace(start.response, gamma=args.gamma))
     if args.sides is not None:
         start = with_lights(start, leds_at_walls(start, args.sides))
     shots = read_photographs(args.data, start)
