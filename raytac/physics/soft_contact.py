@@ -84,7 +84,7 @@ class SoftContact:
                 return failed
             state = self.world.save()
             state.kappa[jammed] *= _STIFFER
-            self.world.restore(state)
+            self.world.restore(state, jammed)  # the others keep their forces, which bound friction in the next step
             report = self.scene.advance(self._world_from_pad[:, None], driven)
             failed = failed | report.failed
         return failed | (report.blocked > _BLOCKED)

@@ -16,6 +16,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.markers.contacts import chosen_envs
+from raytac.physics.batch_check import rigid_poses
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
@@ -168,7 +169,7 @@ class TactileWorld:
             bodies: where free bodies start instead: name to ``world_from_body`` (n, 4, 4).
 
         Raises:
-            InputError: an environment or a body that does not exist, a start of the wrong shape or not finite.
+            InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid.
             OverlapError: bodies overlap at a start that is given, with simulated pads.
         """
         chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
@@ -177,6 +178,7 @@ class TactileWorld:
         for name in places:
             if name not in free:
                 raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=free)
+            rigid_poses(f"bodies[{name!r}]", places[name], len(chosen))
         if joints is not None:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
         self._start_over(chosen, joints, places)
@@ -295,6 +297,9 @@ class TactileWorld:
             return [control] * self.num_envs
         if len(control) != self.num_envs:
             raise InputError("control", value=len(control), rule=f"must be one controller, or one for each of {self.num_envs}")
+        for controller in control:
+            if not callable(controller):
+                raise InputError("control", value=controller, rule="must be a controller; constant controls are a NumPy array")
         return list(control)
 
     def _check_start(self) -> None:

@@ -54,11 +54,15 @@ def test_wrong_starts_are_refused_by_name_and_row() -> None:
         ({"table": at}, "free rigid body"),
         ({"ball": at[:1]}, r"shape \(2, 4, 4\)"),
         ({"ball": np.where(np.arange(2)[:, None, None] == 1, np.nan, at)}, "row 1"),
+        ({"ball": 2.0 * at}, r"bodies\['ball'\].*rigid transforms"),
     ):
         with pytest.raises(InputError, match=text):
             world.reset(bodies=bodies)
     with pytest.raises(InputError, match=r"shape \(2, 7\)"):
         world.reset(joints=np.zeros((2, 6)))
+    with pytest.raises(InputError, match="must be a controller"):
+        world.step([0.0, 0.0])  # type: ignore[list-item]
+    assert [data.time for data in world.data] == [0.0, 0.0]
 
 
 def test_a_robot_can_carry_a_sensor_that_is_no_file() -> None:
