@@ -7,7 +7,7 @@ all LEDs at once, and derivatives by powers are exact. Every third press is left
     python experiments/fit_lights.py --data DIR --out runs/fit_lights                   # about 5 minutes on two cores
     python experiments/fit_lights.py --data DIR --iterations 0 --depth-factor 1.1       # scores the sensor as it is
 
-raytac/report/ball_presses.py says what DIR holds. Written: ``lights.toml``, ``sensor.toml`` (the numbers of the sensor file that
+raytac/calibrate/presses.py says what DIR holds. Written: ``lights.toml``, ``sensor.toml`` (the numbers of the sensor file that
 belong to it), ``presses.png`` and ``metrics.json``. A fit that is interrupted leaves what it reached in ``lights.toml``.
 """
 
@@ -23,6 +23,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from raytac.calibrate.photographs import Photographs, encode, press_balls, read_photographs
 from raytac.errors import InputError, RaytacError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
@@ -31,7 +32,6 @@ from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import CommonOptions
 from raytac.optics.lamp import Lamp
 from raytac.optics.raytrace import RayTracer
-from raytac.report.ball_presses import Photographs, encode, press_balls, read_photographs
 from raytac.specs import LedSpec, LightsSpec, SensorSpec, load_sensor, with_lights
 from raytac.specs.lights_text import lights_text
 from raytac.specs.sensor_check import led_corners

@@ -38,8 +38,16 @@ class GraspController:
         gain: float = 0.5e-3,
         stiffness: float = 4000.0,
     ) -> None:
-        """``path``: displacement of the pads' frame from the start, world frame, at a time [s]: (3,) [m]. ``force`` [N] that each pad is to
-        press with. ``speed``: of the closing of the gap [m/s], until both pads feel something; ``gain``: speed per missing force [m/(s N)]."""
+        """Stand still, open.
+
+        Args:
+            world: with two pads and one opening.
+            path: displacement of the pads' frame from the start, world frame, at a time [s]: (3,) [m]; of a floating gripper also (6,).
+            force: that each pad is to press with [N].
+            speed: of the closing of the gap until both pads feel something [m/s].
+            gain: speed of the closing per missing force [m/(s N)].
+            stiffness: of the arm [N/m].
+        """
         assert world.composed.opening is not None and world.arm is not None
         self.world, self.path, self.force, self.speed, self.gain = world, path, force, speed, gain
         self.opening, self.is_closing = world.composed.opening, False

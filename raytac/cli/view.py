@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -13,23 +13,30 @@ from raytac.io.options import DeviceName, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.physics.solver import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
-from raytac.specs import PressScene, load_press
+from raytac.sensor.options import check_whole
+from raytac.specs import PressScene, TaskScene, load_scene
+from raytac.specs.task import COUPLINGS
+
+if TYPE_CHECKING:
+    from raytac.view.session import Session
 
 __all__ = ["ViewArgs"]
+
+_OUTPUTS = ("rgb", "wrench", "traction")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewArgs:
-    """Show a scene in the browser: 3-D view, tactile image, play, pause and step, and sliders that press; needs raytac[view].
+    """Show a scene in the browser: 3-D view, tactile images, play, pause and step, and sliders that press or steer; needs raytac[view].
 
     Prints the address to open and serves until Ctrl-C. On another machine: ssh -L 8080:127.0.0.1:8080 HOST, then open
     http://127.0.0.1:8080 here.
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press scene, such as sphere, or path of a scene file."""
-    sensor: str = "gelsight_mini"
-    """Name of a shipped sensor, or path of a sensor file."""
+    """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
+    sensor: str | None = None
+    """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated; needs raytac[ipc]); as the scene says if not given, else
     rigid."""
@@ -39,6 +46,10 @@ class ViewArgs:
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
     """How the sensor's markers move; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
+    coupling: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(COUPLINGS) + "}")] = None
+    """Whether what simulated pads feel acts back on a task's robot; as the task says if not given."""
+    steps: int | None = None
+    """Control steps of a task from one shown state to the next; 1 if not given, 4 with rigid pads without markers."""
     resolution: str = "320x240"
     """WIDTHxHEIGHT of the tactile image in pixels."""
     host: str = "127.0.0.1"
@@ -59,8 +70,13 @@ class ViewArgs:
         check_address(self.host, self.port)
         if self.optics not in OPTICS:
             raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
-        scene = load_press(self.scene)
-        session = self._press(scene)
+        scene = load_scene(self.scene)
+        physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
+        if physics == "ipc":
+            check_solver("physics='ipc'")
+            if not self.verbose:
+                hush_solver()
+        session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port) as viewer:
             print(f"raytac: {session.title}")
             print(
@@ -74,23 +90,35 @@ class ViewArgs:
                 print("raytac: viewer closed")
         return 0
 
-    def _press(self, scene: PressScene):
+    def _press(self, scene: PressScene, physics: str) -> Session:
         from raytac.view.press_session import PressSession
 
-        physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
-        if physics == "ipc":
-            check_solver("physics='ipc'")
-            if not self.verbose:
-                hush_solver()
+        for name, value in (("coupling", self.coupling), ("steps", self.steps)):
+            if value is not None:
+                raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
+        pad = self.pad or scene.pad if physics == "ipc" else self.pad
         sensor = TactileSensor(
-            self.sensor,
-            physics=physics,
-            pad=self.pad or scene.pad if physics == "ipc" else self.pad,
-            optics=self.optics,
-            outputs=("rgb", "wrench", "traction"),
-            resolution=parse_resolution(self.resolution),
-            device=self.device,
-            seed=self.seed,
-            markers=self.markers,
+            self.sensor or "gelsight_mini", physics=physics, pad=pad, outputs=_OUTPUTS, seed=self.seed, **self._settings()
         )
         return PressSession(sensor, scene)
+
+    def _task(self, scene: TaskScene, physics: str) -> Session:
+        from raytac.view.world_session import WorldSession
+        from raytac.world.world import TactileWorld
+
+        if self.steps is not None:
+            check_whole("steps", self.steps)
+        if self.sensor is not None:
+            scene = replace(scene, robot=replace(scene.robot, sensor=self.sensor))
+        world = TactileWorld(
+            scene, physics=physics, pad=self.pad, coupling=self.coupling, outputs=_OUTPUTS, seed=self.seed, **self._settings()
+        )
+        return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
+
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "optics": self.optics,
+            "markers": self.markers,
+            "resolution": parse_resolution(self.resolution),
+            "device": self.device,
+        }

@@ -22,6 +22,8 @@ _FINEST = 0.2
 """Gaussians narrower than this share of the pitch move nothing that the grid can hold and are skipped."""
 _ROUNDING = 1e-5
 """Share of the deepest overlap that w may exceed u by in a contact: above what float32 gathers in the pyramid, far below a shape."""
+_REACH = 4.8
+"""Standard deviations of all Gaussians together beyond which a contact moves nothing: Φ(−4.8) is 10⁻⁶ of its depth."""
 
 
 class ElasticSurround:
@@ -63,6 +65,7 @@ class ElasticSurround:
         finest = _FINEST * min(grid.pitch)
         self._pyramid = [GaussianBlur(grid.shape, grid.pitch, s) for s in sigmas if s > finest]
         self._final = GaussianBlur(grid.shape, grid.pitch, final_sigma) if final_sigma > finest else None
+        self._reach = _REACH * float(np.sqrt(np.square([*sigmas, final_sigma]).sum()))
 
     def surface(self, object_height: np.ndarray, pad_from_object: np.ndarray | None = None) -> GelSurface:
         """Deformed surface under an object.
@@ -84,18 +87,30 @@ class ElasticSurround:
             elif deepest <= 0.0:
                 height[b] = rest
             else:
-                displacement, contact[b] = self._displacement(overlap, deepest)
-                np.subtract(rest, displacement, out=height[b])
-                centre[b] = self._centroid(overlap, contact[b])
+                window = self._window(overlap)
+                height[b] = rest
+                displacement, contact[b][window] = self._displacement(overlap[window], deepest, window)
+                height[b][window] -= displacement
+                centre[b] = self._centroid(overlap[window], contact[b][window], window)
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
-    def _displacement(self, overlap: np.ndarray, deepest: float) -> tuple[np.ndarray, np.ndarray]:
-        """w [m] and the contact, both (Ny, Nx)."""
+    def _window(self, overlap: np.ndarray) -> tuple[slice, slice]:
+        """Rows and columns that an object moves."""
+        touched = overlap > 0.0
+        found = []
+        for axis, pitch in ((0, self.grid.pitch[1]), (1, self.grid.pitch[0])):
+            line = np.flatnonzero(touched.any(axis=1 - axis))
+            margin = int(np.ceil(self._reach / pitch))
+            found.append(slice(max(int(line[0]) - margin, 0), min(int(line[-1]) + margin + 1, overlap.shape[axis])))
+        return found[0], found[1]
+
+    def _displacement(self, overlap: np.ndarray, deepest: float, window: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
+        """w [m] and the contact, both of the shape of the window."""
         pressed = np.maximum(overlap, 0.0)
         full = overlap > self.contact_scale * deepest
         moved = pressed
         for blur in self._pyramid:
-            moved = blur(moved)
+            moved = blur(moved, window)
             if self.contact_rule == "unilateral":
                 np.maximum(moved, pressed, out=moved)
             else:
@@ -104,10 +119,11 @@ class ElasticSurround:
         # deepest node is always within it, since no Gaussian exceeds the maximum.
         slack = np.float32(max(_ROUNDING * float(deepest), float(np.finfo(np.float32).tiny)))
         contact = (overlap > 0.0) & (moved <= pressed + slack) if self.contact_rule == "unilateral" else full
-        return (moved if self._final is None else self._final(moved)), contact
+        return (moved if self._final is None else self._final(moved, window)), contact
 
-    def _centroid(self, overlap: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
-        """Overlap-weighted centre (x, y) [m] of the contact."""
+    def _centroid(self, overlap: np.ndarray, contact: np.ndarray, window: tuple[slice, slice]) -> tuple[float, float]:
+        """Overlap-weighted centre (x, y) [m] of the contact, both of the shape of the window."""
         weight = np.where(contact, overlap, 0.0).astype(float)
         total = weight.sum()
-        return float(weight.sum(axis=0) @ self.grid.x / total), float(weight.sum(axis=1) @ self.grid.y / total)
+        x, y = self.grid.x[window[1]], self.grid.y[window[0]]
+        return float(weight.sum(axis=0) @ x / total), float(weight.sum(axis=1) @ y / total)

@@ -35,9 +35,15 @@ class GaussianBlur:
         self._along_y = _operator(shape[0], sigma / pitch[1])
         self._along_x = _operator(shape[1], sigma / pitch[0])
 
-    def __call__(self, field: np.ndarray) -> np.ndarray:
-        """Smoothed copy of ``field``, (Ny, Nx) float32."""
+    def __call__(self, field: np.ndarray, window: tuple[slice, slice] | None = None) -> np.ndarray:
+        """Smoothed copy of ``field``, (Ny, Nx) float32.
+
+        ``window`` (rows, columns), with plain starts and stops: ``field`` is that piece of a field that is 0 elsewhere, and so is the
+        result.
+        """
         rows, columns = self._along_y, self._along_x
+        if window is not None:
+            rows, columns = _piece(rows, window[0]), _piece(columns, window[1])
         if isinstance(rows, tuple) and isinstance(columns, tuple):
             core = product(product(rows[1], field), columns[1].T)
             return product(rows[0], product(core, columns[0].T))
@@ -67,6 +73,20 @@ def _operator(nodes: int, width: float) -> _Operator:
         columns = slice(max(start - reach, 0), min(rows.stop + reach, nodes))
         blocks.append((rows, columns, matrix[rows, columns].astype(np.float32)))
     return blocks
+
+
+def _piece(operator: _Operator, kept: slice) -> _Operator:
+    """What an operator does from the nodes ``kept`` to the same nodes."""
+    if isinstance(operator, tuple):
+        return operator[0][kept], operator[1][:, kept]
+    pieces: _Operator = []
+    for rows, columns, weights in operator:
+        first, last = max(rows.start, kept.start), min(rows.stop, kept.stop)
+        left, right = max(columns.start, kept.start), min(columns.stop, kept.stop)
+        if first < last and left < right:
+            part = weights[first - rows.start : last - rows.start, left - columns.start : right - columns.start]
+            pieces.append((slice(first - kept.start, last - kept.start), slice(left - kept.start, right - kept.start), part))
+    return pieces
 
 
 def _cosine_basis(nodes: int, width: float, tail: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

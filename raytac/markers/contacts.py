@@ -138,13 +138,14 @@ class Contacts:
 
 @dataclass(frozen=True)
 class _Contact:
-    """One contact, as in ``Contacts``: centre, radius, ellipse and depth, then what the object did to it."""
+    """One contact, as in ``Contacts``: centre, radius, ellipse and depth, height z of the pressed gel, then what the object did to it."""
 
     x: float
     y: float
     radius: float
     ellipse: tuple[float, float, float]
     depth: float
+    z: float
     shear_x: float = 0.0
     shear_y: float = 0.0
     twist: float = 0.0
@@ -154,9 +155,10 @@ class ContactTracker:
     """Finds the contacts of each surface in turn and sums up the object's motion at each of them.
 
     A contact is a connected piece of the contact. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
-    frame); a contact at G adds (D G − G)_xy to its shear and D's turn about z to its twist: the way of the object's material where it
-    touches, so that rolling, in which that stands still, adds none. A contact is the same as one before if it lies where D carries that
-    one, to within its radius and 1 mm; otherwise it is new and starts from zero. Without contact the history is gone.
+    frame); a contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's turn about z to its twist: the way of the
+    object's material where it touches, so that rolling, in which that stands still, adds none. A contact is the same as one before if it
+    lies where D carries that one, to within its radius and 1 mm; otherwise it is new and starts from zero. Without contact the
+    history is gone.
     """
 
     def __init__(self, batch: int) -> None:
@@ -200,7 +202,10 @@ class ContactTracker:
         )
 
     def _motion(self, pose: np.ndarray | None) -> list[tuple[float, ...] | None]:
-        """D of every environment as (xx, xy, x, yx, yy, y, turn) of the plane z = 0; None where this or the last pose is not known."""
+        """D's rows of x and y in every environment, (xx, xy, xz, x, yx, yy, yz, y), and its turn about z.
+
+        None where this or the last pose is not known.
+        """
         before, self._pose = self._pose, np.full_like(self._pose, np.nan) if pose is None else np.array(pose, dtype=float)
         if pose is None or all(not contacts for contacts in self._contacts):
             return [None] * self.batch
@@ -208,7 +213,7 @@ class ContactTracker:
         shift = self._pose[:, :3, 3] - (turn @ before[:, :3, 3:])[..., 0]
         rows = np.concatenate([turn.reshape(-1, 9), shift], axis=1).tolist()
         return [
-            (r[0], r[1], r[9], r[3], r[4], r[10], math.atan2(r[3] - r[1], r[0] + r[4])) if math.isfinite(sum(r)) else None
+            (*r[:3], r[9], *r[3:6], r[10], math.atan2(r[3] - r[1], r[0] + r[4])) if math.isfinite(sum(r)) else None
             for r in rows
         ]  # fmt: skip
 
@@ -231,10 +236,10 @@ def chosen_envs(envs: np.ndarray | list[int], batch: int) -> list[int]:
 
 def _followed(now: _Contact, before: list[_Contact], motion: tuple[float, ...] | None) -> _Contact:
     """``now`` with the history of the contact before that the motion carries to it, if there is one."""
-    xx, xy, x, yx, yy, y, turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0) if motion is None else motion
+    xx, xy, xz, x, yx, yy, yz, y, turn = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0) if motion is None else motion
     nearest, least = None, math.inf
     for c in before:
-        carried = xx * c.x + xy * c.y + x, yx * c.x + yy * c.y + y
+        carried = xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y
         apart = math.hypot(now.x - carried[0], now.y - carried[1])
         if apart < least:
             nearest, least = (c, carried), apart
@@ -242,7 +247,7 @@ def _followed(now: _Contact, before: list[_Contact], motion: tuple[float, ...] |
         return now
     c, carried = nearest
     shear_x, shear_y = c.shear_x + carried[0] - c.x, c.shear_y + carried[1] - c.y
-    return _Contact(now.x, now.y, now.radius, now.ellipse, now.depth, shear_x, shear_y, c.twist + turn)
+    return _Contact(now.x, now.y, now.radius, now.ellipse, now.depth, now.z, shear_x, shear_y, c.twist + turn)
 
 
 def _find(samples: ContactSamples) -> list[list[_Contact]]:
@@ -289,5 +294,15 @@ def _find(samples: ContactSamples) -> list[list[_Contact]]:
         xx, xy, yy = xx * dx * dx, xy * dx * dy, yy * dy * dy
         scale = area / math.sqrt(xx * yy - xy * xy)
         ellipse = scale * xx, scale * xy, scale * yy
-        found[rows[number] // ny].append(_Contact(wx / w, wy / w, math.sqrt(area), ellipse, w / count))
+        at = wx / w, wy / w
+        z = _rest_at(cells.grid, *at) - w / count
+        found[rows[number] // ny].append(_Contact(*at, math.sqrt(area), ellipse, w / count, z))
     return found
+
+
+def _rest_at(grid: PadGrid, x: float, y: float) -> float:
+    """Height of the resting gel at the node nearest to a place [m]."""
+    column, row = (
+        round((at - float(line[0])) / pitch) for at, line, pitch in zip((x, y), (grid.x, grid.y), grid.pitch, strict=True)
+    )
+    return float(grid.rest[min(row, len(grid.y) - 1), min(column, len(grid.x) - 1)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-__all__ = ["between", "inverse", "nearest_rotation", "quaternion", "quaternions", "turn_angle"]
+__all__ = ["between", "inverse", "nearest_rotation", "quaternion", "quaternions", "rotations", "turn_angle"]
 
 
 def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
@@ -66,3 +66,13 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     mirrored = np.linalg.det(u @ v) < 0.0
     u[mirrored, :, 2] *= -1.0
     return u @ v
+
+
+def rotations(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3) [rad] (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    half = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 − cos a)/a²
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross

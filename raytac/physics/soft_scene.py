@@ -12,26 +12,24 @@ import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import PadGrid
-from raytac.physics.rotation import between, inverse, nearest_rotation, quaternion, quaternions
-from raytac.physics.soft_approach import STEP, TURN, Mover, allowed_share
+from raytac.physics.batch_check import batch_of, env_mask, rigid_poses
+from raytac.physics.rotation import inverse, nearest_rotation, quaternion, quaternions
 from raytac.physics.soft_bodies import SceneBody, pad_body
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_reading import SeenObject, SeenPad, SoftReader, SoftReading
+from raytac.physics.soft_report import SceneReport
 from raytac.physics.soft_stiffness import pad_stiffness
+from raytac.physics.soft_travel import MOST_SUBSTEPS, Poses, Travel
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CREEP", "MOST_SUBSTEPS", "ScenePad", "SceneReport", "SceneState", "SoftScene"]
 
-MOST_SUBSTEPS = 64
-"""Parts that one step may be cut into: 6.4 mm or 128° near something."""
 CREEP = 5e-5
 """ε_v [m/s]: under a share r of the greatest friction, what sticks creeps at ε_v (1 − √(1 − r)); r = 0.75: 0.05 mm in two seconds."""
 _CLOSE = 2e-8
 """A step is solved when no vertex would move further than this [m]; forces of what sticks want it small against ε_v dt."""
-_LINEAR = 1e-4
+_LINEAR = 1e-6
 """Residual of the linear solve [-]: a grasped body that travels must come along to a small share of ε_v dt, or friction would slip."""
-_REACH = 4.0
-"""Bodies closer than so many d̂ are near."""
 
 
 @dataclass(frozen=True)
@@ -46,33 +44,11 @@ class ScenePad:
 
 
 @dataclass(frozen=True)
-class SceneReport:
-    """One step of B environments, all of its parts together; every array has shape (B,).
-
-    failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
-    min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
-    end [J]. substeps: parts of the step.
-    """
-
-    failed: np.ndarray
-    converged: np.ndarray
-    min_gap: np.ndarray
-    min_det: np.ndarray
-    blocked: np.ndarray
-    newton: np.ndarray
-    elastic: np.ndarray
-    barrier: np.ndarray
-    substeps: int
-
-
-@dataclass(frozen=True)
 class SceneState:
     """Everything that a scene's next step depends on; from ``SoftScene.save``."""
 
     world: ipc.State
-    world_from_pad: np.ndarray
-    driven: dict[str, np.ndarray]
+    poses: Poses
 
 
 class SoftScene:
@@ -129,8 +105,8 @@ class SoftScene:
         self.bodies = {body.name: body for body in bodies}
         self._check_names(pads, bodies)
         self.gravity = np.asarray(gravity, float)
-        self.num_envs = num_envs or _batch(world_from_pad, 4, world_from_body)
-        self._start = self._poses("world_from_pad", world_from_pad, len(pads)), self._of_bodies(world_from_body)
+        self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
+        self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._of_bodies(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
         self.settings = settings or ipc.Settings(
             dt=dt,
@@ -156,7 +132,8 @@ class SoftScene:
         except ipc.IpcError as error:
             raise InputError("scene", value=[*self.pads, *self.bodies], rule=f"cannot be solved: {error}") from error
         self._begin = self.world.save()
-        self._target = self._start[0].copy(), self._driven(self._start[1])
+        self._now = Poses(self._start[0], self._driven(self._start[1])).copy()
+        self._travel = Travel(self)
         self._readers: dict[str, SoftReader] = {}
         self._on_surface = {name: self._coat_on_surface(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
@@ -165,9 +142,7 @@ class SoftScene:
 
     def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
         """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
-        cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
-        goals = self._target[1] | self._named(driven or {})
-        return self._part(0, (cases, goals), dt or self.settings.dt)[0] == MOST_SUBSTEPS
+        return self._travel.part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)[0] == MOST_SUBSTEPS
 
     def step(
         self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
@@ -183,25 +158,21 @@ class SoftScene:
             InputError: an unknown or free body, a bad pose, or a motion near another body that would take more than
                 ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then.
         """
-        cases = self._poses("world_from_pad", world_from_pad, len(self.pads))
-        goals = self._target[1] | self._named(driven or {})
-        begun = self._target[0], self._target[1]
+        begun, goal = self._now, self._goal(world_from_pad, driven)
         before: SceneState | None = None
         done, total = 0, None
         while done < MOST_SUBSTEPS:
-            part, pair = self._part(done, (cases, goals), dt or self.settings.dt)
+            part, pair = self._travel.part(done, self._now, goal, dt or self.settings.dt)
             if part == 0:
                 if before is not None:
                     self.restore(before)
-                self._refuse(pair, begun, (cases, goals))
+                raise self._travel.refusal(pair, begun, goal)
             if part < MOST_SUBSTEPS and before is None:
                 before = self.save()
             done += part
-            share = done / MOST_SUBSTEPS
-            at = np.stack([between(begun[0][:, k], cases[:, k], share) for k in range(len(self.pads))], axis=1)
-            there = {name: between(begun[1][name], goal, share) for name, goal in goals.items()}
-            found = self.advance(at, there, (dt or self.settings.dt) * part / MOST_SUBSTEPS)
-            total = found if total is None else _joined(total, found)
+            at = begun.towards(goal, done / MOST_SUBSTEPS)
+            found = self.advance(at.pads, at.bodies, (dt or self.settings.dt) * part / MOST_SUBSTEPS)
+            total = found if total is None else total.then(found)
         assert total is not None
         return total
 
@@ -211,7 +182,7 @@ class SoftScene:
             self.world.set_target(name, world_from_pad[:, k, :3, 3], quaternions(world_from_pad[:, k]))
         for name, pose in driven.items():
             self.world.set_target(name, pose[:, :3, 3], quaternions(pose))
-        self._target = world_from_pad.copy(), self._target[1] | {name: pose.copy() for name, pose in driven.items()}
+        self._now = Poses(world_from_pad, self._now.bodies | dict(driven)).copy()
         report = self.world.step(dt)
         self._failed = report.failed
         return SceneReport(
@@ -322,15 +293,15 @@ class SoftScene:
 
     def save(self) -> SceneState:
         """The state of every environment."""
-        return SceneState(self.world.save(), self._target[0].copy(), {name: p.copy() for name, p in self._target[1].items()})
+        return SceneState(self.world.save(), self._now.copy())
 
     def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
         """Put environments, a mask (B,) or a list, None for all, back to a saved state; there are no contact forces until the next step."""
-        mask = self._mask(envs)
+        mask = env_mask(envs, self.num_envs)
         self.world.restore(state.world, mask)
-        self._target[0][mask] = state.world_from_pad[mask]
-        for name, pose in state.driven.items():
-            self._target[1][name][mask] = pose[mask]
+        self._now.pads[mask] = state.poses.pads[mask]
+        for name, pose in state.poses.bodies.items():
+            self._now.bodies[name][mask] = pose[mask]
         self._failed = self._failed & ~mask | state.world.failed & mask
 
     def reset(
@@ -344,11 +315,15 @@ class SoftScene:
         Raises:
             OverlapError: bodies overlap at these poses; nothing has changed then.
         """
-        mask = self._mask(envs)
+        mask = env_mask(envs, self.num_envs)
         if world_from_pad is None and world_from_body is None:
-            self.restore(SceneState(self._begin, self._start[0], self._driven(self._start[1])), mask)
+            self.restore(SceneState(self._begin, Poses(self._start[0], self._driven(self._start[1]))), mask)
             return
-        cases = self._start[0] if world_from_pad is None else self._poses("world_from_pad", world_from_pad, len(self.pads))
+        cases = (
+            self._start[0]
+            if world_from_pad is None
+            else rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
+        )
         places = self._start[1] | self._named(world_from_body or {}, free=True)
         before = self.save()
         try:
@@ -357,72 +332,9 @@ class SoftScene:
         except ipc.OverlapError as error:
             self.world.restore(before.world, mask)
             raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
-        self.restore(SceneState(self.world.save(), cases, self._driven(places)), mask)
+        self.restore(SceneState(self.world.save(), Poses(cases, self._driven(places))), mask)
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
-
-    def _part(self, done: int, goals: tuple, dt: float) -> tuple[int, tuple[str, str] | None]:
-        """Sixty-fourths of the step that may be made next, a power of two that ``done`` is a multiple of; 0 if that is too few."""
-        movers = self._movers(goals, dt * (1.0 - done / MOST_SUBSTEPS))
-        pairs = [(a, b) for a, b in self._pairs() if not _still(movers[a], movers[b])]
-        share, pair = allowed_share(movers, pairs, _REACH * self.world.d_hat)
-        room = (MOST_SUBSTEPS - done) * share
-        part = MOST_SUBSTEPS
-        while part >= 1 and (part > room * (1.0 + 1e-9) or done % part):
-            part //= 2
-        return part, pair
-
-    def _pairs(self) -> list[tuple[str, str]]:
-        """Pairs with a driven member; the half-spaces second."""
-        pads, bodies = list(self.pads), list(self.bodies.values())
-        found = [(a, b) for k, a in enumerate(pads) for b in pads[k + 1 :]]
-        found += [(a, b.name) for a in pads for b in bodies]
-        for k, a in enumerate(bodies):
-            found += [
-                (b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name)
-                for b in bodies[k + 1 :]
-                if a.is_driven != b.is_driven
-            ]
-        return found
-
-    def _movers(self, goals: tuple, left: float) -> dict[str, Mover]:
-        found = {}
-        for k, (name, pad) in enumerate(self.pads.items()):
-            rest = pad.mesh.tets.vertices
-            now = self.world.positions(name, frame="body")
-            low, high = np.minimum(rest.min(axis=0), now.min(axis=1)), np.maximum(rest.max(axis=0), now.max(axis=1))
-            found[name] = Mover(self._target[0][:, k], goals[0][:, k], low, high)
-        for name, body in self.bodies.items():
-            found[name] = self._mover(body, goals[1], left)
-        return found
-
-    def _mover(self, body: SceneBody, goals: Mapping[str, np.ndarray], left: float) -> Mover:
-        name, solid = body.name, body.solid
-        one = np.ones((self.num_envs, 1))
-        if isinstance(solid, ipc.HalfSpace):
-            return Mover(self._target[1][name], goals[name], 0.0 * one, 0.0 * one, is_plane=True)
-        if isinstance(solid, ipc.SoftBody):
-            start = self._target[1][name] if body.is_driven else self.pose(name)
-            at = np.einsum("bji,bnj->bni", start[:, :3, :3], self.world.positions(name) - start[:, None, :3, 3])
-            low, high = at.min(axis=1), at.max(axis=1)
-        else:
-            start = self._target[1][name] if body.is_driven else self.pose(name)
-            vertices = solid.surface.vertices
-            low, high = one * vertices.min(axis=0), one * vertices.max(axis=0)
-        if body.is_driven:
-            return Mover(start, goals[name], low, high)
-        end = start.copy()
-        end[:, :3, 3] += left * self.velocity(name)
-        return Mover(start, end, low, high)
-
-    def _refuse(self, pair: tuple[str, str] | None, begun: tuple, goals: tuple) -> None:
-        ways = [np.linalg.norm(goals[0][:, k, :3, 3] - begun[0][:, k, :3, 3], axis=1).max() for k in range(len(self.pads))]
-        ways += [np.linalg.norm(goal[:, :3, 3] - begun[1][name][:, :3, 3], axis=1).max() for name, goal in goals[1].items()]
-        rule = (
-            f"takes {' and '.join(pair or ())} too far against each other where they are near: at most {MOST_SUBSTEPS * STEP * 1e3:.3g} mm "
-            f"or {np.degrees(MOST_SUBSTEPS * TURN):.3g} degrees in one step of {self.settings.dt} s; move slower or in more steps"
-        )
-        raise InputError("world_from_pad", value=f"ways of up to {float(max(ways)) * 1e3:.3g} mm", rule=rule)
 
     def _contact_wrench(self, name: str) -> np.ndarray:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):
@@ -457,6 +369,10 @@ class SoftScene:
             for two in names[k + 1 :]:
                 found[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
         return found
+
+    def _goal(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None) -> Poses:
+        pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
+        return Poses(pads, self._now.bodies | self._named(driven or {}))
 
     def _spread(self, cases: np.ndarray, places: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
         """Put environments of the mask at poses of their own, undeformed and at rest."""
@@ -501,24 +417,12 @@ class SoftScene:
             raise InputError("name", value=name, rule="must be the name of a body of this scene", choices=self.bodies)
         return self.bodies[name]
 
-    def _mask(self, envs: ArrayLike | None) -> np.ndarray:
-        if envs is None:
-            return np.ones(self.num_envs, bool)
-        chosen = np.asarray(envs)
-        if chosen.dtype == bool and chosen.shape == (self.num_envs,):
-            return chosen.copy()
-        if chosen.dtype == bool or (chosen.size and not (chosen.min() >= 0 and chosen.max() < self.num_envs)):
-            raise InputError("envs", value=envs, rule=f"must be a mask ({self.num_envs},) or numbers below {self.num_envs}")
-        mask = np.zeros(self.num_envs, bool)
-        mask[chosen.astype(int)] = True
-        return mask
-
     def _named(self, poses: Mapping[str, ArrayLike], free: bool = False) -> dict[str, np.ndarray]:
         for name in poses:
             if not (self._body(name).is_driven or free):
                 driven = [n for n, body in self.bodies.items() if body.is_driven]
                 raise InputError("driven", value=name, rule="moves freely and takes no pose", choices=driven)
-        return {name: self._poses(name, pose) for name, pose in poses.items()}
+        return {name: rigid_poses(name, pose, self.num_envs) for name, pose in poses.items()}
 
     def _of_bodies(self, poses: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
         for name in poses:
@@ -526,40 +430,4 @@ class SoftScene:
         for name in self.bodies:
             if name not in poses:
                 raise InputError("world_from_body", value=list(poses), rule=f"must say where {name!r} starts")
-        return {name: self._poses(name, poses[name]) for name in self.bodies}
-
-    def _poses(self, what: str, values: ArrayLike, count: int | None = None) -> np.ndarray:
-        """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis."""
-        array = np.asarray(values, float)
-        shape = (4, 4) if count is None else (count, 4, 4)
-        if array.shape not in (shape, (self.num_envs, *shape)):
-            raise InputError(what, value=array.shape, rule=f"must have shape {shape} or {(self.num_envs, *shape)}")
-        off = np.abs(np.swapaxes(array[..., :3, :3], -1, -2) @ array[..., :3, :3] - np.eye(3)).max(initial=0.0)
-        if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
-            raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
-        return np.broadcast_to(array, (self.num_envs, *shape)).copy()
-
-
-def _batch(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
-    """Environments that poses with a first axis speak of; 1 if none has one."""
-    given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
-    given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
-    return given[0][0] if given else 1
-
-
-def _still(a: Mover, b: Mover) -> bool:
-    return np.array_equal(a.start, a.end) and np.array_equal(b.start, b.end)
-
-
-def _joined(one: SceneReport, two: SceneReport) -> SceneReport:
-    return SceneReport(
-        one.failed | two.failed,
-        one.converged & two.converged,
-        np.minimum(one.min_gap, two.min_gap),
-        np.minimum(one.min_det, two.min_det),
-        np.maximum(one.blocked, two.blocked),
-        one.newton + two.newton,
-        two.elastic,
-        two.barrier,
-        one.substeps + two.substeps,
-    )
+        return {name: rigid_poses(name, poses[name], self.num_envs) for name in self.bodies}

@@ -7,6 +7,7 @@ from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec, load_marker_
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.press_file import load_press, validate_press
+from raytac.specs.scene_file import load_scene
 from raytac.specs.sensor import (
     CameraSpec,
     CaseSpec,
@@ -49,6 +50,7 @@ __all__ = [
     "load_marker_motion",
     "load_mesh",
     "load_press",
+    "load_scene",
     "load_sensor",
     "load_task",
     "validate_press",

@@ -28,6 +28,8 @@ _MODES = {
     "stopped": "stopped: the program that served this page has ended",
 }
 _COMMANDS = ("Play", "Pause", "Step", "Reset")
+_ALL = "all"
+"""Button that takes the eye back to where it began."""
 _AXES = ("x", "y", "z")
 
 
@@ -106,6 +108,8 @@ class Page:
                 "see through", True, visible=self._view.has_hiding, hint="Let the coat be seen through objects"
             )
         self._view.see_through(True)
+        self._look = gui.add_button_group("look at", (_ALL, *(pad.name for pad in self._session.pads)))
+        self._look.on_click(self._look_at)
         self._quantity.on_update(lambda _: self._redraw())
         self._see_through.on_update(lambda _: self._view.see_through(self._see_through.value))
         self._facts = gui.add_html("")
@@ -139,6 +143,10 @@ class Page:
             player.drive(control.name, slider.value)  # the value now: of many events the last one counts
 
         slider.on_update(moved)
+
+    def _look_at(self, event: GuiEvent[Any]) -> None:
+        if event.client is not None and self._last is not None:
+            self._view.look(event.client, self._last.pads.get(event.target.value))
 
     # --- drawing ---------------------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from itertools import chain
 
 import numpy as np
 
-from raytac.errors import InputError, RaytacError
+from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.gel.part import Part
 from raytac.physics.contact_state import ContactState
@@ -17,11 +17,10 @@ from raytac.physics.part_surface import object_surface
 from raytac.physics.soft import SoftPad
 from raytac.physics.soft_bodies import OBJECT, PAD
 from raytac.sensor import TactileSensor
-from raytac.sensor.contact_width import LEAST_CELLS
 from raytac.specs import PressScene, validate_press
 from raytac.specs.press import StageSpec
-from raytac.view.sensor_view import grid_faces, pad_view, sensor_lines, sensor_solids, strided
-from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid
+from raytac.view.sensor_view import coat_edges, grid_faces, narrow_warning, pad_view, sensor_lines, sensor_solids, strided
+from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid, check_targets
 
 __all__ = ["PressSession"]
 
@@ -35,6 +34,8 @@ _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
 """Ends of the sliders for force [N], shear [mm] and twist [degrees]."""
 _STATES = {"rigid": 20, "ipc": 10}
 """States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
+_SAG = 1e-5
+"""How far the drawn facets of a curved object lie inside it [m]."""
 _OBJECT_COLOUR = (150, 156, 166)
 
 
@@ -92,7 +93,7 @@ class PressSession:
             self.reset()
 
     def drive(self, targets: Mapping[str, float]) -> None:
-        self._check(targets)
+        check_targets(self.controls, targets)
         for name, value in targets.items():
             control = next(c for c in self.controls if c.name == name)
             self._held.pop(control.instead_of, None)
@@ -144,16 +145,6 @@ class PressSession:
             Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),
         )
 
-    def _check(self, targets: Mapping[str, float]) -> None:
-        for name, value in targets.items():
-            control = next((c for c in self.controls if c.name == name), None)
-            if control is None:
-                raise InputError(
-                    "control", value=name, rule="must be one of the scene's", choices=[c.name for c in self.controls]
-                )
-            if not control.low <= value <= control.high:
-                raise InputError(control.label, value=value, rule=f"must be within {control.low:g} and {control.high:g}")
-
     def _way(self, name: str) -> tuple[StageSpec | None, int]:
         """The stage that takes the object to where the control ``name`` is held, in how many states; None if it is there."""
         now, wanted = self._places(), self._held[name]
@@ -196,7 +187,7 @@ class PressSession:
         closed = [part for part in self._pad.parts if part.kind != "plane"]
         shapes = []
         if closed:
-            surface = object_surface(closed)
+            surface = object_surface(closed, _SAG)
             shapes.append(Solid("object", surface.vertices, surface.faces, _OBJECT_COLOUR, hides_pads=True))
         for k, part in enumerate(p for p in self._pad.parts if p.kind == "plane"):
             shapes.append(
@@ -216,13 +207,7 @@ class PressSession:
         """Edges of the simulated pad's own mesh over the smooth coat."""
         if not isinstance(self._pad, SoftPad):
             return ()
-        return (Lines("coat_mesh", self._coat_edges(self._pad.mesh.coat.rest), (205, 212, 222), 0.8),)
-
-    def _coat_edges(self, vertices: np.ndarray) -> np.ndarray:
-        rows, columns = self._pad.mesh.coat.shape  # type: ignore[union-attr]
-        at = vertices.reshape(rows, columns, 3) + np.array([0.0, 0.0, 2e-5])  # clear of the faces below
-        along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 3)
-        return np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 3)])
+        return (Lines("coat_mesh", coat_edges(self._pad.mesh.coat, self._pad.mesh.coat.rest), (205, 212, 222), 0.8),)
 
     def _drawn(self, frame: TactileFrame, image_ms: float) -> Snapshot:
         name, surface = self._sensor.spec.name, frame.surface
@@ -230,14 +215,10 @@ class PressSession:
         reshaped: dict[str, np.ndarray] = {}
         if isinstance(self._pad, SoftPad):
             if surface.coat is not None:
-                reshaped["coat_mesh"] = self._coat_edges(surface.coat.positions[0])
+                reshaped["coat_mesh"] = coat_edges(surface.coat.mesh, surface.coat.positions[0])
             soft = self._soft_object()
             if soft is not None:
                 reshaped["object"], poses["object"] = soft[0], np.eye(4)
-        warning = ""
-        if frame.contact_cells is not None and frame.contact_cells[0] < LEAST_CELLS:
-            cells = frame.contact_cells[0]
-            warning = f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} its force at a given depth is too large."
         controls = {name: self._held.get(name, value) for name, value in self._places().items()} if self._is_drivable else {}
         return Snapshot(
             pads={name: pad_view(frame, self._grid, np.eye(4))},
@@ -245,7 +226,7 @@ class PressSession:
             reshaped=reshaped,
             controls=controls,
             facts=self._facts(frame),
-            warning=warning,
+            warning=narrow_warning(frame),
             time_ms={"image": image_ms, **frame.time_ms},
         )
 

@@ -9,16 +9,21 @@ import numpy as np
 from raytac.robots.pose import quaternion
 from raytac.view.colours import ColourScale
 from raytac.view.glb import coloured_glb
-from raytac.view.session import Session, Snapshot
+from raytac.view.session import PadView, Session, Snapshot
+from raytac.view.smooth import split_creases
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import ClientHandle, ViserServer
 
 __all__ = ["SceneView"]
 
 _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 
+_AMBIENT = 0.5
+"""Light from everywhere beside viser's own from above, so that the colours of a coat that looks down are seen."""
+_NEAR_A_PAD = (0.035, 0.06, 0.06)
+"""Where an eye looks at a pad from, pad frame [m]: obliquely, from beyond the fingertips of a gripper."""
 _THIN = 0.35
 """Opacity of what pads are seen through."""
 
@@ -28,25 +33,29 @@ class SceneView:
 
     def __init__(self, server: ViserServer, session: Session) -> None:
         """Put the session's solids and lines into the scene, unplaced, and the eye where the session wants it."""
+        self._session = session
         self._server, self._pads = server, {pad.name: pad for pad in session.pads}
         self._scale = session.units_per_metre
         scene, scale = server.scene, self._scale
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
+        scene.add_light_ambient("/ambient", intensity=_AMBIENT)
         server.initial_camera.position = scale * np.asarray(session.camera.position)
         server.initial_camera.look_at = scale * np.asarray(session.camera.look_at)
         server.initial_camera.fov = _FIELD_OF_VIEW
-        self._solids = {
-            solid.name: scene.add_mesh_simple(
+        self._sources: dict[str, np.ndarray] = {}
+        """Vertex of the session's mesh that each drawn one is, by name of solid."""
+        self._solids = {}
+        for solid in session.solids:
+            source, faces = split_creases(solid.vertices, solid.faces)
+            self._sources[solid.name] = source
+            self._solids[solid.name] = scene.add_mesh_simple(
                 f"/solids/{solid.name}",
-                scale * solid.vertices,
-                solid.faces,
+                scale * solid.vertices[source],
+                faces,
                 color=solid.colour,
                 opacity=_opacity(solid.opacity),
-                flat_shading=True,
             )
-            for solid in session.solids
-        }
         self._lines = {
             lines.name: scene.add_line_segments(
                 f"/lines/{lines.name}",
@@ -58,7 +67,19 @@ class SceneView:
             for lines in session.lines
         }
         self._hiding = {solid.name: solid.opacity for solid in session.solids if solid.hides_pads}
+        self._placed: dict[str, np.ndarray] = {}
+        """Pose that each solid and line was drawn at last."""
         self._coats = {}
+
+    def look(self, client: ClientHandle, view: PadView | None) -> None:
+        """Take one client's eye to a pad, on the side that the pad looks to; None is back to the start."""
+        if view is None:
+            eye, target = (np.asarray(place) for place in (self._session.camera.position, self._session.camera.look_at))
+        else:
+            pose = view.world_from_pad
+            eye, target = pose[:3, :3] @ np.asarray(_NEAR_A_PAD) + pose[:3, 3], pose[:3, 3]
+        with client.atomic():
+            client.camera.position, client.camera.look_at = self._scale * eye, self._scale * target
 
     @property
     def has_hiding(self) -> bool:
@@ -75,11 +96,14 @@ class SceneView:
         with self._server.atomic():
             for name, pose in snapshot.poses.items():
                 handle = self._solids.get(name) or self._lines.get(name)
-                if handle is not None and np.isfinite(pose).all():
-                    handle.position, handle.wxyz = self._scale * pose[:3, 3], quaternion(pose[:3, :3])
+                before = self._placed.get(name)
+                if handle is None or not np.isfinite(pose).all() or (before is not None and np.array_equal(pose, before)):
+                    continue
+                self._placed[name] = pose.copy()
+                handle.position, handle.wxyz = self._scale * pose[:3, 3], quaternion(pose[:3, :3])
             for name, points in snapshot.reshaped.items():
                 if name in self._solids:
-                    self._solids[name].vertices = _f32(self._scale * points)
+                    self._solids[name].vertices = _f32(self._scale * points[self._sources[name]])
                 elif name in self._lines:
                     self._lines[name].points = _f32(self._scale * points)
             for name, view in snapshot.pads.items():

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from raytac.frame import TactileFrame
+from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.pad import rest_height
 from raytac.gel.surface import PadGrid
+from raytac.sensor.contact_width import LEAST_CELLS
 from raytac.specs import SensorSpec
 from raytac.view.session import Lines, PadView, Solid
 
-__all__ = ["grid_faces", "pad_view", "sensor_lines", "sensor_solids", "strided"]
+__all__ = ["coat_edges", "gel_solid", "grid_faces", "narrow_warning", "pad_view", "sensor_lines", "sensor_solids", "strided"]
 
 _MOST_VERTICES = 12_000
 """Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
@@ -65,12 +67,33 @@ def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env
     )
 
 
-def sensor_solids(spec: SensorSpec, prefix: str = "") -> tuple[Solid, ...]:
-    """The gel block below its coat, and the lights; pad frame."""
-    return (Solid(prefix + "gel", *_block(spec), _GEL, 0.35), *_lights(spec, prefix))
+def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
+    """What to say of a contact that a simulated pad's cells cannot resolve; empty if they can."""
+    if frame.contact_cells is None or not frame.contact_cells[env] < LEAST_CELLS:
+        return ""
+    cells = frame.contact_cells[env]
+    return f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} its force at a given depth is too large."
 
 
-def sensor_lines(spec: SensorSpec, prefix: str = "") -> tuple[Lines, ...]:
+def coat_edges(mesh: CoatMesh, vertices: np.ndarray) -> np.ndarray:
+    """Grid lines of a simulated coat whose vertices (V, 3) [m] are where they are now, as segments (N, 2, 3)."""
+    rows, columns = mesh.shape
+    at = vertices.reshape(rows, columns, 3) + np.array([0.0, 0.0, 2e-5])  # clear of the faces below
+    along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 3)])
+
+
+def gel_solid(spec: SensorSpec, name: str = "gel") -> Solid:
+    """The gel block below its coat, see-through; pad frame."""
+    return Solid(name, *_block(spec), _GEL, 0.35)
+
+
+def sensor_solids(spec: SensorSpec) -> tuple[Solid, ...]:
+    """The gel block, and every light as its rectangle, seen from both sides, in the colour of its light; pad frame."""
+    return (gel_solid(spec), *_lights(spec))
+
+
+def sensor_lines(spec: SensorSpec) -> tuple[Lines, ...]:
     """The inside of the case as a box, and the camera's view of the plane z = 0; pad frame."""
     (wide, long), gel = spec.case.size, spec.gelpad
     case = _box_edges((-0.5 * wide, -0.5 * long, spec.case.floor_z), (0.5 * wide, 0.5 * long, -gel.thickness))
@@ -80,7 +103,7 @@ def sensor_lines(spec: SensorSpec, prefix: str = "") -> tuple[Lines, ...]:
     corners = np.array([[u, v] for u, v in ((0, 0), (width, 0), (width, height), (0, height))], float)
     seen = np.column_stack([eye[0] + (corners[:, 0] - cx) * px, eye[1] + (corners[:, 1] - cy) * py, np.zeros(4)])
     rays = [np.stack([np.broadcast_to(eye, (4, 3)), seen], axis=1), np.stack([seen, np.roll(seen, -1, axis=0)], axis=1)]
-    return Lines(prefix + "case", case, _CASE), Lines(prefix + "camera_view", np.concatenate(rays), _VIEW)
+    return Lines("case", case, _CASE), Lines("camera_view", np.concatenate(rays), _VIEW)
 
 
 def _block(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -103,8 +126,7 @@ def _block(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([top, back]), np.concatenate([sides, floor])
 
 
-def _lights(spec: SensorSpec, prefix: str) -> tuple[Solid, ...]:
-    """Every LED as its rectangle, both sides, in the colour of its light."""
+def _lights(spec: SensorSpec) -> tuple[Solid, ...]:
     found = []
     for led in spec.lights.leds:
         u, v = np.asarray(led.edges)
@@ -113,7 +135,7 @@ def _lights(spec: SensorSpec, prefix: str) -> tuple[Solid, ...]:
         faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
         power = np.asarray(led.power)
         red, green, blue = (round(60 + 195 * float(p)) for p in power / max(float(power.max()), 1e-12))
-        found.append(Solid(f"{prefix}leds/{led.name}", corners, faces, (red, green, blue)))
+        found.append(Solid(f"leds/{led.name}", corners, faces, (red, green, blue)))
     return tuple(found)
 
 

@@ -6,13 +6,27 @@ are in metres in the session's world frame unless a field says otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-__all__ = ["QUANTITIES", "CameraPlace", "Control", "Lines", "Pad", "PadView", "Quantity", "Session", "Snapshot", "Solid"]
+from raytac.errors import InputError
+
+__all__ = [
+    "QUANTITIES",
+    "CameraPlace",
+    "Control",
+    "Lines",
+    "Pad",
+    "PadView",
+    "Quantity",
+    "Session",
+    "Snapshot",
+    "Solid",
+    "check_targets",
+]
 
 Colour = tuple[int, int, int]
 """8-bit sRGB."""
@@ -52,6 +66,17 @@ class Control:
     """A sentence that the page shows on hovering."""
     instead_of: str = ""
     """Name of another control that this one takes over from when it is moved, as a force does from a depth; empty is none."""
+
+
+def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> None:
+    """Raises ``InputError`` for a target of no control, or beyond its control's ends."""
+    known = {control.name: control for control in controls}
+    for name, value in targets.items():
+        if name not in known:
+            raise InputError("control", value=name, rule="must be one of the scene's", choices=known)
+        control = known[name]
+        if not control.low <= value <= control.high:
+            raise InputError(control.label, value=value, rule=f"must be within {control.low:g} and {control.high:g}")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ import numpy as np
 
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_bounds, object_height
-from raytac.gel.pad import make_grid
+from raytac.gel.pad import make_grid, rest_height
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.load_law import LoadLaw
@@ -75,8 +75,12 @@ class _Pad:
         self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
         self.gel = int(model.geom(mounted.gel).id)
         self.coarse = make_grid(spec.gelpad, _PITCH)
-        gy, gx = np.gradient(self.coarse.rest, self.coarse.y, self.coarse.x)
-        self.slope_x, self.slope_y = gx, gy
+        self.rest_x, self.rest_y = (
+            rest_height(spec.gelpad, self.coarse.x, np.zeros(1)),
+            rest_height(spec.gelpad, np.zeros(1), self.coarse.y),
+        )
+        self.slope_x = np.gradient(self.rest_x, self.coarse.x)
+        self.slope_y = np.gradient(self.rest_y, self.coarse.y)
         self.cell = self.coarse.pitch[0] * self.coarse.pitch[1]
         self.highest = float(self.coarse.rest.max())
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
@@ -96,12 +100,13 @@ class _Pad:
         least = float(gap.min())
         if not least < 0.0:
             return None
-        j, i = (gap < 0.0).nonzero()
-        share = gap[j, i]
-        share = share / share.sum()
-        centre = np.array([share @ x[i], share @ y[j], share @ under[j, i]])
-        slope = share @ self.slope_x[rows, columns][j, i], share @ self.slope_y[rows, columns][j, i]
-        normal = np.array([-slope[0], -slope[1], 1.0])
+        share = np.minimum(gap, 0.0)
+        total = float(share.sum())
+        along_x, along_y = share.sum(axis=0) / total, share.sum(axis=1) / total
+        # The resting surface is a sum of one function of x and one of y, and the body's underside is that plus the gap.
+        z = along_x @ self.rest_x[columns] + along_y @ self.rest_y[rows] + float(np.vdot(share, share)) / total
+        centre = np.array([along_x @ x, along_y @ y, z])
+        normal = np.array([-(along_x @ self.slope_x[columns]), -(along_y @ self.slope_y[rows]), 1.0])
         return Touch(-_refined(gap, least), centre, normal / math.sqrt(normal @ normal), gap)
 
     def law(self, touch: Touch) -> LoadLaw:

@@ -201,7 +201,7 @@ class SoftPads:
         report = self.soft.step(cases, led, dt)
         self._last_cases, self._last_led = cases, led
         failed |= report.failed
-        alive = np.flatnonzero(~failed)
+        alive = np.flatnonzero(~failed).tolist()
         self._mirror(datas, alive)
         if self._coupling is not None:
             answers = soft_answers(self.soft, self._felt)

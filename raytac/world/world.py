@@ -30,6 +30,7 @@ from raytac.world.rigid_pads import RigidPads
 from raytac.world.state import Control, Controller, WorldState
 
 if TYPE_CHECKING:
+    from raytac.physics.soft_scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
 __all__ = ["TactileWorld"]
@@ -141,6 +142,11 @@ class TactileWorld:
             if mounted.name not in self._sensors:
                 self._sensors[mounted.name] = TactileSensor(spec, seed=self.seed + i, **self._sensor_settings)
         return self._sensors
+
+    @property
+    def soft(self) -> SoftScene | None:
+        """The contact solver's scene, with everything that it knows; None with the rigid pad."""
+        return None if isinstance(self._pads, RigidPads) else self._pads.soft
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

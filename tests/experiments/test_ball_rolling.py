@@ -22,3 +22,13 @@ def test_a_short_stroke_with_the_rigid_pad(tmp_path: Path) -> None:
     # Between two parallel planes a ball that slips on neither goes exactly half as far; the dome and the dent take a little off.
     assert value("ball_over_pad_way") == pytest.approx(0.5, abs=0.03)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"metrics.json", "rigid.png", "rigid.gif", "rigid_strip.png"}
+
+
+@pytest.mark.slow
+def test_a_short_stroke_with_the_simulated_pad(tmp_path: Path) -> None:
+    main(Args(physics=("ipc",), quick=True, out=tmp_path / "run"))
+    found = read_metrics(tmp_path / "run" / "metrics.json")
+    assert found["ball_rolling.ipc.goals_reached"] == 1
+    assert float(found["ball_rolling.ipc.goal_error_mm"]) < 1.0
+    assert float(found["ball_rolling.ipc.min_gap_m"]) > 0.0 and float(found["ball_rolling.ipc.min_det_f"]) > 0.5
+    assert float(found["ball_rolling.ipc.ball_over_pad_way"]) == pytest.approx(0.5, abs=0.03)

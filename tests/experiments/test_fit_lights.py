@@ -11,12 +11,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from raytac.calibrate.photographs import Photographs, press_balls
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png, write_png
 from raytac.optics.raytrace import RayTracer
-from raytac.report.ball_presses import Photographs, press_balls
 from raytac.specs import LightsSpec, SensorSpec, load_lights, load_sensor
 from raytac.specs.lights_text import lights_text
 
@@ -82,6 +82,6 @@ def test_lights_that_made_the_photographs_are_found_again(fit_lights: ModuleType
 
 
 def test_a_folder_without_photographs_is_refused_before_anything_is_written(fit_lights: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"background\.png"):
+    with pytest.raises(InputError, match=r"data = .*none.: must exist"):
         fit_lights.main(fit_lights.Args(data=tmp_path / "none", out=tmp_path / "out", device="cpu"))
     assert not (tmp_path / "out").exists()

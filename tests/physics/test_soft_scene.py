@@ -76,7 +76,7 @@ def test_a_fast_approach_is_cut_and_a_too_fast_one_refused_before_anything_moves
     with pytest.raises(InputError, match=r"world_from_pad.*takes left and cube too far.*6\.4 mm"):
         scene.step(np.stack([pose(LEFT, (0.0, 6e-3, 0.0)), pose(RIGHT, (0.0, 30e-3, 0.0))]))
     after = scene.save()
-    assert np.array_equal(before.world.y, after.world.y) and np.array_equal(before.world_from_pad, after.world_from_pad)
+    assert np.array_equal(before.world.y, after.world.y) and np.array_equal(before.poses.pads, after.poses.pads)
     report = scene.step(fingers(-0.2e-3))
     assert report.substeps > 2 and report.blocked[0] == 0.0
     gentle = two_pads(kind="kinematic", gap=1e-3, friction=0.0)
@@ -137,3 +137,19 @@ def test_what_cannot_be_is_named():
     with pytest.raises(OverlapError, match="reset"):
         scene.reset(world_from_pad=fingers(-1e-3))
     scene.step(fingers(0.1e-3))
+
+
+@pytest.mark.gpu
+def test_cuda_and_cpu_press_alike():
+    """Steps of several lengths too, each of which is a recording of its own."""
+    found = {}
+    for device in ("cpu", "cuda"):
+        cube = scene_body("cube", (primitive("box", (HALF,) * 3),), "affine", density=1e4)
+        pads = [ScenePad("left", SENSOR, MESH), ScenePad("right", SENSOR, MESH)]
+        scene = SoftScene(pads, [cube], fingers(0.2e-3), {"cube": np.eye(4)}, gravity=(0, 0, 0), device=device)
+        for gap, dt in ((0.1e-3, 0.01), (0.0, 0.004), (-0.1e-3, 0.01), (-0.1e-3, 0.01)):
+            scene.step(fingers(gap), dt=dt)
+        found[device] = np.concatenate(
+            [scene.wrench("left")[0], scene.pose("cube")[0].ravel(), scene.stiffness("left")[0].diagonal()]
+        )
+    assert found["cuda"] == pytest.approx(found["cpu"], rel=1e-3, abs=1e-4)

@@ -24,6 +24,8 @@ class PageClient:
         """Properties of each GUI element by its id; ``value`` among them."""
         self.nodes: dict[str, dict[str, Any]] = {}
         """Properties of each node of the 3-D scene by its name."""
+        self.eye: tuple[float, ...] | None = None
+        """Where the page has put this client's camera last."""
         self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -65,6 +67,8 @@ class PageClient:
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
         elif kind in ("SetPositionMessage", "SetOrientationMessage"):
             self.nodes.setdefault(message["name"], {}).update({k: v for k, v in message.items() if k in ("position", "wxyz")})
+        elif kind == "SetCameraPositionMessage":
+            self.eye = tuple(message["position"])
         elif kind.startswith("Gui") and "props" in message:
             known = self.elements.setdefault(message["uuid"], {})
             known |= {"type": kind, **message["props"], **({"value": message["value"]} if "value" in message else {}), **known}

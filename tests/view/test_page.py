@@ -97,6 +97,19 @@ def test_what_is_shown_can_be_chosen(open_page):
     client.until(lambda: client.nodes["/solids/block"]["opacity"] is None, "an opaque object")
 
 
+def test_each_client_looks_where_it_likes(open_page):
+    viewer, one = open_page(StillSession())
+    two = PageClient(viewer.port)
+    two.until(lambda: two.eye is not None, "the start")
+    start = two.eye
+    one.press("left")
+    one.until(lambda: one.eye == pytest.approx((3.5, 6.0, 6.0)), "the pad, 100 units a metre")
+    assert two.eye == start
+    one.press("all")
+    one.until(lambda: one.eye == pytest.approx((2.0, -3.0, 2.0)), "the start again")
+    two.close()
+
+
 def test_closing_tells_the_clients_frees_the_port_and_ends_all_threads():
     before = set(threading.enumerate())
     viewer = Viewer(StillSession(), port=0)

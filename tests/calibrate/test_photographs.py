@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytac.calibrate.photographs import Photographs, press_balls, read_photographs
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
 from raytac.io.png import write_png
-from raytac.report.ball_presses import Photographs, press_balls, read_photographs
 from raytac.specs import SensorSpec, load_sensor
 
 RADIUS = 3.155e-3
@@ -57,10 +57,10 @@ def test_on_the_dome_the_overlap_is_the_labelled_circle_seen_by_the_camera(senso
 
 
 def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="must exist"):
+    with pytest.raises(InputError, match="tell a layout"):
         read_photographs(tmp_path, sensor)
     grey = np.full((240, 320, 3), 128, np.uint8)
-    for name in ("background.png", "6.310mm_04.png"):
+    for name in ("background.png", "6.310mm_04.png", "6.310mm_05.png", "9.500mm_06.png"):
         write_png(tmp_path / name, grey)
     head, row = "diameter,index,cx_px,cy_px,r_px,fully_visible\n", "6.310mm,4,100.5,80,30,1\n"
     (tmp_path / "labels.csv").write_text(head + row + "6.310mm,5,1,1,30,0\n", "utf-8")
@@ -69,10 +69,11 @@ def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> 
     np.testing.assert_allclose(found.presses, (128 / 255) ** sensor.response.gamma)
     assert found.shrunk(8).background.shape == (30, 40, 3)
     assert found.distance(sensor)[0, 79, 100] == pytest.approx(math.hypot(0, 0.5) / 30)
-    (tmp_path / "labels.csv").write_text(head + row + "9.500mm,4,100,80,30,1\n", "utf-8")
+    (tmp_path / "labels.csv").write_text(head + row + "9.500mm,6,100,80,30,1\n", "utf-8")
     with pytest.raises(InputError, match="one ball"):
         read_photographs(tmp_path, sensor)
-    write_png(tmp_path / "background.png", grey[:100])
+    for name in ("background.png", "6.310mm_04.png"):
+        write_png(tmp_path / name, grey[:200])
     (tmp_path / "labels.csv").write_text(head + row, "utf-8")
-    with pytest.raises(InputError, match="shape"):
+    with pytest.raises(InputError, match="sensor's size"):
         read_photographs(tmp_path, sensor)

@@ -1,25 +1,20 @@
-"""Photographs of ball presses with labelled contact circles, and the gel surfaces that belong to them.
-
-A folder holds ``background.png`` (the sensor untouched), ``labels.csv`` (columns ``diameter``, ``index``, ``cx_px``, ``cy_px``, ``r_px``,
-``fully_visible``) and ``DIAMETER_INDEX.png``, such as ``6.310mm_07.png``, all at the sensor's own resolution.
-"""
+"""Photographs of ball presses in linear light, and the gel surfaces that belong to their contact circles."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from raytac.calibrate.presses import read_presses
 from raytac.errors import InputError
 from raytac.gel.elastic import PYRAMID_SIGMAS, ElasticSurround
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import rest_height
 from raytac.gel.part import primitive
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.io.png import read_png
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Photographs", "encode", "press_balls", "read_photographs"]
@@ -61,33 +56,22 @@ def encode(linear: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def read_photographs(folder: Path, sensor: SensorSpec) -> Photographs:
-    """The fully visible presses of a folder.
+    """The fully visible presses of a data set that labels its circles, at the sensor's own resolution.
 
     Raises:
-        InputError: no such folder, a missing file, an image of another size, more than one ball, or no fully visible press.
+        InputError: no such data set, images of another size than the sensor's, more than one ball, or no fully visible press.
+        CalibrationError: a missing or malformed file.
     """
-    for needed in (folder, folder / "labels.csv", folder / "background.png"):
-        if not needed.exists():
-            raise InputError("data", value=str(needed), rule="must exist: background.png, labels.csv and photographs, see --help")
-    with (folder / "labels.csv").open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["fully_visible"] == "1"]
-    balls = {row["diameter"] for row in rows}
+    presses = read_presses(folder)
+    presses = presses.take(presses.fully_visible)
+    balls = sorted({f"{2e3 * radius:.4g} mm" for radius in presses.ball_radius})
     if len(balls) != 1:
-        raise InputError("data", value=sorted(balls), rule="must hold fully visible presses of one ball")
-    width, height = sensor.camera.resolution
-
-    def image(path: Path) -> np.ndarray:
-        pixels = read_png(path)
-        if pixels.shape != (height, width, 3):
-            raise InputError(
-                "data", value=f"{path.name}: {pixels.shape}", rule=f"must have the sensor's shape ({height}, {width}, 3)"
-            )
-        return (pixels / 255) ** sensor.response.gamma
-
-    ball = balls.pop()
-    presses = np.stack([image(folder / f"{ball}_{int(row['index']):02d}.png") for row in rows])
-    circles = np.array([[float(row[key]) for key in ("cx_px", "cy_px", "r_px")] for row in rows])
-    return Photographs(image(folder / "background.png"), presses, circles, float(ball.removesuffix("mm")) / 2e3)
+        raise InputError("data", value=balls, rule="must hold fully visible presses of one ball")
+    if presses.resolution != sensor.camera.resolution:
+        rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
+        raise InputError("data", value=presses.resolution, rule=rule)
+    background, images = ((image / 255) ** sensor.response.gamma for image in (presses.background, presses.images))
+    return Photographs(background, images, presses.circles, float(presses.ball_radius[0]))
 
 
 def press_balls(

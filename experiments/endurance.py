@@ -1,0 +1,225 @@
+"""Does anything wear in ten thousand control steps of picking up, holding and letting go with two simulated pads?
+
+    python experiments/endurance.py --out runs/endurance                    # all of it; goes on where an earlier run stopped
+    python experiments/endurance.py --out runs/endurance --most-s 540       # as much as fits into nine minutes
+
+Two pads on a floating gripper take a cube from a table, lift it, hold it, put it down and let go, again and again. Every step must keep
+surfaces apart and tetrahedra upright, converge, and leave the gel's back where the case is; memory must not grow. After every cycle the
+state and the record are written, so that the run can be cut at any time.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import tyro
+
+import ipc
+from experiments.grasp_control import GraspController, smooth
+from raytac.errors import RaytacError
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.options import CommonOptions
+from raytac.physics.soft_scene import SceneState
+from raytac.physics.soft_travel import Poses
+from raytac.specs.task_file import load_task
+from raytac.world.world import TactileWorld
+
+OBJECT = "object"
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+"""What of MuJoCo's state the next step depends on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Pick, hold and release until the steps are done."""
+
+    steps: int = 10_000
+    """Control steps in all."""
+    most_s: float = 0.0
+    """Stop after the first cycle that ends later than this [s]; 0: only when the steps are done."""
+    pad: str = "coarse"
+    """How finely pads are cut."""
+    force: float = 4.0
+    """That each pad is to press with [N]."""
+    height_mm: float = 5.0
+    """That the object is lifted by [mm]."""
+    close_steps: int = 30
+    lift_steps: int = 40
+    hold_steps: int = 50
+    lower_steps: int = 40
+    open_steps: int = 40
+    """Of one cycle."""
+    coupling: str = "two_way"
+
+
+ROW = ("min_gap_m", "min_det_f", "unconverged", "newton_mean", "bond_m", "frame_m", "lifted_m", "drift_m", "speed_s", "memory_mb")
+"""Of each cycle: least gap and det F, steps without convergence, mean Newton iterations, greatest distance of a bonded vertex from its
+place in the case and of the case from MuJoCo's frame, height that the object was held at, its distance from where the first cycle began,
+seconds a step, resident memory."""
+
+
+def main(args: Args) -> None:
+    out = args.out if args.out is not None else Path("runs") / "endurance"
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    world = make_world(args)
+    cycle = args.close_steps + args.lift_steps + args.hold_steps + args.lower_steps + args.open_steps
+    rows, done, spent = resume(out, world, args)
+    first = np.array(world.scene.body(OBJECT).position)
+    while done < args.steps:
+        rows.append(one_cycle(world, args, first))
+        done += cycle
+        if not all(np.isfinite(rows[-1])) or not (rows[-1][0] > 0.0 and rows[-1][1] > 0.0):
+            raise RaytacError(f"after {done} steps: {dict(zip(ROW, rows[-1], strict=True))}")
+        store(out, world, args, rows, done, spent + time.perf_counter() - began)
+        print(f"{done}: " + ", ".join(f"{key} {value:.3g}" for key, value in zip(ROW, rows[-1], strict=True)), flush=True)
+        if args.most_s and time.perf_counter() - began > args.most_s:
+            break
+    report(out, args, rows, done, spent + time.perf_counter() - began)
+
+
+def make_world(args: Args) -> TactileWorld:
+    scene = load_task("lift_cube")
+    middle, width = scene.body(OBJECT).position, float(scene.body(OBJECT).params["width"])
+    place = (middle[0], middle[1], 0.0145)
+    robot = replace(
+        scene.robot, model="floating_gripper", joints=None, opening=width + 4e-3, position=place, quaternion=(0.0, 1.0, 0.0, 0.0)
+    )
+    return TactileWorld(
+        replace(scene, robot=robot), physics="ipc", pad=args.pad, coupling=args.coupling, outputs=("wrench",), device=args.device
+    )
+
+
+def one_cycle(world: TactileWorld, args: Args, first: np.ndarray) -> list[float]:
+    """Pick up, hold, put down, let go; the row of it."""
+    assert world.soft is not None
+    begin, dt = float(world.data[0].time), world.scene.control_timestep
+    ends = np.cumsum([args.close_steps, args.lift_steps, args.hold_steps, args.lower_steps, args.open_steps])
+    up = (ends[0] * dt, ends[1] * dt, ends[2] * dt, ends[3] * dt)
+
+    def path(t: float) -> np.ndarray:
+        t -= begin
+        share = smooth((t - up[0]) / (up[1] - up[0])) - smooth((t - up[2]) / (up[3] - up[2]))
+        return np.array([0.0, 0.0, 1e-3 * args.height_mm * share, 0.0, 0.0, 0.0])
+
+    grasp = GraspController(world, path, force=args.force)
+    state, seen, newton, unconverged, lifted = world.state(), [], [], 0, 0.0
+    bonds = {name: (pad.mesh.bonded, pad.mesh.tets.vertices[pad.mesh.bonded]) for name, pad in world.soft.pads.items()}
+    bond = frame = 0.0
+    since = time.perf_counter()
+    for step in range(int(ends[-1])):
+        if step == int(ends[3]):
+            grasp.force = 0.0
+        grasp.is_closing = step < int(ends[3])
+        grasp.update(state)
+        state = world.step(grasp)
+        if state.failed[0]:
+            raise RaytacError(f"the physics broke down at {state.time[0]:.3f} s")
+        seen.append((state.report["min_gap"][0], state.report["min_det"][0]))
+        newton.append(int(state.report["newton"][0]))
+        unconverged += int(not state.report["converged"][0])
+        for name, (held, rest) in bonds.items():
+            bond = max(bond, float(np.abs(world.soft.world.positions(name, frame="body")[0, held] - rest).max()))
+            frame = max(frame, float(np.abs(world.soft.pose(name)[0] - state.world_from_pad[name][0]).max()))
+        if step == int(ends[2]) - 1:
+            lifted = float(world.soft.pose(OBJECT)[0, 2, 3] - first[2])
+    seconds = (time.perf_counter() - since) / int(ends[-1])
+    drift = float(np.linalg.norm(world.soft.pose(OBJECT)[0, :3, 3] - first))
+    gap, det = np.min(seen, axis=0)
+    return [float(gap), float(det), unconverged, float(np.mean(newton)), bond, frame, lifted, drift, seconds, memory_mb()]
+
+
+def memory_mb() -> float:
+    """Resident memory of this process [MB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def settings_of(args: Args) -> str:
+    kept = {k: v for k, v in vars(args).items() if k not in ("out", "steps", "most_s", "device", "seed")}
+    return json.dumps(kept, sort_keys=True)
+
+
+def store(out: Path, world: TactileWorld, args: Args, rows: list[list[float]], done: int, spent: float) -> None:
+    """State and record, replaced in one move. Nothing touches a pad at the end of a cycle, so the coupling has no memory to keep."""
+    assert world.soft is not None
+    values = np.empty(mujoco.mj_stateSize(world.model, STATE))
+    mujoco.mj_getState(world.model, world.data[0], values, STATE)
+    soft = world.soft.save()
+    arrays = {f"solver.{f.name}": getattr(soft.world, f.name) for f in fields(soft.world)}
+    arrays |= {f"body.{name}": pose for name, pose in soft.poses.bodies.items()}
+    part = out / "partial.npz"
+    record = {"rows": np.array(rows), "done": done, "spent": spent, "settings": settings_of(args)}
+    np.savez(part, allow_pickle=False, mujoco=values, pads=soft.poses.pads, **record, **arrays)
+    part.replace(out / "state.npz")
+
+
+def resume(out: Path, world: TactileWorld, args: Args) -> tuple[list[list[float]], int, float]:
+    """Rows, steps and seconds of an earlier run whose state is taken over; nothing if there is none."""
+    assert world.soft is not None
+    path = out / "state.npz"
+    if not path.exists():
+        return [], 0, 0.0
+    with np.load(path, allow_pickle=False) as file:
+        if str(file["settings"]) != settings_of(args):
+            raise RaytacError(f"{path} is of a run with other settings: {file['settings']}; choose another --out or delete it")
+        mujoco.mj_setState(world.model, world.data[0], file["mujoco"], STATE)
+        mujoco.mj_forward(world.model, world.data[0])
+        solver = ipc.State(**{f.name: file[f"solver.{f.name}"] for f in fields(ipc.State)})
+        bodies = {key.removeprefix("body."): file[key] for key in file.files if key.startswith("body.")}
+        world.soft.restore(SceneState(solver, Poses(file["pads"], bodies)))
+        rows, done, spent = file["rows"].tolist(), int(file["done"]), float(file["spent"])
+    print(f"goes on after {done} steps")
+    return rows, done, spent
+
+
+def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: float) -> None:
+    from matplotlib.figure import Figure
+
+    table = np.array(rows)
+    column = {key: table[:, k] for k, key in enumerate(ROW)}
+    half = max(len(rows) // 2, 1)
+    metrics: dict[str, Metric] = {"experiment": "endurance", "device": args.device, "seed": args.seed, "wall_s": spent}
+    metrics |= {
+        "endurance.steps": done,
+        "endurance.cycles": len(rows),
+        "endurance.min_gap_m": float(column["min_gap_m"].min()),
+        "endurance.min_det_f": float(column["min_det_f"].min()),
+        "endurance.unconverged_steps": int(column["unconverged"].sum()),
+        "endurance.bond_m": float(column["bond_m"].max()),
+        "endurance.frame_m": float(column["frame_m"].max()),
+        "endurance.lifted_least_mm": 1e3 * float(column["lifted_m"].min()),
+        "endurance.drift_mm": 1e3 * float(column["drift_m"][-1]),
+        "endurance.ms_per_step": 1e3 * float(np.median(column["speed_s"])),
+        "endurance.memory_mb": float(column["memory_mb"][-1]),
+        "endurance.memory_growth_mb": float(column["memory_mb"][-1] - column["memory_mb"][half - 1]),
+    }
+    figure = Figure(figsize=(8, 9), layout="constrained")
+    names = ("min_gap_m", "min_det_f", "newton_mean", "lifted_m", "drift_m", "memory_mb")
+    for axes, key in zip(figure.subplots(len(names), 1, sharex=True), names, strict=True):
+        axes.plot(np.arange(1, len(rows) + 1), column[key])
+        axes.set_ylabel(key, fontsize="small")
+    figure.axes[-1].set_xlabel("cycle")
+    figure.savefig(out / "endurance.png", dpi=110)
+    write_metrics(out / "metrics.json", metrics | versions())
+    print(
+        f"{done} steps, {len(rows)} cycles: least gap {metrics['endurance.min_gap_m']:.2e} m, "
+        f"least det F {metrics['endurance.min_det_f']:.3f}, "
+        f"bond off by {metrics['endurance.bond_m']:.1e} m, memory grew by {metrics['endurance.memory_growth_mb']:.1f} MB in the second half"
+    )
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except RaytacError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,1 @@
+"""Real sensor images with known indenters: reading them, and fitting sensors to them."""
