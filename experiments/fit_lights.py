@@ -2,9 +2,12 @@
 
 The forward model is raytac's own: the ball pressed into the rigid pad, the ``fast`` ray tracer with shadows and inter-reflection, the
 sensor's response. Light is additive, so one rendering with every LED in a layer of its own gives the derivatives by a parameter of
-all LEDs at once, and derivatives by powers are exact. Every third press is left out of the fit and scored.
+all LEDs at once, and derivatives by powers are exact. Fitted with the LEDs: gamma, the stray light that no gel changes (``black_level``)
+and the vignette; in turn with them, the contact circle of every press. Some presses are left out of the fit and scored.
 
-    python experiments/fit_lights.py --data DIR --out runs/fit_lights                   # about 5 minutes on two cores
+    python experiments/fit_lights.py --data DIR --out runs/fit_lights                   # the sensor's own LEDs, from where they are
+    python experiments/fit_lights.py --data DIR --sides 3,2,3 --out runs/fit_lights     # red, green, blue LEDs at the walls, from scratch
+    python experiments/fit_lights.py --data DIR --split left     # fitted to the left half of the pad, tested on the right
     python experiments/fit_lights.py --data DIR --iterations 0 --depth-factor 1.1       # scores the sensor as it is
 
 raytac/calibrate/presses.py says what DIR holds. Written: ``lights.toml``, ``sensor.toml`` (the numbers of the sensor file that
@@ -16,36 +19,29 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
-from raytac.calibrate.photographs import Photographs, encode, press_balls, read_photographs
+from raytac.calibrate.light_fit import LightFit, solve
+from raytac.calibrate.light_parameters import CHANNELS, LightParameters, darkest, leds_at_walls
+from raytac.calibrate.photographs import Photographs, decode, encode, press_balls, read_photographs
 from raytac.errors import InputError, RaytacError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import CommonOptions
-from raytac.optics.lamp import Lamp
 from raytac.optics.raytrace import RayTracer
-from raytac.specs import LedSpec, LightsSpec, SensorSpec, load_sensor, with_lights
+from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.lights_text import lights_text
-from raytac.specs.sensor_check import led_corners
 
-CHANNELS = ("red", "green", "blue")
-SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
-"""Outward direction (x, y) of the wall that the LEDs of a layer stay at."""
-STEPS = np.array([0.15, 0.15, 0.15, 0.03, 0.03, 0.1])
-"""Steps of the derivatives: position [mm], azimuth and elevation of the axis [rad], lobe exponent. Wide enough to cross the cells of a
-shadow walk."""
-VIEW_MARGIN = 0.3
-"""How far [mm] the plane through an LED across its axis, its 90-degree cut-off, stays from every point of the visible pad."""
-CEILING = -5.1
-"""Highest z [mm] of an LED: below gel and a support plate of 1 mm, so that ``refraction.model = "slab"`` stays possible."""
+ROUNDS = 4
+"""Times that LEDs and circles are fitted in turn at each resolution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,229 +54,45 @@ class Args(CommonOptions):
     """Name of a shipped sensor, or path of a sensor file; its lights are where the fit starts."""
     depth_factor: float = 1.2
     """Depth of a press over that of a ball whose overlap with the resting gel is the labelled circle (docs/rigid-pad.md)."""
+    split: Literal["press", "left", "right", "shallow", "none"] = "press"
+    """What is fitted: all but every third press, those on one half of the pad, the shallower half, or all (none held out)."""
+    sides: str | None = None
+    """Numbers of red, green and blue LEDs, joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    gamma: float | None = None
+    """Where the fit of gamma starts; None is the sensor's own."""
+    refine: bool = True
+    """Fit the contact circles too; those of held-out presses with the finished lights."""
     surround_scale: float = 1.0
     """Widths of the elastic surround over Taxim's."""
     iterations: int = 30
-    """Steps of the solver at each of the two resolutions."""
+    """Steps of the solver at each of the two resolutions, in rounds with the circles between them."""
     background_weight: float = 0.7
     """Weight of a pixel of the image at rest against one of a press."""
     quick: bool = False
     """Six presses, small images, ten steps at most: shows that all runs."""
 
 
-# ------------------------------------------------------------------------------------------------------------ parameters
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """``leds`` (L, 6): x, y, z [mm], azimuth, elevation [rad], lobe; ``power`` (L, 3): own channel [W/sr], the other two relative to it;
-    ``vignette``: a₁ of 1 + a₁r². ``template``: the light file that names, layers and sizes come from."""
-
-    template: LightsSpec
-    leds: np.ndarray
-    power: np.ndarray
-    vignette: float
-
-    @classmethod
-    def of(cls, sensor: SensorSpec) -> Parameters:
-        """Those of a sensor.
-
-        Raises:
-            InputError: a layer that is no camera channel.
-        """
-        leds, power = [], []
-        for led in sensor.lights.leds:
-            if led.layer not in CHANNELS:
-                raise InputError(
-                    "led.layer", value=led.layer, rule="must be a camera channel, the LED's colour", choices=CHANNELS
-                )
-            x, y, z = led.axis
-            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(z), led.lobe])
-            own, *others = (led.power[c] for c in channels(led))
-            power.append([own, *(other / max(own, 1e-12) for other in others)])
-        return cls(sensor.lights, np.array(leds), np.array(power), sensor.response.vignetting[0])
-
-    def flat(self) -> np.ndarray:
-        return np.concatenate([self.leds.ravel(), self.power.ravel(), [self.vignette]])
-
-    def at(self, x: np.ndarray) -> Parameters:
-        """The parameters of a vector as ``flat`` gives it."""
-        cut = self.leds.size
-        return Parameters(self.template, x[:cut].reshape(-1, 6), x[cut:-1].reshape(-1, 3), float(x[-1]))
-
-    def moved(self, leds: np.ndarray) -> Parameters:
-        return dataclasses.replace(self, leds=leds)
-
-    def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Power by LED and channel (L, 3) [W/sr], and its slope by each of the LED's three parameters (L, 3, 3)."""
-        power, slope = np.zeros((len(self.leds), 3)), np.zeros((len(self.leds), 3, 3))
-        for k, (led, (main, a, b)) in enumerate(zip(self.template.leds, self.power, strict=True)):
-            own, first, second = channels(led)
-            power[k, [own, first, second]] = main, main * a, main * b
-            slope[k, 0, [own, first, second]] = 1, a, b
-            slope[k, 1, first] = slope[k, 2, second] = main
-        return power, slope
-
-    def lights(self, powers: np.ndarray | None = None) -> LightsSpec:
-        """The light file, with these powers or other ones (L, 3)."""
-        leds = []
-        for led, row, w in zip(self.template.leds, self.leds, self.powers()[0] if powers is None else powers, strict=True):
-            flat, azimuth = np.cos(row[4]), row[3]
-            axis = (float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4])))
-            place, power = (row[0] / 1e3, row[1] / 1e3, row[2] / 1e3), (float(w[0]), float(w[1]), float(w[2]))
-            leds.append(dataclasses.replace(led, position=tuple(map(float, place)), axis=axis, lobe=float(row[5]), power=power))
-        return LightsSpec(tuple(leds))
-
-    def bounds(self, sensor: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest parameters: an LED stays at its wall and looks at most 75 degrees aside of straight across."""
-        low, high = [], []
-        half = 5e2 * np.array(sensor.case.size)
-        for led, row in zip(self.template.leds, self.leds, strict=True):
-            out = np.array(SIDES[led.layer])
-            across = np.arctan2(-out[1], -out[0])
-            across += 2 * np.pi * np.round((row[3] - across) / (2 * np.pi))
-            low.append([*np.where(out > 0, 0.6 * half, 0.1 - half), -24.0, across - 1.31, -1.2, 1.0])
-            high.append([*np.where(out < 0, -0.6 * half, half - 0.1), CEILING, across + 1.31, 1.0, 15.0])
-        shares = np.tile([0.0, 0.0, 0.0], len(low)), np.tile([1.0, 0.5, 0.5], len(low))
-        return np.r_[np.ravel(low), shares[0], -0.4], np.r_[np.ravel(high), shares[1], 0.0]
-
-
-def channels(led: LedSpec) -> tuple[int, int, int]:
-    """The LED's own channel, then the other two."""
-    own = CHANNELS.index(led.layer)
-    return own, *(c for c in range(3) if c != own)  # type: ignore[return-value]
-
-
-# ------------------------------------------------------------------------------------------------------------ the fit
-
-
-class Problem:
-    """Residuals in 8-bit levels: the presses with the real background as flat field (disc and ring up to twice the labelled radius), the
-    image at rest, and a penalty [500 levels/mm] where an LED leaves its place or its cut-off comes near the view."""
-
-    def __init__(
-        self, sensor: SensorSpec, shots: Photographs, surface: GelSurface, p: Parameters, weight: float, device: str
-    ) -> None:
-        """``weight`` of a pixel at rest; the light that comes over the case is that of ``p`` and stays."""
-        self.sensor, self.shots, self.surface, self.weight = sensor, shots, surface, weight
-        height, width = shots.background.shape[:2]
-        self.press, self.row, self.column = np.nonzero(shots.distance(sensor) < 2)
-        native, (cx, cy) = sensor.camera.resolution, sensor.camera.principal_point
-        v, u = (np.mgrid[:height, :width] + 0.5) * native[0] / width
-        self.r2 = (((u - cx) ** 2 + (v - cy) ** 2) / (native[0] ** 2 + native[1] ** 2) * 4).reshape(-1, 1)
-        lit = dataclasses.replace(sensor, lights=p.lights(np.ones((len(p.leds), 3))))
-        self.tracer = RayTracer(lit, resolution=(width, height), outputs=("layers",), layers="led", device=device)
-
-    def light(self, p: Parameters) -> list[np.ndarray]:
-        """Exposed light of every LED at power 1: in the pixels of presses, in the same pixels at rest, at rest (L, …)."""
-        leds = p.lights(np.ones((len(p.leds), 3))).leds
-        self.tracer.lamps = [Lamp.from_spec(self.tracer.mi, led) for led in leds]
-        layers = self.tracer.render_layers(self.surface)
-        light = self.sensor.response.exposure * np.stack([layer[..., 0] for layer in layers.values()]).astype(float)
-        rest = light[:, 0]
-        return [light[:, 1 + self.press, self.row, self.column], rest[:, self.row, self.column], rest.reshape(len(light), -1)]
-
-    def penalty(self, p: Parameters) -> np.ndarray:
-        camera, half = self.sensor.camera, 5e2 * np.array(self.sensor.case.size)
-        x, y = (5e2 * n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
-        corners = np.array([(sx * x, sy * y, z) for sx in (-1, 1) for sy in (-1, 1) for z in (-0.3, -1.2)])
-        over = []
-        for led in p.lights().leds:
-            edge = 1e3 * np.array(led_corners(led))
-            over += [VIEW_MARGIN - (corners - 1e3 * np.array(led.position)) @ np.array(led.axis), edge[:, 2] - CEILING]
-            over += [np.ravel(np.abs(edge[:, :2]) - half + 0.1), 1e3 * self.sensor.case.floor_z + 0.1 - edge[:, 2]]
-        return 500 * np.maximum(np.concatenate(over), 0)
-
-    def residuals(self, p: Parameters, light: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate([*(part.ravel() for part in self._images(p, light)[0]), self.penalty(p)])
-
-    def _images(self, p: Parameters, light: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Residuals of presses (N, 3) and rest (M, 3); slopes of the first by light pressed and at rest, of the second by that at rest."""
-        power, gamma = p.powers()[0], self.sensor.response.gamma
-        pressed, flat, rest = (np.maximum(part.T @ power, 1e-7) for part in light)
-        image = encode(self.shots.background[self.row, self.column] * pressed / flat, gamma)
-        still = encode(rest * (1 + p.vignette * self.r2), gamma)
-        apart = [image - encode(self.shots.presses[self.press, self.row, self.column], gamma)]
-        apart.append(self.weight * (still - encode(self.shots.background.reshape(-1, 3), gamma)))
-        return apart, [image / gamma / pressed, -image / gamma / flat, self.weight * still / gamma / rest]
-
-    def jacobian(self, p: Parameters, light: list[np.ndarray]) -> np.ndarray:
-        (power, slope), count, (apart, gains) = p.powers(), len(p.leds), self._images(p, light)
-        images, limits = sum(part.size for part in apart), self.penalty(p)
-        jac = np.zeros((images + len(limits), 9 * count + 1), np.float32)
-
-        def column(k: int, parts: list[np.ndarray], weights: np.ndarray) -> None:
-            pressed, flat, rest = (gain * (part[:, None] * weights) for gain, part in zip(gains, parts, strict=True))
-            jac[:images, k] = np.concatenate([(pressed + flat).ravel(), rest.ravel()])
-
-        for k, step in enumerate(STEPS):
-            all_moved = p.leds.copy()
-            all_moved[:, k] += step
-            change = [(new - old) / step for new, old in zip(self.light(p.moved(all_moved)), light, strict=True)]
-            for led in range(count):
-                column(6 * led + k, [part[led] for part in change], power[led])
-                alone = p.leds.copy()
-                alone[led, k] += 1e-4
-                jac[images:, 6 * led + k] = (self.penalty(p.moved(alone)) - limits) / 1e-4
-        for led in range(count):
-            for k in range(3):
-                column(6 * count + 3 * led + k, [part[led] for part in light], slope[led, k])
-        by_vignette = gains[2] * (light[2].T @ power) / (1 + p.vignette * self.r2) * self.r2
-        jac[images - by_vignette.size : images, -1] = by_vignette.ravel()
-        return jac
-
-
-def solve(problem: Problem, p: Parameters, iterations: int, label: str) -> Parameters:
-    """Levenberg and Marquardt's method with bounds: steps are cut off at the bounds, a parameter that is pushed out of them rests.
-
-    An interrupt ends the fit with what it reached.
-    """
-    low, high = p.bounds(problem.sensor)
-    p, damping = p.at(np.clip(p.flat(), low, high)), 1e-2
-    light = problem.light(p)
-    residuals = problem.residuals(p, light)
-    try:
-        for _ in (bar := tqdm(range(iterations), desc=label, leave=False, disable=None)):
-            x, jac, before = p.flat(), problem.jacobian(p, light), float(residuals @ residuals)
-            normal, slope = (jac.T @ jac).astype(float), (jac.T @ residuals.astype(np.float32)).astype(float)
-            free = ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))
-            cost = before
-            while damping < 1e6 and cost >= before:
-                damped, step = normal + np.diag(damping * np.maximum(np.diag(normal), 1e-9)), np.zeros_like(x)
-                step[free] = np.linalg.solve(damped[np.ix_(free, free)], -slope[free])
-                trial = p.at(np.clip(x + step, low, high))
-                seen = problem.light(trial)
-                off = problem.residuals(trial, seen)
-                cost = float(off @ off)
-                damping *= 4
-            if cost >= before:
-                break
-            p, light, residuals, damping = trial, seen, off, max(damping / 12, 1e-6)
-            bar.set_postfix(rmse=f"{np.sqrt(cost / len(residuals)):.3f}")
-            if before - cost < 1e-4 * before:
-                break
-    except KeyboardInterrupt:
-        print("interrupted: going on with what was reached", file=sys.stderr)
-    return p
-
-
 # ------------------------------------------------------------------------------------------------------------ results
 
 
-def score(sensor: SensorSpec, surface: GelSurface, shots: Photographs, device: str) -> tuple[dict[str, float], np.ndarray]:
+def score(
+    sensor: SensorSpec, surface: GelSurface, shots: Photographs, labels: np.ndarray, device: str
+) -> tuple[dict[str, float], np.ndarray]:
     """Errors in 8-bit levels and the images with the real background as flat field, (N, H, W, 3).
 
     Mean absolute errors are means over presses, in the labelled disc and in the ring up to twice its radius, with the flat field and
-    (``plain``) without; ``rest_rms`` compares the image at rest with the background.
+    (``plain``) without; ``labels`` (N, 3) are the circles of disc and ring; ``rest_rms`` compares the image at rest with the background.
     """
     height, width = shots.background.shape[:2]
     tracer, gamma = RayTracer(sensor, resolution=(width, height), outputs=("layers",), device=device), sensor.response.gamma
+    black = np.array(sensor.response.black_level)
     linear = np.sum(list(tracer.render_layers(surface).values()), axis=0) * tracer.response.scale
-    real, rho = encode(shots.presses, gamma), shots.distance(sensor)
-    flat = encode(shots.background * linear[1:] / linear[:1], gamma)
-    rms = np.sqrt(np.mean((encode(linear[0], gamma) - encode(shots.background, gamma)) ** 2, axis=(0, 1)))
+    real, rho = shots.presses, dataclasses.replace(shots, circles=labels).distance(sensor)
+    flat = encode((decode(shots.background, gamma) - black) * linear[1:] / linear[:1] + black, gamma).clip(0, 255)
+    plain = encode(linear + black, gamma).clip(0, 255)
+    rms = np.sqrt(np.mean((plain[0] - shots.background) ** 2, axis=(0, 1)))
     errors = {f"rest_rms.{name}": float(e) for name, e in zip(CHANNELS, rms, strict=True)}
-    for kind, images in (("flat_field", flat), ("plain", encode(linear[1:], gamma))):
+    for kind, images in (("flat_field", flat), ("plain", plain[1:])):
         for part, inside in {"contact": rho < 1, "ring": (rho >= 1) & (rho < 2)}.items():
             each = [np.abs(image - truth)[where].mean() for image, truth, where in zip(images, real, inside, strict=True)]
             errors[f"{kind}.{part}_mae"] = float(np.mean(each))
@@ -309,46 +121,103 @@ def draw(real: np.ndarray, simulated: np.ndarray, path: Path) -> None:
         plt.close(figure)
 
 
+def split_presses(shots: Photographs, split: str) -> tuple[Photographs, Photographs]:
+    """The photographs to fit to and those to test on; both are all of them if none are held out."""
+    index, (x, _, r) = np.arange(len(shots.circles)), shots.circles.T
+    middle = shots.background.shape[1] / 2
+    fitted = {
+        "press": index % 3 != 2,
+        "left": x < middle,
+        "right": x >= middle,
+        "shallow": np.argsort(np.argsort(r, kind="stable")) < len(r) / 2,
+        "none": index >= 0,
+    }[split]
+    if not fitted.any() or (fitted.all() and split != "none"):
+        raise InputError("split", value=split, rule=f"leaves no press to fit to or to test on, of {len(r)}")
+    return shots.take(index[fitted]), shots.take(index[~fitted] if split != "none" else index)
+
+
 def main(args: Args) -> None:
     began = time.perf_counter()
-    sensor = load_sensor(args.sensor)
-    shots = read_photographs(args.data, sensor)
+    start = load_sensor(args.sensor)
+    if args.gamma is not None:
+        if not 1 <= args.gamma <= 2.4:
+            raise InputError("gamma", value=args.gamma, rule="must be in [1, 2.4]")
+        start = dataclasses.replace(start, response=dataclasses.replace(start.response, gamma=args.gamma))
+    if args.sides is not None:
+        start = with_lights(start, leds_at_walls(start, args.sides))
+    shots = read_photographs(args.data, start)
     if args.quick:
         shots = shots.take(np.arange(min(6, len(shots.presses))))
-    held_out = np.arange(len(shots.presses)) % 3 == 2
-    train, test = shots.take(np.nonzero(~held_out)[0]), shots.take(np.nonzero(held_out)[0])
-    grid = make_grid(sensor.gelpad, 0.3e-3 if args.quick else 0.12e-3)
-    pressed, unseen = (press_balls(sensor, grid, part, args.depth_factor, args.surround_scale) for part in (train, test))
+    train, test = split_presses(shots, args.split)
+    grid = make_grid(start.gelpad, 0.3e-3 if args.quick else 0.12e-3)
 
-    p, iterations = Parameters.of(sensor), min(args.iterations, 10) if args.quick else args.iterations
-    for factor in (8,) if args.quick else (8, 4):  # a new ray tracer each: the light from the case follows the LEDs
-        problem = Problem(sensor, train.shrunk(factor), pressed, p, args.background_weight, args.device)
-        p = solve(problem, p, iterations, f"at 1/{factor}")
+    def pressed(part: Photographs, circles: np.ndarray) -> GelSurface:
+        return press_balls(start, grid, dataclasses.replace(part, circles=circles), args.depth_factor, args.surround_scale)
 
-    response = dataclasses.replace(sensor.response, vignetting=(p.vignette, 0.0, 0.0))
-    fitted = with_lights(dataclasses.replace(sensor, response=response), p.lights())
-    device = RayTracer(sensor, resolution=(8, 6), outputs=("depth",), device=args.device).device
+    p, iterations = LightParameters.of(start, shots.background), min(args.iterations, 10) if args.quick else args.iterations
+    if args.sides is not None:
+        p = brightened(p, start, lambda c: pressed(train, c), train, args.device)
+    circles, rounds = train.circles, ROUNDS if args.refine and iterations else 1
+    for factor in (8,) if args.quick else (8, 4):
+        for _ in range(rounds):  # a new ray tracer each: the light from the case follows the LEDs
+            part = dataclasses.replace(train, circles=circles).shrunk(factor)
+            problem = LightFit(start, part, lambda c: pressed(train, c), p, args.background_weight, args.device)
+            p = solve(problem, p, -(-iterations // rounds), f"at 1/{factor}")
+            if args.refine and iterations:
+                problem.refine_circles(p, train.circles)
+                circles = problem.circles
+
+    gamma, *stray, a1, a2 = map(float, p.response)
+    black = np.array(stray) * darkest(shots.background, gamma)
+    response = dataclasses.replace(start.response, gamma=gamma, black_level=tuple(map(float, black)), vignetting=(a1, a2, 0.0))
+    fitted = with_lights(dataclasses.replace(start, response=response), p.lights())
+    device = RayTracer(start, resolution=(8, 6), outputs=("depth",), device=args.device).device
     metrics: dict[str, int | float | str] = {"experiment": "fit_lights", "device": device, "seed": args.seed, **versions()}
-    metrics |= {"presses.fitted": len(train.presses), "presses.held_out": len(test.presses), "depth_factor": args.depth_factor}
+    metrics |= {"split": args.split, "presses.fitted": len(train.presses), "presses.scored": len(test.presses)}
+    metrics |= {"depth_factor": args.depth_factor, "surround_scale": args.surround_scale, "leds": len(p.leds)}
+    unseen = pressed(test, test.circles)
     touching = unseen.contact[1:].sum((1, 2)) * grid.pitch[0] * grid.pitch[1]
-    labelled = test.circles[:, 2] * sensor.camera.pixel_pitch[0]
+    labelled = test.circles[:, 2] * start.camera.pixel_pitch[0]
     metrics["contact_radius_over_label"] = float(np.mean(np.sqrt(touching / np.pi) / labelled))
     small = test.shrunk(4 if args.quick else 1)
-    for name, spec in (("start", sensor), ("fitted", fitted)):
-        fitted_errors, images = score(spec, unseen, small, args.device)
-        metrics |= {f"{name}.{key}": value for key, value in fitted_errors.items()}
+    candidates = [("start", start, unseen), ("fitted", fitted, unseen)]
+    if args.refine and iterations:  # the light knows nothing of these presses; three numbers a press are found by it
+        problem = LightFit(start, test.shrunk(8), lambda c: pressed(test, c), p, args.background_weight, args.device)
+        for _ in range(ROUNDS):
+            problem.refine_circles(p, test.circles)
+        candidates.append(("refined", fitted, problem.surface))
+        metrics["circles.moved_px"] = float(np.abs(problem.circles - test.circles).mean())
+    for name, spec, surface in candidates:
+        errors, images = score(spec, surface, small, test.circles, args.device)
+        metrics |= {f"{name}.{key}": value for key, value in errors.items()}
     with result_folder(args.out or Path("runs") / "fit_lights") as folder:
-        error = " and ".join(f"{fitted_errors[f'flat_field.{part}_mae']:.2f} ({part})" for part in ("contact", "ring"))
-        comment = f"Fitted by experiments/fit_lights.py to {len(train.presses)} presses.\nMean absolute error on others: {error} of 255."
+        contact, ring = (metrics[f"fitted.flat_field.{part}_mae"] for part in ("contact", "ring"))
+        error = f"{contact:.2f} (contact) and {ring:.2f} (ring) of 255"
+        comment = f"Fitted by experiments/fit_lights.py to {len(train.presses)} presses.\nMean absolute error, split {args.split}: {error}."
         (folder / "lights.toml").write_text(lights_text(fitted.lights, comment), "utf-8")
-        numbers = f"[response]\nexposure = {response.exposure}\nvignetting = [{p.vignette:.4f}, 0.0, 0.0]\n"
-        (folder / "sensor.toml").write_text("# Numbers of the sensor file that belong to lights.toml.\n" + numbers, "utf-8")
+        levels = ", ".join(f"{level:.5f}" for level in response.black_level)
+        numbers = f"exposure = {response.exposure}\ngamma = {gamma:.4f}\nblack_level = [{levels}]\nvignetting = [{a1:.4f}, {a2:.4f}, 0.0]\n"
+        heading = "# Numbers of the sensor file that belong to lights.toml.\n[response]\n"
+        (folder / "sensor.toml").write_text(heading + numbers, "utf-8")
         shown = np.unique(np.linspace(0, len(images) - 1, 5).astype(int))
-        draw(255 * small.presses[shown] ** (1 / response.gamma), images[shown], folder / "presses.png")
+        draw(small.presses[shown], images[shown], folder / "presses.png")
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - began})
     for key, value in metrics.items():
-        if key.startswith(("start.", "fitted.")):
+        if key.startswith(("start.", "fitted.", "refined.")):
             print(f"{key} = {value:.3f}")
+
+
+def brightened(
+    p: LightParameters, sensor: SensorSpec, press: Callable[[np.ndarray], GelSurface], shots: Photographs, device: str
+) -> LightParameters:
+    """The same LEDs with powers that give the image at rest its mean, colour by colour."""
+    problem = LightFit(sensor, shots.shrunk(8), press, p, 1.0, device)
+    rest = (problem.light(p)[2].T @ p.powers()[0]).mean(0)
+    gamma = float(p.response[0])
+    gain = decode(shots.background, gamma).reshape(-1, 3).mean(0) / np.maximum(rest, 1e-12)
+    own = np.array([gain[CHANNELS.index(led.layer)] for led in p.template.leds])
+    return dataclasses.replace(p, power=p.power * np.column_stack([own, np.ones_like(own), np.ones_like(own)]))
 
 
 if __name__ == "__main__":

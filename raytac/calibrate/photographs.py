@@ -1,4 +1,4 @@
-"""Photographs of ball presses in linear light, and the gel surfaces that belong to their contact circles."""
+"""Photographs of ball presses, and the gel surfaces that belong to their contact circles."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from raytac.gel.part import primitive
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Photographs", "encode", "press_balls", "read_photographs"]
+__all__ = ["Photographs", "decode", "encode", "press_balls", "read_photographs"]
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """Images in linear full scale: ``background`` (H, W, 3), ``presses`` (N, H, W, 3); ``circles`` (N, 3): x, y, radius [px] at the
+    """Images in 8-bit levels, as floats: ``background`` (H, W, 3), ``presses`` (N, H, W, 3); ``circles`` (N, 3): x, y, radius [px] at the
     sensor's resolution; ``radius``: of the ball [m]."""
 
     background: np.ndarray
@@ -51,8 +51,13 @@ class Photographs:
 
 
 def encode(linear: np.ndarray, gamma: float) -> np.ndarray:
-    """8-bit levels, not rounded; the lower end keeps slopes finite."""
-    return 255 * np.clip(linear, 1e-6, 1) ** (1 / gamma)
+    """8-bit levels, not rounded and not cut at 255; the lower end keeps slopes finite."""
+    return 255 * np.maximum(linear, 1e-6) ** (1 / gamma)
+
+
+def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
+    """Linear full scale of 8-bit levels."""
+    return (levels / 255) ** gamma
 
 
 def read_photographs(folder: Path, sensor: SensorSpec) -> Photographs:
@@ -70,7 +75,7 @@ def read_photographs(folder: Path, sensor: SensorSpec) -> Photographs:
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
         raise InputError("data", value=presses.resolution, rule=rule)
-    background, images = ((image / 255) ** sensor.response.gamma for image in (presses.background, presses.images))
+    background, images = (image.astype(np.float32) for image in (presses.background, presses.images))
     return Photographs(background, images, presses.circles, float(presses.ball_radius[0]))
 
 
