@@ -101,6 +101,12 @@ def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
     assert np.abs(traction[..., :2]).max() > 1e2  # it is there, and cancels
     height = pad.surface(reached(states)).height[0]
     assert np.abs(height - height[::-1]).max() < 1e-7 and np.abs(height - height[:, ::-1]).max() < 1e-7
+    coat = pad.surface(reached(states)).coat
+    assert coat is not None
+    moved = coat.displacement[0].reshape(*coat.mesh.shape, 3)  # what markers ride on
+    assert np.linalg.norm(moved[..., :2], axis=-1).max() > 10e-6
+    assert np.abs(moved - moved[::-1] * [1.0, -1.0, 1.0]).max() < 2e-7
+    assert np.abs(moved - moved[:, ::-1] * [-1.0, 1.0, 1.0]).max() < 2e-7
 
 
 def test_a_release_leaves_the_pad_at_rest(pressed):
