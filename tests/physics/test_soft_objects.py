@@ -50,6 +50,7 @@ def test_a_soft_ball_leaves_a_symmetric_imprint_shallower_than_its_way(soft):
 
 def test_what_drives_a_soft_ball_is_what_the_case_feels(soft):
     pad, state = soft
+    assert pad.solver is not None
     driven, case = (pad.solver.world.wrench(name).force[0] for name in ("object", "pad"))
     assert state.normal_force[0] > 0.1
     assert np.abs(driven + case).max() < 0.01 * state.normal_force[0]
