@@ -46,6 +46,10 @@ class Perturber:
         self.settings = settings
         self._streams = [np.random.default_rng((seed, env)) for env in range(batch)]
 
+    def reseed(self, env: int, seed: int) -> None:
+        """Start the stream of an environment anew; environment 0 of a perturber that was made with this seed has the same."""
+        self._streams[env] = np.random.default_rng((seed, 0))
+
     def placement(self, env: int) -> tuple[np.ndarray, float]:
         """A new shift (2,) [m] and turn [rad] of an environment's pattern."""
         draw = self._streams[env].uniform(-1.0, 1.0, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -147,6 +148,11 @@ class MarkerTracker:
         which = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
+
+    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
+        """Start the perturbations of environments anew, each from a seed; ``reset`` then draws from them."""
+        for b, seed in zip(envs, seeds, strict=True):
+            self._perturber.reseed(b, seed)
 
     def at_rest(self) -> MarkerFrame:
         """Markers of one untouched pad (B = 1), placed as in environment 0; changes no history and draws nothing."""

@@ -65,15 +65,22 @@ class Travel:
     def part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, Pair | None]:
         """How much of a step of ``dt`` [s] may be made next, and the pair that sets it.
 
-        In ``MOST_SUBSTEPS``-ths, a power of two that ``done`` is a multiple of; 0 if even one is too much.
+        In ``MOST_SUBSTEPS``-ths, a power of two that ``done`` is a multiple of; 0 if even one is too much. What no one drives may be too
+        fast (a beam that snaps back): that is the solver's to resolve, in the smallest parts.
         """
-        movers = self._movers(now, goal, dt * (1.0 - done / MOST_SUBSTEPS))
-        pairs = [(a, b) for a, b in self.pairs if not (_is_still(movers[a]) and _is_still(movers[b]))]
-        share, pair = allowed_share(movers, pairs, _REACH * self.scene.world.d_hat)
-        room, part = (MOST_SUBSTEPS - done) * share, MOST_SUBSTEPS
-        while part >= 1 and (part > room * (1.0 + 1e-9) or done % part):
+        room, pair = self._room(done, self._movers(now, goal, dt * (1.0 - done / MOST_SUBSTEPS)))
+        if room < 1.0 and self._room(done, self._movers(now, goal, 0.0))[0] >= 1.0:
+            room = 1.0
+        part = MOST_SUBSTEPS
+        while part >= 1 and (part > room or done % part):
             part //= 2
         return part, pair
+
+    def _room(self, done: int, movers: Mapping[str, Mover]) -> tuple[float, Pair | None]:
+        """Sixty-fourths of the step that these motions leave, and the pair that sets it."""
+        pairs = [(a, b) for a, b in self.pairs if not (_is_still(movers[a]) and _is_still(movers[b]))]
+        share, pair = allowed_share(movers, pairs, _REACH * self.scene.world.d_hat)
+        return (MOST_SUBSTEPS - done) * share * (1.0 + 1e-9), pair
 
     def refusal(self, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
         """The error of a motion that cannot be resolved."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from raytac.specs.sensor import Vec3
+from raytac.specs.sensor import SensorSpec, Vec3
 
 __all__ = [
     "COUPLINGS",
@@ -59,8 +59,8 @@ class RobotSpec:
 
     model: str
     """One of ``ROBOTS``, or the absolute path of an MJCF file."""
-    sensor: str = "gelsight_mini"
-    """Every sensor on it: name or path of a sensor file."""
+    sensor: str | SensorSpec = "gelsight_mini"
+    """Every sensor on it: name or path of a sensor file, or a specification."""
     joints: tuple[float, ...] | None = None
     """Where an arm's joints start [rad]; None: the Panda's READY, another robot's own start."""
     opening: float | None = None
@@ -100,6 +100,8 @@ class BodySpec:
     """[kg/m³]; plays no part where ``mass`` is given."""
     friction: float | None = None
     """Coulomb friction coefficient; None: the gelpad's own against a gel, ``PAIR_FRICTION`` against anything else."""
+    gel_friction: float | None = None
+    """The same against gel alone, in place of ``friction``; None: ``friction``."""
     youngs_modulus: float = 1e6
     """Of a soft body [Pa]."""
     poisson_ratio: float = 0.4
@@ -110,6 +112,12 @@ class BodySpec:
     """Fixed body that holds the part of a soft body which lies inside of it or touches it at the start."""
     colour: Vec3 | None = None
     """Linear red, green, blue in [0, 1] for pictures."""
+
+
+    @property
+    def friction_on_gel(self) -> float | None:
+        """Coefficient against gel; None: the gelpad's own."""
+        return self.friction if self.gel_friction is None else self.gel_friction
 
 
 @dataclass(frozen=True)

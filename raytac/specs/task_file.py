@@ -76,6 +76,7 @@ BODY_SCHEMA: Final[Schema] = {
     "mass_kg": Number("[0.00001, 1000]", default=None),
     "density_kg_m3": Number("[1, 30000]", default=None),
     "friction": Number("[0, 10]", default=None),
+    "gel_friction": Number("[0, 10]", default=None),
     "youngs_modulus_kpa": Number("[1, 100000]", default=None),
     "poisson_ratio": Number("[0, 0.49]", default=None),
     "cell_mm": Number("[0.1, 100]", default=None),

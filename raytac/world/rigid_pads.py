@@ -21,15 +21,13 @@ MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad c
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_bounds, object_height
-from raytac.gel.pad import make_grid, rest_height
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.load_law import LoadLaw
@@ -38,12 +36,11 @@ from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import pose, world_from_site
 from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedBody, ComposedScene
+from raytac.world.pad_overlap import PadOverlap, Touch
 from raytac.world.state import Controller, is_lost
 
-__all__ = ["RigidPads", "Touch"]
+__all__ = ["RigidPads"]
 
-_PITCH = 0.2e-3
-"""Spacing of the nodes at which contact is found [m]; the greatest overlap is refined between them."""
 _HYSTERESIS = 0.1
 """α, share of the energy that the gel loses in a cycle: a guess; silicone elastomers lose some per cent to some tens of per cent."""
 _RATE = 0.2
@@ -53,20 +50,6 @@ _SLIP_RATE = 0.5
 """Rate at which friction takes away sliding, per step of MuJoCo."""
 
 
-@dataclass(frozen=True)
-class Touch:
-    """Overlap of one body and one resting pad, pad frame."""
-
-    depth: float
-    """Greatest overlap [m]."""
-    centre: np.ndarray
-    """Centroid of the overlap on the body's underside [m], (3,)."""
-    normal: np.ndarray
-    """Unit normal of the resting gel there, (3,)."""
-    gap: np.ndarray
-    """Distance along z from the resting gel to the body [m], (Ny, Nx); negative where they overlap, inf where there is no body."""
-
-
 class _Pad:
     """One sensor's pad: where contact is looked for, and where it is shown."""
 
@@ -74,44 +57,9 @@ class _Pad:
         self.mounted, self.spec = mounted, spec
         self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
         self.gel = int(model.geom(mounted.gel).id)
-        self.coarse = make_grid(spec.gelpad, _PITCH)
-        self.rest_x, self.rest_y = (
-            rest_height(spec.gelpad, self.coarse.x, np.zeros(1)),
-            rest_height(spec.gelpad, np.zeros(1), self.coarse.y),
-        )
-        self.slope_x = np.gradient(self.rest_x, self.coarse.x)
-        self.slope_y = np.gradient(self.rest_y, self.coarse.y)
-        self.cell = self.coarse.pitch[0] * self.coarse.pitch[1]
-        self.highest = float(self.coarse.rest.max())
+        self.overlap = PadOverlap(spec.gelpad)
+        self.highest = self.overlap.highest
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
-
-    def touch(self, parts: Sequence, pad_from_body: np.ndarray, radius: float) -> Touch | None:
-        """How a body at a pose (4, 4) overlaps the resting pad; None where it does not. ``radius`` [m] of a ball that holds the body."""
-        grid = self.coarse
-        columns, rows = (
-            slice(*np.searchsorted(line, (at - radius, at + radius)))
-            for line, at in zip((grid.x, grid.y), pad_from_body[:2, 3], strict=True)
-        )
-        x, y = grid.x[columns], grid.y[rows]
-        if len(x) < 2 or len(y) < 2:
-            return None
-        under = object_height(parts, pad_from_body[None], x, y, below=self.highest)[0]
-        gap = under - grid.rest[rows, columns]
-        least = float(gap.min())
-        if not least < 0.0:
-            return None
-        share = np.minimum(gap, 0.0)
-        total = float(share.sum())
-        along_x, along_y = share.sum(axis=0) / total, share.sum(axis=1) / total
-        # The resting surface is a sum of one function of x and one of y, and the body's underside is that plus the gap.
-        z = along_x @ self.rest_x[columns] + along_y @ self.rest_y[rows] + float(np.vdot(share, share)) / total
-        centre = np.array([along_x @ x, along_y @ y, z])
-        normal = np.array([-(along_x @ self.slope_x[columns]), -(along_y @ self.slope_y[rows]), 1.0])
-        return Touch(-_refined(gap, least), centre, normal / math.sqrt(normal @ normal), gap)
-
-    def law(self, touch: Touch) -> LoadLaw:
-        """Load law of the body that touches, at this place and angle."""
-        return LoadLaw(np.maximum(touch.gap + touch.depth, 0.0), self.cell, self.spec.gelpad)
 
 
 class RigidPads:
@@ -127,7 +75,7 @@ class RigidPads:
         self._radius = [_radius(body) for body in self.bodies]
         self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
         # A body's friction against gel; None is the gel's own.
-        self._friction = [body.spec.friction for body in self.bodies]
+        self._friction = [body.spec.friction_on_gel for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
         self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
@@ -137,8 +85,8 @@ class RigidPads:
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
         self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
-        """Forget what environments went through."""
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+        """Forget what environments went through; where bodies start, MuJoCo knows."""
         for b in envs:
             self._laws[b] = {}
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
@@ -231,7 +179,7 @@ class RigidPads:
     def _touch(self, data: mujoco.MjData, pad: _Pad, i: int) -> Touch | None:
         pad_from_body = _relative(world_from_site(data, pad.site), data, self.bodies[i].index)
         near = self._is_near(pad, pad_from_body, i)
-        return pad.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
+        return pad.overlap.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
 
     def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]]:
         """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact)."""
@@ -246,7 +194,7 @@ class RigidPads:
                     continue
                 law = self._laws[b].get((name, i))
                 if law is None:
-                    law = self._laws[b][name, i] = pad.law(touch)
+                    law = self._laws[b][name, i] = pad.overlap.law(touch)
                 self._fill(data, pad, i, touch, law, compliance)
                 mujoco.mj_addContact(model, data, self._contact)
                 found.append((name, int(data.ncon) - 1))
@@ -319,19 +267,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a × b of two vectors; NumPy's own takes twenty times as long for one pair."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def _refined(gap: np.ndarray, least: float) -> float:
-    """The least gap between the nodes: parabolas through the least node and its neighbours along both axes, exact for a ball on a dome."""
-    j, i = np.unravel_index(int(gap.argmin()), gap.shape)
-    for line, at in ((gap[j], i), (gap[:, i], j)):
-        if not 0 < at < len(line) - 1:
-            continue
-        before, after = float(line[at - 1]), float(line[at + 1])
-        curve = before + after - 2.0 * float(gap[j, i])
-        if np.isfinite(curve) and curve > 0.0:
-            least -= 0.125 * (after - before) ** 2 / curve
-    return least
 
 
 def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:

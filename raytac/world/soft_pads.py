@@ -9,7 +9,7 @@ where MuJoCo has them, what belongs to the solver moves by itself and is mirrore
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import mujoco
@@ -104,14 +104,29 @@ class SoftPads:
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
         self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData]) -> None:
-        """Put environments back to the start: gels at rest, bodies where they began, no forces."""
-        self.soft.reset(list(envs))
-        cases = self._pad_poses(datas)
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+        """Put environments back to the start: gels at rest, no forces, bodies where they began.
+
+        ``bodies``: not None if they or the robot start elsewhere: name to poses (n, 4, 4) of the environments named; the cases are where
+        MuJoCo has them.
+
+        Raises:
+            OverlapError: bodies overlap there; the solver has not changed then.
+        """
+        cases, chosen = self._pad_poses(datas), list(envs)
+        begin = {b.name: pose_of(b.position, b.quaternion) for b in self.composed.scene.bodies}
+        starts = {name: np.repeat(at[None], len(datas), axis=0) for name, at in begin.items()}
+        for name, at in (bodies or {}).items():
+            starts[name][chosen] = at
+        kept = np.isin(np.arange(len(datas)), chosen, invert=True)
+        if bodies is None:
+            self.soft.reset(chosen)
+        else:
+            self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
         for b in envs:
             self._last_cases[b] = cases[b]
             for body in self._led:
-                self._last_led[body.spec.name][b] = pose_of(body.spec.position, body.spec.quaternion)
+                self._last_led[body.spec.name][b] = starts[body.spec.name][b]
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
             for values in self.report.values():
@@ -233,12 +248,12 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
     body = scene.bodies[index]
     parts = object_parts(body)
     if body.kind == "plane":
-        return scene_body(body.name, (), "half_space", friction=body.friction)
+        return scene_body(body.name, (), "half_space", friction=body.friction_on_gel)
     if body.dynamics == "fixed" or (body.dynamics == "free" and body.owner == "mujoco"):
-        return scene_body(body.name, parts, "kinematic", friction=body.friction)
+        return scene_body(body.name, parts, "kinematic", friction=body.friction_on_gel)
     if body.dynamics == "free":
         density = body.density if body.mass is None else body.mass / _volume(parts)
-        return scene_body(body.name, parts, "affine", density=density, friction=body.friction)
+        return scene_body(body.name, parts, "affine", density=density, friction=body.friction_on_gel)
     held = None if body.held_by is None else _holder(scene, index)
     low, high = _extent(parts)
     return scene_body(
@@ -250,7 +265,7 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
         poisson_ratio=body.poisson_ratio,
         cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
         held=held,
-        friction=body.friction,
+        friction=body.friction_on_gel,
     )
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from raytac.markers.contacts import chosen_envs
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import pose
+from raytac.robots.pose import pose, quaternion
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
 from raytac.specs.press import PADS
@@ -153,25 +153,64 @@ class TactileWorld:
         """Names of the sensors; asking for them makes none."""
         return tuple(mounted.name for mounted in self.composed.sensors)
 
-    def reset(self, envs: np.ndarray | list[int] | None = None) -> WorldState:
+    def reset(
+        self,
+        envs: np.ndarray | list[int] | None = None,
+        *,
+        joints: np.ndarray | None = None,
+        bodies: Mapping[str, np.ndarray] | None = None,
+    ) -> WorldState:
         """Put environments (a mask (B,), a list, or None for all) back to the start: joints, bodies, pads, markers and time.
 
-        Raises ``InputError`` for an environment that does not exist.
+        Args:
+            envs: n environments.
+            joints: where the arm's joints start instead (n, joints) [rad or m].
+            bodies: where free bodies start instead: name to ``world_from_body`` (n, 4, 4).
+
+        Raises:
+            InputError: an environment or a body that does not exist, a start of the wrong shape or not finite.
+            OverlapError: bodies overlap at a start that is given, with simulated pads.
         """
         chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
-        self._start_over(chosen)
-        self._pads.reset(chosen, self.data)
+        places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
+        free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
+        for name in places:
+            if name not in free:
+                raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=free)
+        if joints is not None:
+            joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
+        self._start_over(chosen, joints, places)
+        self._pads.reset(chosen, self.data, None if joints is None and not places else places)
         for sensor in self._sensors.values():
             if sensor.markers is not None:
                 sensor.reset_markers(chosen)
         return self.state()
 
-    def _start_over(self, envs: Iterable[int]) -> None:
+    @staticmethod
+    def _checked_start(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        values = np.asarray(value, float)
+        if values.shape != shape:
+            raise InputError(name, value=values.shape, rule=f"must have the shape {shape}, one row an environment named")
+        if not np.isfinite(values).all():
+            bad = int(np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))[0])
+            raise InputError(name, value=values[bad].tolist(), rule=f"must be finite; row {bad} is not")
+        return values
+
+    def _start_over(
+        self, envs: Sequence[int] | range, joints: np.ndarray | None = None, bodies: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         """MuJoCo's part of a reset."""
-        for b in envs:
+        for row, b in enumerate(envs):
             data = self.data[b]
             mujoco.mj_resetData(self.model, data)
             data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
+            if joints is not None and self.arm is not None:
+                data.qpos[self.arm.qpos] = joints[row]
+            for name, at in (bodies or {}).items():
+                body = self.composed.bodies[name]
+                if body.is_free:  # the solver's are mirrored when it has its own
+                    data.qpos[body.qpos : body.qpos + 3] = at[row, :3, 3]
+                    data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(at[row, :3, :3])
             mujoco.mj_forward(self.model, data)
             self._failed[b] = False
 

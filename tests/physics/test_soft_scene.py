@@ -88,6 +88,15 @@ def test_a_fast_approach_is_cut_and_a_too_fast_one_refused_before_anything_moves
     assert scene.wrench("left")[0, 1] == pytest.approx(gentle.wrench("left")[0, 1], rel=1e-2)
 
 
+def test_what_flies_by_itself_is_never_refused():
+    """A cube shot at a pad at 2 m/s, 20 mm a step: resolved in small parts, stopped, and thrown back slower."""
+    scene = two_pads(gap=4e-3)
+    scene.world.set_velocity("cube", (0.0, -2.0, 0.0))
+    reports = [scene.step(fingers(4e-3)) for _ in range(2)]
+    assert all(r.min_gap[0] > 0.0 and r.min_det[0] > 0.0 for r in reports) and max(r.substeps for r in reports) > 8
+    assert abs(scene.velocity("cube")[0, 1]) < 2.0 and scene.pose("cube")[0, 1, 3] > -4.1e-3 - 4e-3
+
+
 def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
     box = np.full((1, 3), 1e-3)
     one = Mover(np.eye(4)[None], pose(position=(10e-3, 0, 0))[None], -box, box)

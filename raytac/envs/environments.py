@@ -1,0 +1,179 @@
+"""Gymnasium environments over ``TaskBatch``: one, and vectors that step all of theirs at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from raytac.envs.batch import Outcome, TaskBatch
+from raytac.envs.task import Task
+from raytac.errors import InputError
+from raytac.markers.contacts import chosen_envs
+from raytac.observe import gymnasium_space
+
+__all__ = ["TactileEnv", "TactileVectorEnv"]
+
+_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
+
+
+def _action_space(size: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+
+class TactileEnv(gymnasium.Env):
+    """One environment of a task; subclasses name the task, and their docstring specifies it.
+
+    Keyword arguments are those of ``TaskBatch``, but for ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
+    reward), ``success`` and ``failed``.
+    """
+
+    task: ClassVar[type[Task]]
+
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        """Raises as ``TaskBatch``; ``InputError`` for a render mode, of which there is none yet."""
+        if render_mode is not None:
+            raise InputError("render_mode", value=render_mode, rule="must be None: `raytac view` shows scenes")
+        self.batch = TaskBatch(self.task(), num_envs=1, **options)
+        self.observation_space = gymnasium_space(self.batch.arrays)
+        self.action_space = _action_space(self.batch.steering.size)
+        self.metadata = {"render_modes": [], "render_fps": 1.0 / self.batch.control_timestep}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode; a seed makes this and all later ones repeatable, sensors' noise too. ``options`` are not used."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.batch.reseed([0], [seed])
+        return _row(self.batch.reset([0], [self.np_random])), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite."""
+        out = self.batch.step(np.asarray(action)[None])
+        info = {
+            "reward_terms": {name: float(term[0]) for name, term in out.terms.items()},
+            "success": bool(out.success[0]),
+            "failed": bool(out.failed[0]),
+        }
+        return _row(out.observation), float(out.reward[0]), bool(out.terminated[0]), bool(out.truncated[0]), info
+
+
+class TactileVectorEnv(gymnasium.vector.VectorEnv):
+    """B environments of a task in one world: MuJoCo's states are stepped together, and each sensor sees all of them in one call.
+
+    Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
+    ``success``, ``failed``; where environments began anew in the same step also ``final_obs`` and ``final_info`` (arrays of objects), as
+    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does.
+    """
+
+    task: ClassVar[type[Task]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        render_mode: None = None,
+        **options: Any,
+    ) -> None:
+        """Compose the world.
+
+        Args:
+            num_envs: number of environments B.
+            autoreset_mode: when an environment that has ended begins anew: in the same step, in the next one (whose action it ignores,
+                with reward 0), or only by ``reset``.
+            render_mode: must be None.
+            options: of ``TaskBatch``.
+
+        Raises:
+            InputError: a value out of its choices.
+        """
+        if render_mode is not None:
+            raise InputError("render_mode", value=render_mode, rule="must be None: `raytac view` shows scenes")
+        try:
+            self._mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            choices = [mode.value for mode in _MODES]
+            raise InputError("autoreset_mode", value=autoreset_mode, rule="must be a known mode", choices=choices) from error
+        self.num_envs = num_envs
+        self.batch = TaskBatch(self.task(), num_envs=num_envs, **options)
+        self.single_observation_space = gymnasium_space(self.batch.arrays)
+        self.single_action_space = _action_space(self.batch.steering.size)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = {"autoreset_mode": self._mode, "render_modes": [], "render_fps": 1.0 / self.batch.control_timestep}
+        self._rngs = [seeding.np_random(None)[0] for _ in range(num_envs)]
+        self._ended = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin episodes: of all environments, or of those in ``options["reset_mask"]`` (B,).
+
+        Raises:
+            InputError: seeds of another number than environments, or a mask of another shape.
+        """
+        mask = (options or {}).get("reset_mask")
+        envs = list(range(self.num_envs)) if mask is None else chosen_envs(np.asarray(mask), self.num_envs)
+        if seed is not None:
+            seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
+            if len(seeds) != self.num_envs:
+                raise InputError("seed", value=len(seeds), rule=f"must be one, or one for each of {self.num_envs} environments")
+            told = [b for b in envs if seeds[b] is not None]
+            for b in told:
+                self._rngs[b] = seeding.np_random(int(seeds[b]))[0]  # type: ignore[arg-type]
+            self.batch.reseed(told, [int(seeds[b]) for b in told])  # type: ignore[arg-type]
+        self._ended[envs] = False
+        return self.batch.reset(envs, [self._rngs[b] for b in envs]), {}
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment."""
+        late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
+        out = self.batch.step(np.asarray(actions))
+        observation, terms = out.observation, {name: term.copy() for name, term in out.terms.items()}
+        reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
+        success, failed = out.success.copy(), out.failed.copy()
+        if len(late):
+            observation = self._again(late)
+            for values in (reward, terminated, truncated, success, failed, *terms.values()):
+                values[late] = 0
+        infos = _infos(self.num_envs, {"reward_terms": terms, "success": success, "failed": failed})
+        self._ended = terminated | truncated
+        if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
+            ended = np.flatnonzero(self._ended)
+            infos |= self._final(out, ended)
+            observation = self._again(ended)
+            self._ended[:] = False
+        return observation, reward, terminated, truncated, infos
+
+    def _again(self, envs: np.ndarray) -> dict[str, np.ndarray]:
+        return self.batch.reset(envs.tolist(), [self._rngs[b] for b in envs])
+
+    def _final(self, out: Outcome, ended: np.ndarray) -> dict[str, Any]:
+        last, told = np.full(self.num_envs, None, object), np.zeros(self.num_envs, bool)
+        for b in ended:
+            last[b] = {name: values[b].copy() for name, values in out.observation.items()}
+        told[ended] = True
+        terms = {name: np.where(told, term, 0.0) for name, term in out.terms.items()}
+        final = {"reward_terms": terms, "success": out.success & told, "failed": out.failed & told}
+        info = _infos(self.num_envs, final)
+        return {"final_obs": last, "_final_obs": told, "final_info": info, "_final_info": told.copy()}
+
+
+def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: values[0] for name, values in observation.items()}
+
+
+def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
+    """With the masks beside every entry by which Gymnasium's vectors tell which environments have it."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found[name] = _infos(num_envs, value) if isinstance(value, dict) else value
+        found[f"_{name}"] = np.ones(num_envs, bool)
+    return found

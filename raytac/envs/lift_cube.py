@@ -1,0 +1,93 @@
+"""``raytac/LiftCube-v0``."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from raytac.envs.environments import TactileEnv, TactileVectorEnv
+from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed
+
+__all__ = ["LiftCube", "LiftCubeEnv", "LiftCubeVectorEnv"]
+
+
+class LiftCube(Task):
+    """The numbers of ``LiftCubeEnv``, as code."""
+
+    scene: ClassVar = "lift_cube_env"
+    body: ClassVar = "object"
+    motion: ClassVar = Motion(
+        ("x", "y", "z", "grip"),
+        (5e-3, 5e-3, 5e-3, 4e-3),
+        (0.30, -0.15, 0.012),
+        (0.60, 0.15, 0.30),
+        leash=0.015,
+        opening=(0.02, 0.08),
+    )
+    max_episode_steps: ClassVar = 250
+    body_seen: ClassVar = True
+
+    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
+        at = body[:3, 3] + [*rng.uniform(-0.03, 0.03, 2), 0.0]
+        goal = np.array([*(body[:2, 3] + rng.uniform(-0.05, 0.05, 2)), rng.uniform(0.08, 0.20)])
+        return Start(goal, {"object": placed(body, at)})
+
+    def judge(self, now: Situation) -> Verdict:
+        cube = now.body[:, :3, 3]
+        lifted, rest = cube[:, 2] > 0.04, far(cube, now.goal)
+        terms = {
+            "reaching": near(far(now.tool[:, :3, 3], cube), 0.1),
+            "lifted": 15.0 * lifted,
+            "goal": 16.0 * lifted * near(rest, 0.3),
+            "goal_fine": 5.0 * lifted * near(rest, 0.05),
+        }
+        terminated = far(now.tool[:, :3, 3], cube) > 1.0
+        return Verdict({**terms, **self.effort(now)}, terminated, lifted & (rest < 0.02))
+
+
+class LiftCubeEnv(TactileEnv):
+    r"""Grasp a cube between two sensors and carry it to a goal in the air.
+
+    A Panda's fingers are two GelSight Minis (9 x 11 markers) over a cube of 30 mm and 50 g on a table (scene `lift_cube_env`).
+
+    Action, Box(-1, 1, (4,)): what the target of the point between the pads moves along world x, y, z (5 mm a step at 1), and by how much
+    the opening that is asked for changes (4 mm). The target leads the tool by at most 15 mm along an axis and stays in x 0.30 to 0.60,
+    y ±0.15, z 0.016 to 0.30 m; the opening stays in 20 to 80 mm.
+    `action="joints"`: see docs/rl.md. A step is 20 ms.
+
+    Observations, float32:
+
+    - `state` (14,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+      gap between the pads / 0.1 m (1), last action (4);
+    - `goal` (3,): goal from the tool / 0.1 m, world axes;
+    - `body` (15,): of the cube, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
+      velocity [rad/s] (6); there unless `body_seen=False`;
+    - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` adds or takes (docs/rl.md).
+
+    Reward, sum of (in `info["reward_terms"]`), that of Isaac Lab's Isaac-Lift-Cube-Franka-v0; lifted: the cube's middle is above 0.04 m:
+
+    | term | value |
+    | --- | --- |
+    | `reaching` | 1 − tanh(d(tool, cube) / 0.1) |
+    | `lifted` | 15 if lifted |
+    | `goal` | 16 (1 − tanh(d(cube, goal) / 0.3)) if lifted |
+    | `goal_fine` | 5 (1 − tanh(d(cube, goal) / 0.05)) if lifted |
+    | `action_rate` | −1e-4 \|a − a₋₁\|² |
+    | `joint_speed` | −1e-4 \|q̇\|² [rad/s] |
+
+    Start: the open gripper above the table, the cube drawn within ±30 mm along x and y; the goal within ±50 mm along x and y of the cube's
+    place in the scene, 80 to 200 mm high.
+    Termination: the tool is more than 1 m from the cube (TacEx thesis). Truncation: 250 steps (5 s, as Isaac Lab), or the physics fails.
+    Success: lifted, and within 20 mm of the goal.
+
+    Version 0: first release.
+    """
+
+    task = LiftCube
+
+
+class LiftCubeVectorEnv(TactileVectorEnv):
+    """B environments as ``LiftCubeEnv`` specifies one, in one world."""
+
+    task = LiftCube

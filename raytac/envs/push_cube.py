@@ -1,0 +1,84 @@
+"""``raytac/PushCube-v0``."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from raytac.envs.environments import TactileEnv, TactileVectorEnv
+from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed, turned
+
+__all__ = ["PushCube", "PushCubeEnv", "PushCubeVectorEnv"]
+
+
+class PushCube(Task):
+    """The numbers of ``PushCubeEnv``, as code."""
+
+    scene: ClassVar = "push_cube"
+    body: ClassVar = "cube"
+    motion: ClassVar = Motion(("x", "y", "z"), (5e-3, 5e-3, 2e-3), (0.25, -0.25, 0.035), (0.65, 0.25, 0.10), leash=0.006)
+    max_episode_steps: ClassVar = 150
+    body_seen: ClassVar = True
+
+    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
+        at = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
+        begin = placed(body, at)
+        begin[:3, :3] = turned(np.array([0.0, 0.0, 1.0]), rng.uniform(-0.3, 0.3)) @ body[:3, :3]
+        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.10)
+        goal = at + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Start(goal, {"cube": begin})
+
+    def judge(self, now: Situation) -> Verdict:
+        cube = now.body[:, :3, 3]
+        top = cube + np.array([0.0, 0.0, 0.02])
+        reach, rest = far(now.tool[:, :3, 3], top), far(cube[:, :2], now.goal[:, :2])
+        terms = {"reaching": near(reach, 0.1), "target": 4.0 * near(rest, 0.1), "target_fine": 4.0 * near(rest, 0.02)}
+        terminated = far(now.tool[:, :3, 3], cube) > 1.0
+        return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.01)
+
+
+class PushCubeEnv(TactileEnv):
+    r"""Slide a cube across a table to a goal by pressing on it with one sensor.
+
+    A Panda carries a GelSight Mini (9 x 11 markers) pad down over a cube of 40 mm and 50 g on a table (scene `push_cube`). The pad must
+    press hard enough to hold the cube by friction and softly enough to let it slide.
+
+    Action, Box(-1, 1, (3,)): what the target of the pad moves along world x, y (5 mm a step at 1) and z (2 mm); the target leads the pad
+    by at most 6 mm along an axis and stays in x 0.25 to 0.65, y ±0.25, z 0.035 to 0.10 m.
+    `action="joints"`: see docs/rl.md. A step is 20 ms.
+
+    Observations, float32:
+
+    - `state` (12,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+      last action (3);
+    - `goal` (3,): goal from the tool / 0.1 m, world axes;
+    - `body` (15,): of the cube, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
+      velocity [rad/s] (6); there unless `body_seen=False`;
+    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` adds or takes (docs/rl.md).
+
+    Reward, sum of (in `info["reward_terms"]`); d distances in m, a the action, q̇ joint speeds in rad/s:
+
+    | term | value | source |
+    | --- | --- | --- |
+    | `reaching` | 1 − tanh(d(pad, middle of the cube's top) / 0.1) | form of the TacEx thesis, width of Isaac Lab's lift task |
+    | `target` | 4 (1 − tanh(d_xy(cube, goal) / 0.1)) | form of the TacEx thesis; constants ours |
+    | `target_fine` | 4 (1 − tanh(d_xy(cube, goal) / 0.02)) | ours |
+    | `action_rate` | −1e-4 \|a − a₋₁\|² | Isaac Lab's lift task |
+    | `joint_speed` | −1e-4 \|q̇\|² | the same |
+
+    Start: the pad 2 mm above the middle of the cube's place, which is drawn within ±10 mm along x and y and turned by up to ±0.3 rad; the
+    goal lies 30 to 100 mm from it in any direction.
+    Termination: the pad is more than 1 m from the cube (TacEx thesis). Truncation: 150 steps (3 s), or the physics fails.
+    Success: the cube is within 10 mm of the goal.
+
+    Version 0: first release.
+    """
+
+    task = PushCube
+
+
+class PushCubeVectorEnv(TactileVectorEnv):
+    """B environments as ``PushCubeEnv`` specifies one, in one world."""
+
+    task = PushCube

@@ -1,0 +1,130 @@
+"""Seeded differences between sensors that ought to be alike: what is drawn for an environment, and what for a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.markers import MarkerPerturbation
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["CameraDrift", "Randomization", "randomised_sensor"]
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """Half widths of uniform distributions, relative to 1; all 0 is none.
+
+    *Each environment, at every reset* (``CameraDrift`` and the marker tracker): ``exposure``, ``white_balance``, ``gamma`` and the pattern
+    of ``markers``. *Each frame*: ``noise``, and noise and losses of ``markers``. *Once a world*, in the sensor that all its environments
+    share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``. A table of ``taxim``
+    is baked anew for every such sensor, the ray tracer is not: vary seeds over processes.
+    """
+
+    led_power: float = 0.0
+    """Of every LED by itself."""
+    led_colour: float = 0.0
+    """Of every LED's every channel."""
+    reflectance: float = 0.0
+    """Of the coat's every channel."""
+    youngs_modulus: float = 0.0
+    """Of the gel."""
+    friction: float = 0.0
+    """Of the gel."""
+    exposure: float = 0.0
+    """Gain of the camera, all channels, in linear light."""
+    white_balance: float = 0.0
+    """Gain of every channel, in linear light."""
+    gamma: float = 0.0
+    """Of the exponent that encodes linear light."""
+    noise: float = 0.0
+    """Standard deviation of every 8-bit value in every frame; not relative."""
+    markers: MarkerPerturbation = field(default_factory=MarkerPerturbation)
+    """Noise and losses of the tracker, shift and turn of the pattern."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name == "markers":
+                continue
+            rule = "must be 0 or more, and finite" if item.name == "noise" else "must be in [0, 1): a half width relative to 1"
+            if not (np.isfinite(value) and value >= 0.0 and (item.name == "noise" or value < 1.0)):
+                raise InputError(item.name, value=value, rule=rule)
+
+    @property
+    def changes_images(self) -> bool:
+        """Whether images differ between environments of one world."""
+        return any((self.exposure, self.white_balance, self.gamma, self.noise))
+
+    @property
+    def changes_sensor(self) -> bool:
+        """Whether the sensor differs between worlds."""
+        return any((self.led_power, self.led_colour, self.reflectance, self.youngs_modulus, self.friction))
+
+
+def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:
+    """The sensor that a seed draws; the one given where nothing of it is drawn. A reflectance is at most 1."""
+    r = randomization
+    if not r.changes_sensor:
+        return sensor
+    rng = np.random.default_rng((seed, 0x5E45))
+
+    def factor(width: float, count: int = 1) -> np.ndarray:
+        return 1.0 + width * rng.uniform(-1.0, 1.0, count)
+
+    leds = tuple(
+        replace(led, power=tuple(float(p) for p in np.asarray(led.power) * factor(r.led_power) * factor(r.led_colour, 3)))
+        for led in sensor.lights.leds
+    )
+    reflectance = np.minimum(np.asarray(sensor.coat.reflectance) * factor(r.reflectance, 3), 1.0)
+    gelpad = replace(
+        sensor.gelpad,
+        youngs_modulus=float(sensor.gelpad.youngs_modulus * factor(r.youngs_modulus)[0]),
+        friction=float(sensor.gelpad.friction * factor(r.friction)[0]),
+    )
+    return replace(
+        sensor,
+        lights=replace(sensor.lights, leds=leds),
+        coat=replace(sensor.coat, reflectance=tuple(float(v) for v in reflectance)),
+        gelpad=gelpad,
+    )
+
+
+class CameraDrift:
+    """Cameras of B environments that each have their own exposure, white balance and exponent, and noise.
+
+    u8 → 255 (g · (u8 / 255)^γ)^(1 / γ') with g the gains; what comes out above 255 saturates, as in a camera. Streams are one an
+    environment: what one draws does not depend on how many there are.
+    """
+
+    def __init__(self, sensor: SensorSpec, randomization: Randomization, num_envs: int, seed: int) -> None:
+        self._settings, self._gamma = randomization, sensor.response.gamma
+        self._streams = [np.random.default_rng((seed + b, 0xCA3)) for b in range(num_envs)]
+        self._curves = np.empty((num_envs, 3, 256), np.float32)
+        self.reset(range(num_envs))
+
+    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
+        """Start the streams of environments anew, each from a seed."""
+        for b, seed in zip(envs, seeds, strict=True):
+            self._streams[b] = np.random.default_rng((seed, 0xCA3))
+
+    def reset(self, envs: range | list[int]) -> None:
+        """Draw cameras of environments anew."""
+        r, level = self._settings, np.arange(256) / 255.0
+        for b in envs:
+            draw = self._streams[b].uniform(-1.0, 1.0, 5)
+            gain = (1.0 + r.exposure * draw[0]) * (1.0 + r.white_balance * draw[1:4])
+            exponent = self._gamma * (1.0 + r.gamma * draw[4])
+            self._curves[b] = 255.0 * (gain[:, None] * level**self._gamma) ** (1.0 / exponent)
+
+    def apply(self, images: np.ndarray, *, noise: bool = True) -> np.ndarray:
+        """8-bit images (B, H, W, 3) as these cameras give them; ``noise``: with that of a frame."""
+        batch, channel = np.arange(len(images))[:, None, None, None], np.arange(3)
+        values = self._curves[batch, channel, images]
+        if noise and self._settings.noise:
+            shape = images.shape[1:]
+            values = values + self._settings.noise * np.stack([s.standard_normal(shape, np.float32) for s in self._streams])
+        return np.clip(values + 0.5, 0.0, 255.0).astype(np.uint8)

@@ -1,0 +1,157 @@
+"""What is observed of a tactile sensor: names, sizes and units, checked before anything is computed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from raytac.errors import InputError
+from raytac.io.options import parse_resolution
+from raytac.sensor.options import LARGEST_SIDE, checked_resolution
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
+
+MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
+"""Names that ``modalities`` accepts:
+
+- ``rgb``: the camera's image, uint8, (H, W, 3);
+- ``markers``: displacement of every marker along x and y of the pad, (M, 2); 0 where a marker is lost;
+- ``marker_visible``: which markers are found, (M,), 0 or 1;
+- ``height``: height of the surface over the pad frame's origin, (rows, columns);
+- ``indentation``: how far it lies below the surface at rest, (rows, columns); negative where the gel bulges;
+- ``contact``: share of a cell that is touched, (rows, columns), 0 to 1;
+- ``wrench``: force on the pad and torque about the pad frame's origin, pad frame, (6,).
+"""
+SCALES: Mapping[str, float | tuple[float, ...]] = {
+    "markers": 1e-3,
+    "height": 1e-3,
+    "indentation": 1e-3,
+    "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
+}
+"""What a number is divided by, so that it is of the order of 1: lengths [m], force [N] and torque [N m]."""
+
+
+@dataclass(frozen=True)
+class ObservationSettings:
+    """Choices of one sensor's observation. Optical mode, marker model and pad physics change values, never shapes."""
+
+    modalities: tuple[str, ...] = ("markers",)
+    """Some of ``MODALITIES``; nothing else is computed."""
+    resolution: tuple[int, int] | str | None = None
+    """(width, height) of ``rgb`` [px], or text as ``"64x48"``; None is the sensor's own."""
+    crop: str | tuple[int, int, int, int] = "centre"
+    """What is cut off the rendered image: ``"centre"`` keeps the pixels square and takes the middle, as large as it fits;
+    (left, top, right, bottom) cuts that many pixels of the observed size, and the view is squeezed into what is asked for."""
+    downscale: int = 1
+    """The image is rendered this many times as large along both sides and averaged."""
+    difference: bool = False
+    """``rgb`` becomes (255 + image − image at rest) // 2, which is 127 where nothing has changed and cannot overflow."""
+    map_shape: tuple[int, int] = (32, 32)
+    """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad, no more than
+    its grid has nodes."""
+    stack: int = 1
+    """Number of last observations: images lie one behind the other in the channels, all else along a new first axis, oldest first. After
+    a reset all are the first one."""
+    normalise: bool = True
+    """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a share in both cases."""
+    scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    """In place of those of ``SCALES``, by modality."""
+    optics: str = "taxim"
+    """As of ``TactileSensor``."""
+    marker_model: str = "fots"
+    """As ``markers`` of ``TactileSensor``."""
+    optics_options: Mapping[str, Any] = field(default_factory=dict)
+    """As of ``TactileSensor``."""
+
+    def __post_init__(self) -> None:
+        given = (self.modalities,) if isinstance(self.modalities, str) else tuple(self.modalities)
+        for name in given:
+            if name not in MODALITIES:
+                raise InputError("modalities", value=name, rule="must be a known modality", choices=MODALITIES)
+        if not given or len(set(given)) != len(given):
+            raise InputError("modalities", value=given, rule="must name one or more, none twice", choices=MODALITIES)
+        object.__setattr__(self, "modalities", tuple(m for m in MODALITIES if m in given))
+        if isinstance(self.resolution, str):
+            object.__setattr__(self, "resolution", parse_resolution(self.resolution))
+        object.__setattr__(self, "resolution", checked_resolution(self.resolution))
+        for name in ("downscale", "stack"):
+            _check_count(name, getattr(self, name))
+        if not isinstance(self.map_shape, (tuple, list)) or len(self.map_shape) != 2:
+            raise InputError("map_shape", value=self.map_shape, rule="must be (rows, columns)")
+        for count in self.map_shape:
+            _check_count("map_shape", count)
+        if self.crop != "centre":
+            sides = self.crop
+            if (
+                isinstance(sides, str)
+                or len(sides) != 4
+                or any(not isinstance(n, int) or isinstance(n, bool) or n < 0 for n in sides)
+            ):
+                rule = "must be 'centre', or pixels cut off at left, top, right and bottom, each 0 or more"
+                raise InputError("crop", value=sides, rule=rule)
+        if self.difference and "rgb" not in self.modalities:
+            raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
+        for name, scale in self.scales.items():
+            if name not in SCALES:
+                raise InputError("scales", value=name, rule="must be a modality that has a unit", choices=tuple(SCALES))
+            values = (scale,) if isinstance(scale, (int, float)) else tuple(scale)
+            if len(values) not in ((1, 6) if name == "wrench" else (1,)) or not all(math.isfinite(v) and v > 0.0 for v in values):
+                raise InputError(f"scales[{name!r}]", value=scale, rule="must be positive and finite: one, or six of a wrench")
+
+    def scale(self, modality: str) -> float | tuple[float, ...]:
+        """What a modality is divided by."""
+        return self.scales.get(modality, SCALES[modality]) if self.normalise else 1.0
+
+    @property
+    def needs_markers(self) -> bool:
+        return "markers" in self.modalities or "marker_visible" in self.modalities
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What must be asked of a ``TactileSensor``; the surface itself, which maps are made from, it always gives."""
+        return tuple(name for name in ("rgb", "wrench") if name in self.modalities)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How an observed image is cut from a rendered one; (width, height) [px]."""
+
+    observed: tuple[int, int]
+    rendered: tuple[int, int]
+    left: int
+    """Pixels of the observed size that are cut off."""
+    top: int
+    downscale: int
+
+
+def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
+    """Sizes of rendered and observed image.
+
+    Raises:
+        InputError: the rendered image would be larger than can be rendered.
+    """
+    asked = settings.resolution
+    assert not isinstance(asked, str)
+    observed = sensor.camera.resolution if asked is None else asked
+    width, height = observed
+    if settings.crop == "centre":
+        native = sensor.camera.resolution
+        scale = max(width / native[0], height / native[1])
+        whole = max(width, round(native[0] * scale)), max(height, round(native[1] * scale))
+        left, top = (whole[0] - width) // 2, (whole[1] - height) // 2
+    else:
+        left, top, right, bottom = (int(n) for n in settings.crop)
+        whole = width + left + right, height + top + bottom
+    rendered = whole[0] * settings.downscale, whole[1] * settings.downscale
+    if max(rendered) > LARGEST_SIDE:
+        rule = f"with crop and downscale the rendered image is {rendered[0]}x{rendered[1]}; at most {LARGEST_SIDE} px a side"
+        raise InputError("resolution", value=observed, rule=rule)
+    return Layout(observed, rendered, left, top, settings.downscale)
+
+
+def _check_count(name: str, value: object) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise InputError(name, value=value, rule="must be a whole number >= 1")

@@ -1,0 +1,76 @@
+"""Shapes, types and bounds of observations, with or without Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from raytac.errors import BackendError, InputError
+from raytac.observe.settings import ObservationSettings, image_layout
+from raytac.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    import gymnasium
+
+__all__ = ["ArraySpec", "array_specs", "gymnasium_space"]
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """One environment's array."""
+
+    shape: tuple[int, ...]
+    dtype: type
+    low: float
+    high: float
+
+
+def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, ArraySpec]:
+    """Arrays that ``settings`` ask of a sensor, by modality.
+
+    Raises:
+        InputError: markers are asked for and the sensor has none, or an image is too large.
+    """
+    count = sensor.markers.rows * sensor.markers.columns
+    if settings.needs_markers and not count:
+        raise InputError("modalities", value="markers", rule=f"needs a sensor with markers; {sensor.name} has none")
+    width, height = image_layout(sensor, settings).observed
+    found = {
+        "rgb": ArraySpec((height, width, 3), np.uint8, 0, 255),
+        "markers": ArraySpec((count, 2), np.float32, -np.inf, np.inf),
+        "marker_visible": ArraySpec((count,), np.int8, 0, 1),
+        "height": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
+        "indentation": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
+        "contact": ArraySpec(tuple(settings.map_shape), np.float32, 0.0, 1.0),
+        "wrench": ArraySpec((6,), np.float32, -np.inf, np.inf),
+    }
+    return {name: _stacked(name, found[name], settings.stack) for name in settings.modalities}
+
+
+def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
+    if stack == 1:
+        return spec
+    shape = (*spec.shape[:-1], spec.shape[-1] * stack) if name == "rgb" else (stack, *spec.shape)
+    return ArraySpec(shape, spec.dtype, spec.low, spec.high)
+
+
+def gymnasium_space(specs: Mapping[str, ArraySpec | Mapping[str, Any]]) -> gymnasium.spaces.Dict:
+    """The same as a ``gymnasium.spaces.Dict`` of boxes, nested as ``specs`` are.
+
+    Raises:
+        BackendError: Gymnasium is not installed.
+    """
+    try:
+        from gymnasium import spaces
+    except ImportError as error:
+        raise BackendError(f"spaces need Gymnasium ({error}): `pip install raytac[rl]`") from error
+    made: dict[str, Any] = {}
+    for name, spec in specs.items():
+        if isinstance(spec, ArraySpec):
+            made[name] = spaces.Box(spec.low, spec.high, spec.shape, spec.dtype)
+        else:
+            made[name] = gymnasium_space(spec)
+    return spaces.Dict(made)

@@ -1,0 +1,69 @@
+"""A Gymnasium wrapper that adds what tactile sensors observe to an environment of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
+from raytac.observe.observer import TactileObserver
+from raytac.observe.spaces import gymnasium_space
+
+__all__ = ["AddTactile"]
+
+
+class AddTactile(gymnasium.Wrapper):
+    """Observations become a Dict: the environment's own (its keys if it is a Dict, else ``observation``) and one of every sensor.
+
+    .. code-block:: python
+
+        env = AddTactile(MyEnv(world), {"sensor": observer}, world.observe)
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        observers: Mapping[str, TactileObserver],
+        frames: Callable[[], Mapping[str, TactileFrame]],
+    ) -> None:
+        """``observers``: one a sensor, of one environment, without ``difference``; ``frames``: gives the present frame of each.
+
+        Raises:
+            InputError: an observer of several environments, or a name that the environment's observation has already.
+        """
+        super().__init__(env)
+        for name, observer in observers.items():
+            if observer.num_envs != 1:
+                raise InputError(f"observers[{name!r}]", value=observer.num_envs, rule="must be of one environment")
+            if observer.settings.difference:
+                raise InputError(f"observers[{name!r}]", value="difference", rule="needs the sensor: subtract in your loop")
+        self.observers, self._frames = dict(observers), frames
+        own = env.observation_space
+        spaces: dict[str, Any] = dict(own.spaces) if isinstance(own, gymnasium.spaces.Dict) else {"observation": own}
+        for name, observer in observers.items():
+            if name in spaces:
+                rule = "must not be a key of the environment's observation"
+                raise InputError("observers", value=name, rule=rule)
+            spaces[name] = gymnasium_space(observer.arrays)
+        self.observation_space = gymnasium.spaces.Dict(spaces)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        for observer in self.observers.values():
+            observer.reset()
+        return self._joined(observation), info
+
+    def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._joined(observation), reward, terminated, truncated, info
+
+    def _joined(self, observation: Any) -> dict[str, Any]:
+        made = dict(observation) if isinstance(observation, Mapping) else {"observation": observation}
+        frames = self._frames()
+        for name, observer in self.observers.items():
+            made[name] = {key: np.asarray(value[0]) for key, value in observer.observe(frames[name]).items()}
+        return made

@@ -1,0 +1,241 @@
+"""Environments: Gymnasium's and SB3's checks, seeds, vectors against single ones, resets, ends, bad input, and that tasks can be done."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import raytac.envs
+import raytac.envs.lift_cube
+from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv
+from raytac.envs.balance_pole import BalancePole
+from raytac.envs.batch import TaskBatch
+from raytac.envs.push_cube import PushCube
+from raytac.envs.roll_ball import RollBall
+from raytac.errors import InputError
+from raytac.markers import MarkerPerturbation
+from raytac.observe import ObservationSettings, Randomization
+from tests.envs import scripted
+
+ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
+
+
+def equal(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+@pytest.mark.parametrize("kind", ENVS)
+def test_gymnasium_and_stable_baselines3_accept_it(kind: type) -> None:
+    with warnings.catch_warnings():
+        # Both warn of bounds at infinity and of arrays that are neither images nor vectors, which is as it should be.
+        warnings.simplefilter("ignore")
+        env = kind()
+        check_env(env, skip_render_check=True)
+        checker = pytest.importorskip("stable_baselines3.common.env_checker")
+        checker.check_env(env, skip_render_check=True)
+
+
+def test_every_name_is_registered_alone_and_as_a_vector() -> None:
+    assert tuple(i for i in gymnasium.registry if i.startswith("raytac/")) == raytac.envs.IDS
+    env = gymnasium.make("raytac/RollBall-v0", tactile=None)
+    assert isinstance(env.unwrapped, RollBallEnv) and "sensor_markers" not in env.observation_space.spaces  # type: ignore[attr-defined]
+    many = gymnasium.make_vec("raytac/RollBall-v0", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
+    assert isinstance(many.unwrapped, RollBallVectorEnv) and many.num_envs == 3
+
+
+def test_the_docstring_says_the_shapes_that_there_are() -> None:
+    for kind in ENVS:
+        text = " ".join((kind.__doc__ or "").split())
+        env = kind()
+        for name, spec in env.batch.arrays.items():
+            if name != "body":
+                shown = f"({spec.shape[0]},)" if len(spec.shape) == 1 else f"({spec.shape[0]}, {spec.shape[1]})"
+                assert f"`{name}`" in text and shown in text, (kind, name, shown)
+        assert f"Box(-1, 1, ({env.batch.steering.size},))" in text and f"{kind.task.max_episode_steps} steps" in text
+        env.reset(seed=0)
+        info = env.step(np.zeros(env.batch.steering.size, np.float32))[4]
+        assert all(f"`{term}`" in text for term in info["reward_terms"])
+
+
+def test_seeds_repeat_and_differ_with_noise_too() -> None:
+    noisy = Randomization(markers=MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=2e-4))
+    env = RollBallEnv(randomization=noisy)
+
+    def episode(seed: int) -> list[dict]:
+        seen = [env.reset(seed=seed)[0]]
+        for action in np.random.default_rng(0).uniform(-1, 1, (3, 3)):
+            seen.append(env.step(action)[0])
+        return seen
+
+    one, same, other = episode(1), episode(1), episode(2)
+    assert all(equal(a, b) for a, b in zip(one, same, strict=True))
+    assert not equal(one[0], other[0]) and np.isfinite(one[3]["sensor_markers"]).all()
+
+
+def test_a_vector_does_what_single_environments_of_its_seeds_do() -> None:
+    many = PushCubeVectorEnv(2)
+    first, _ = many.reset(seed=5)
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 2, 3)).astype(np.float32)
+    actions[..., 2] = -1.0  # down onto the cube
+    steps = [many.step(a) for a in actions]
+    for b in range(2):
+        env = PushCubeEnv()
+        alone, _ = env.reset(seed=5 + b)
+        assert equal(alone, {name: values[b] for name, values in first.items()})
+        for action, (seen, reward, *_, infos) in zip(actions[:, b], steps, strict=True):
+            mine, earned, *_, info = env.step(action)
+            for name, values in mine.items():
+                np.testing.assert_allclose(values, seen[name][b], atol=1e-6)
+            assert earned == pytest.approx(reward[b])
+            assert info["reward_terms"]["reaching"] == pytest.approx(infos["reward_terms"]["reaching"][b])
+    assert steps[-1][0]["sensor_markers"].any(), "nothing was touched"
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_environments_begin_anew_when_the_mode_says(mode: AutoresetMode) -> None:
+    many = RollBallVectorEnv(2, autoreset_mode=mode, max_episode_steps=3, tactile=("wrench",))
+    many.reset(seed=0)
+    still = np.zeros((2, 3), np.float32)
+    many.step(still)
+    many.reset(options={"reset_mask": np.array([False, True])})  # so that they end at different times
+    many.step(still)
+    seen, _, terminated, truncated, infos = many.step(still)
+    assert truncated.tolist() == [True, False] and not terminated.any()
+    assert ("final_obs" in infos) == (mode is AutoresetMode.SAME_STEP)
+    time = many.batch.world.state().time
+    assert (time[0] == 0.0) == (mode is AutoresetMode.SAME_STEP) and time[1] > 0.0
+    if mode is AutoresetMode.SAME_STEP:
+        assert infos["_final_obs"].tolist() == [True, False] and infos["final_obs"][1] is None
+        assert not np.array_equal(infos["final_obs"][0]["goal"], seen["goal"][0])
+        np.testing.assert_array_equal(seen["state"][0], 0.0)
+    if mode is AutoresetMode.NEXT_STEP:
+        seen, reward, terminated, truncated, _ = many.step(still)
+        assert reward[0] == 0.0 and not truncated[0] and many.batch.world.state().time[0] == 0.0 and truncated[1]
+        np.testing.assert_array_equal(seen["state"][0], 0.0)
+
+
+def test_the_terms_add_up_and_are_what_their_formulas_say() -> None:
+    batch = TaskBatch(PushCube(), num_envs=2, tactile=None)
+    batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    first, second = np.full((2, 3), 0.5), np.full((2, 3), -0.5)
+    batch.step(first)
+    out = batch.step(second)
+    np.testing.assert_allclose(sum(out.terms.values()), out.reward)
+    state = batch.world.state()
+    cube, pad = state.world_from_body["cube"][:, :3, 3], state.world_from_pad["sensor"][:, :3, 3]
+    away = np.linalg.norm(pad - cube - [0, 0, 0.02], axis=1)
+    np.testing.assert_allclose(out.terms["reaching"], 1 - np.tanh(away / 0.1))
+    missing = np.linalg.norm((cube - batch._goal)[:, :2], axis=1)
+    np.testing.assert_allclose(out.terms["target_fine"], 4 * (1 - np.tanh(missing / 0.02)))
+    np.testing.assert_allclose(out.terms["action_rate"], -3e-4)
+    np.testing.assert_allclose(out.observation["body"][:, :3], (cube - pad) / 0.1, atol=1e-6)
+
+
+def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
+    batch = TaskBatch(BalancePole(), num_envs=4, tactile=None)
+    batch.reset(range(4), [np.random.default_rng(b) for b in range(4)])
+    ended = np.zeros(4, bool)
+    for _ in range(150):
+        out = batch.step(np.zeros((4, 4)))
+        fresh = out.terminated & ~ended
+        assert (out.terms["terminated"][fresh] == -2.0).all() and (out.terms["alive"][fresh] == 0.0).all()
+        ended |= out.terminated
+    assert ended.sum() >= 2
+
+
+@pytest.mark.parametrize(
+    ("task", "policy", "steps"), [(RollBall, scripted.roll_ball, 60), (BalancePole, scripted.balance_pole, 120)]
+)
+def test_the_task_can_be_done(task: type, policy, steps: int) -> None:
+    batch = TaskBatch(task(), num_envs=2, tactile=None)
+    batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    for _ in range(steps):
+        out = batch.step(policy(batch))
+        assert not out.terminated.any()
+    assert out.success.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "policy"), [(PushCube, scripted.push_cube), (raytac.envs.lift_cube.LiftCube, scripted.lift_cube)]
+)
+def test_the_long_tasks_can_be_done(task: type, policy) -> None:
+    batch = TaskBatch(task(), num_envs=2, tactile=None)
+    batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    for _ in range(batch.max_episode_steps):
+        out = batch.step(policy(batch))
+    assert out.success.all()
+
+
+def test_joint_targets_are_actions_too() -> None:
+    env = LiftCubeEnv(action="joints", tactile=None)
+    env.reset(seed=0)
+    before = env.batch.world.state().joints
+    for _ in range(5):
+        env.step(np.array([0, 0, 0, 0, 0, 0, 1, -1], np.float32))
+    after = env.batch.world.state().joints
+    assert before is not None and after is not None
+    assert after[0, 6] - before[0, 6] == pytest.approx(0.25, abs=0.08)
+    np.testing.assert_allclose(after[0, :6], before[0, :6], atol=0.01)
+
+
+def test_images_in_a_vector() -> None:
+    settings = ObservationSettings(("rgb", "markers"), resolution=(32, 32), optics="phong")
+    many = RollBallVectorEnv(2, tactile=settings, randomization=Randomization(exposure=0.2))
+    seen, _ = many.reset(seed=0)
+    assert seen["sensor_rgb"].shape == (2, 32, 32, 3) and many.observation_space.contains(seen)
+    for _ in range(4):
+        touched = many.step(np.array([[0, 0, -1.0], [0, 0, 0.0]], np.float32))[0]["sensor_rgb"]
+    changed = np.abs(touched.astype(int) - seen["sensor_rgb"]).max(axis=(1, 2, 3))
+    assert changed[0] > 5 and changed[1] <= 1
+
+
+def test_bad_input_names_the_environment() -> None:
+    many = RollBallVectorEnv(3, tactile=None)
+    with pytest.raises(InputError, match="must be reset"):
+        many.step(np.zeros((3, 3)))
+    many.reset(seed=0)
+    for wrong in (np.nan, np.inf, 1.5):
+        actions = np.zeros((3, 3))
+        actions[2, 1] = wrong
+        with pytest.raises(InputError, match="environment 2, component 1"):
+            many.step(actions)
+    with pytest.raises(InputError, match=r"\(3, 3\)"):
+        many.step(np.zeros((2, 3)))
+    for options, text in (
+        ({"tactile": "touch"}, "modalities"),
+        ({"action": "torque"}, "action"),
+        ({"physics": "fem"}, "physics"),
+        ({"max_episode_steps": 0}, "max_episode_steps"),
+        ({"autoreset_mode": "never"}, "autoreset_mode"),
+    ):
+        with pytest.raises(InputError, match=text):
+            RollBallVectorEnv(2, **options)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="3 environments"):
+        many.reset(seed=[1, 2])
+    with pytest.raises(InputError, match="mask"):
+        many.reset(options={"reset_mask": np.array([True])})
+
+
+def test_an_environment_that_fails_is_truncated_and_the_others_go_on() -> None:
+    many = RollBallVectorEnv(2, tactile=("wrench",), autoreset_mode=AutoresetMode.DISABLED)
+    many.reset(seed=0)
+    many.batch.world.data[0].qvel[0] = 1e9
+    seen, reward, terminated, truncated, infos = many.step(np.zeros((2, 3), np.float32))
+    assert infos["failed"].tolist() == truncated.tolist() == [True, False] and not terminated.any()
+    assert reward[0] == 0.0 and reward[1] > 0.0 and all(np.isfinite(values).all() for values in seen.values())
+
+
+@pytest.mark.slow
+def test_a_simulated_pad_is_a_setting_that_changes_no_shape() -> None:
+    rigid, soft = (RollBallVectorEnv(2, physics=p, tactile=("markers", "wrench")) for p in ("rigid", "ipc"))
+    assert rigid.observation_space == soft.observation_space
+    soft.reset(seed=0)
+    for _ in range(6):
+        seen = soft.step(np.array([[0, 0, -1.0], [0, 0, 0.0]], np.float32))[0]
+    assert soft.observation_space.contains(seen) and seen["sensor_wrench"][0, 2] < 0.0 == seen["sensor_wrench"][1, 2]

@@ -1,0 +1,69 @@
+"""Environments that start elsewhere: joints and bodies of those that are named, in both physics."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module names its types at run time.)
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError
+from raytac.specs import load_sensor, load_task
+from raytac.world.world import TactileWorld
+
+
+def shifted(world: TactileWorld, body: str, rows: int, by: float) -> np.ndarray:
+    at = np.repeat(world.state().world_from_body[body][:1], rows, axis=0)
+    at[:, 0, 3] += by
+    return at
+
+
+def test_named_environments_start_where_they_are_told_and_others_go_on() -> None:
+    world = TactileWorld("roll_ball", outputs=("wrench",), num_envs=3)
+    arm = world.arm
+    assert arm is not None
+    world.step()
+    before = world.state()
+    joints = np.repeat(world.composed.start[arm.qpos][None], 2, axis=0)
+    joints[1, 0] += 0.1
+    state = world.reset([0, 2], joints=joints, bodies={"ball": shifted(world, "ball", 2, 0.02)})
+    np.testing.assert_allclose(state.time, [0.0, before.time[1], 0.0])
+    assert state.joints is not None and before.joints is not None
+    np.testing.assert_allclose(state.joints[[0, 2]], joints)
+    np.testing.assert_array_equal(state.joints[1], before.joints[1])
+    np.testing.assert_allclose(state.world_from_body["ball"][:, 0, 3], [0.47, 0.45, 0.47], atol=1e-6)
+    np.testing.assert_allclose(world.reset().world_from_body["ball"][:, 0, 3], 0.45, atol=1e-12)
+
+
+def test_the_solver_s_bodies_start_elsewhere_too() -> None:
+    world = TactileWorld("roll_ball", physics="ipc", outputs=("wrench",), num_envs=2)
+    state = world.reset([1], bodies={"ball": shifted(world, "ball", 1, 0.02)})
+    np.testing.assert_allclose(state.world_from_body["ball"][:, 0, 3], [0.45, 0.47], atol=1e-9)
+    state = world.step()
+    np.testing.assert_allclose(state.world_from_body["ball"][:, 0, 3], [0.45, 0.47], atol=1e-4)
+
+
+def test_wrong_starts_are_refused_by_name_and_row() -> None:
+    world = TactileWorld("roll_ball", outputs=("wrench",), num_envs=2)
+    at = shifted(world, "ball", 2, 0.0)
+    for bodies, text in (
+        ({"bal": at}, "choose from: ball"),
+        ({"table": at}, "free rigid body"),
+        ({"ball": at[:1]}, r"shape \(2, 4, 4\)"),
+        ({"ball": np.where(np.arange(2)[:, None, None] == 1, np.nan, at)}, "row 1"),
+    ):
+        with pytest.raises(InputError, match=text):
+            world.reset(bodies=bodies)
+    with pytest.raises(InputError, match=r"shape \(2, 7\)"):
+        world.reset(joints=np.zeros((2, 6)))
+
+
+def test_a_robot_can_carry_a_sensor_that_is_no_file() -> None:
+    spec = load_sensor("gelsight_mini")
+    soft = replace(spec, gelpad=replace(spec.gelpad, youngs_modulus=1e4))
+    scene = load_task("roll_ball")
+    world = TactileWorld(replace(scene, robot=replace(scene.robot, sensor=soft)), outputs=("wrench",))
+    assert world.sensors["sensor"].spec.gelpad.youngs_modulus == 1e4
