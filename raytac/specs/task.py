@@ -113,7 +113,6 @@ class BodySpec:
     colour: Vec3 | None = None
     """Linear red, green, blue in [0, 1] for pictures."""
 
-
     @property
     def friction_on_gel(self) -> float | None:
         """Coefficient against gel; None: the gelpad's own."""
