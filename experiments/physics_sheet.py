@@ -73,8 +73,7 @@ class Args(CommonOptions):
                 frames = {}
                 for physics, sensor in sensors.items():
                     began = time.perf_counter()
-                    pad = sensor.load(load_press(name))
-                    frames[physics] = frame = sensor.update(pad.peak(pad.run()))
+                    frames[physics] = frame = sensor.press(load_press(name))
                     metrics |= {f"{name}.{physics}.{key}": value for key, value in measured(frame).items()}
                     metrics[f"{name}.{physics}.press_s"] = time.perf_counter() - began
                 metrics |= {f"{name}.{key}": value for key, value in compared(frames["rigid"], frames["ipc"]).items()}
