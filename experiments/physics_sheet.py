@@ -1,6 +1,6 @@
 """What does each physics of the pad show? Every press scene under the rigid pad and under the simulated one, on one sheet.
 
-    python experiments/physics_sheet.py --out runs/physics_sheet              # both pads, nine scenes: some minutes on two cores
+    python experiments/physics_sheet.py --out runs/physics_sheet              # both pads, eight scenes: some minutes on two cores
     python experiments/physics_sheet.py --pad medium --out runs/physics_sheet_medium
 
 One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's.
@@ -143,7 +143,7 @@ def draw(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSens
         f"indentation, ipc ({pad}) [mm]",
         "ipc − rigid [mm]",
     )
-    figure = Figure(figsize=(13.0, 2.12 * len(rows) + 0.35), layout="constrained", dpi=80)
+    figure = Figure(figsize=(13.0, 1.72 * len(rows) + 0.35), layout="constrained", dpi=100)
     axes = np.atleast_2d(figure.subplots(len(rows), len(titles), squeeze=False))
     for line, (name, rigid, soft) in zip(axes, rows, strict=True):
         grid = rigid.surface.grid

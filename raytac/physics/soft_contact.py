@@ -103,12 +103,18 @@ class SoftContact:
             lost |= self.drive(pad_from_object, world_from_pad)
             before, forces = forces, self.forces()
             changed, borne = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces - before, forces))
-            total = forces.sum(axis=1)
-            cone = (1.0 + _UNSETTLED) * self._friction * np.maximum(-total[:, 2], 0.0) + _SLIGHT
-            settled = (changed <= _UNSETTLED * borne) & (np.linalg.norm(total[:, :2], axis=1) <= cone)
-            if (settled | lost).all():
+            if (((changed <= _UNSETTLED * borne) & self.obeys_friction()) | lost).all():
                 break
         return lost
+
+    def obeys_friction(self) -> np.ndarray:
+        """Whether friction is within its cone and no vertex is pulled, over-all and within a hundredth, shape (B,)."""
+        forces = self.forces()
+        total = forces.sum(axis=1)
+        borne = np.maximum(-total[:, 2], 0.0)
+        cone = (1.0 + _UNSETTLED) * self._friction * borne + _SLIGHT
+        pulled = np.maximum(forces[:, :, 2], 0.0).sum(axis=1)
+        return (np.linalg.norm(total[:, :2], axis=1) <= cone) & (pulled <= _UNSETTLED * borne + _SLIGHT)
 
     def weigh(self, share: float) -> None:
         """Let gravity act with ``share`` of its strength, towards −z of the world."""

@@ -22,6 +22,12 @@ _CLOSE = 1e-6
 """A depth is reached within this [m]."""
 _TIGHT = 5e-4
 """A force is reached within this share."""
+_FAR = 0.01
+"""Share of the force from which a change of it tells the contact's stiffness; lesser ones may be friction that still gives way."""
+_GROWTH = 8.0
+"""Times the force that is borne up to which a contact's stiffness is extrapolated."""
+_SLIGHT = 1e-6
+"""No force [N]."""
 _PATIENCE, _REFINEMENTS = 120, 4
 _STILL = 2e-5
 """Speed below which a free object lies still [m/s]."""
@@ -96,10 +102,7 @@ class SoftDrive:
             else:
                 to_twist = twist + fraction * (stage.twist - twist)
             self._go(self._depth, to_shear, to_twist, follow=True)
-            self._step()
-            if not np.isfinite(self._force).any():
-                self._settle_depth()
-                self._step()  # so that friction is bounded by the forces at the depth that was settled on
+            self._settle()  # a shear unloads what lies behind the object
         elif stage.kind == "release":
             self._force[:] = np.nan
             self._release(depth, fraction)
@@ -107,6 +110,8 @@ class SoftDrive:
             borne = np.where(np.isfinite(force), force, 0.0)
             self._force[:] = borne + fraction * (stage.force - borne)
             self._load()
+            if not self._is_free and (self._force < borne).any():
+                self._settle()
         else:
             self._force[:] = np.nan
             target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
@@ -133,9 +138,10 @@ class SoftDrive:
         # Follow the clearance, but never so fast that the object would stand still or turn back.
         off = np.nan_to_num(self._seen - self._kept)
         self._kept = self._kept + np.clip(off, -self._d_hat, 0.5 * np.abs(way))
-        short = np.clip(way, 0.0, self._d_hat) if is_last else 0.0
+        exact = np.full(self.num_envs, is_last) | np.isnan(self._seen)  # the first that touches has no clearance to go by
+        short = np.where(exact, np.clip(way, 0.0, self._d_hat), 0.0)
         self._go(depth - short, self._shear, self._twist)
-        if is_last:
+        if exact.any():
             self._kept = self._kept + self._off()
             self._depth = depth
             self._step()
@@ -166,6 +172,19 @@ class SoftDrive:
 
     def _settle_friction(self) -> None:
         self.failed |= self._solver.settle_friction(self.poses(), self.case(), self.failed)
+
+    def _settle(self) -> None:
+        """Let friction become that of the contacts there are, at the force or the depth that is kept."""
+        if not np.isfinite(self._force).any():
+            self._settle_depth()
+            self._settle_friction()
+            self._settle_depth()
+            return
+        for _ in range(_REFINEMENTS):  # where friction gives way the force does too, and to make up for that costs steps
+            if (self._solver.obeys_friction() | self.failed).all():
+                return
+            self._settle_friction()
+            self._load()
 
     def _off(self) -> np.ndarray:
         """How much more the barrier keeps than the object is held higher by [m], (B,); 0 out of contact, or where a force is kept."""
@@ -200,20 +219,29 @@ class SoftDrive:
         if not np.isfinite(self._stiffness).all():
             wanted = np.nan_to_num(self._force)
             self._stiffness = np.array([self._places.stiffness(b, self._twist[b], wanted[b]) for b in range(self.num_envs)])
-        borne = self._normal_force()
+        borne, drift = self._normal_force(), np.zeros(self.num_envs)
         for _ in range(_PATIENCE):
-            missing = np.where(np.isfinite(self._force) & ~self.failed, self._force - borne, 0.0)
-            if (np.abs(missing) <= _TIGHT * np.nan_to_num(self._force)).all():
+            missing = self._missing()
+            if self._bears(missing):
                 return
-            way = np.clip(missing / self._stiffness, -STEP, STEP)
+            # On the way the contact grows and stiffens, a ball's as the cube root of its force.
+            grown = np.clip(np.nan_to_num(self._force) / np.maximum(borne, _SLIGHT), 1.0, _GROWTH)
+            way = np.clip((missing - drift) / (self._stiffness * 0.5 * (1.0 + np.cbrt(grown))), -STEP, STEP)
             self._depth = self._depth + way
             self._step()
             before, borne = borne, self._normal_force()
-            moved = np.abs(way) > 1e-9
-            found = (borne - before)[moved] / way[moved]
-            usable = found > 0.1 * self._stiffness[moved]
-            self._stiffness[moved] = np.where(usable, found, self._stiffness[moved])
-        self.failed |= np.abs(missing) > _TIGHT * np.nan_to_num(self._force)
+            gained, far = borne - before, np.abs(self._stiffness * way) > _FAR * np.maximum(borne, _SLIGHT)
+            found = gained / np.where(far, way, 1.0)
+            self._stiffness = np.where(far & (found > 0.3 * self._stiffness), found, self._stiffness)
+            drift = np.where(far, 0.0, gained - self._stiffness * way)
+        self.failed |= np.abs(self._missing()) > _TIGHT * np.nan_to_num(self._force)
+
+    def _missing(self) -> np.ndarray:
+        """What the contact bears too little of the force that is kept [N], (B,); 0 where none is."""
+        return np.where(np.isfinite(self._force) & ~self.failed, self._force - self._normal_force(), 0.0)
+
+    def _bears(self, missing: np.ndarray) -> bool:
+        return bool((np.abs(missing) <= _TIGHT * np.nan_to_num(self._force)).all())
 
     def _lie(self) -> None:
         """Let a free object come to rest under its weight."""

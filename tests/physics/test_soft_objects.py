@@ -1,0 +1,85 @@
+"""Objects that give way, or lie free, on the soft pad: symmetry, balance, and Hertz' law of two elastic bodies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.physics.soft import SoftPad
+from raytac.specs import load_sensor
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+
+SENSOR = load_sensor("gelsight_mini")
+FLAT = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.0, dome_radius=(math.inf, math.inf)))
+RADIUS, YOUNG, POISSON = 4e-3, 430e3, 0.45
+
+
+def ball(sensor, stage, **settings):
+    """A pad and its state at the end of a stage that presses a ball into it."""
+    spec = ObjectSpec("sphere", {"radius": RADIUS}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05, **settings)
+    pad = SoftPad(sensor, PressScene("ball", spec, (stage,)), pitch=0.1e-3)
+    return pad, pad.peak(pad.run())
+
+
+@pytest.fixture(scope="module")
+def rigid():
+    return ball(FLAT, StageSpec("indent", depth=0.25e-3))
+
+
+@pytest.fixture(scope="module")
+def soft():
+    pytest.importorskip("pytetwild")
+    return ball(FLAT, StageSpec("indent", depth=0.5e-3), dynamics="soft", youngs_modulus=YOUNG, poisson_ratio=POISSON)
+
+
+def test_a_soft_ball_leaves_a_symmetric_imprint_shallower_than_its_way(soft):
+    """Ball and gel share the way by 1 − ν² over E of each, so that as stiff a ball leaves half of it to the gel at most."""
+    pad, state = soft
+    assert not state.failed[0] and state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
+    height, deepest = pad.surface(state).height[0], pad.surface(state).indentation.max()
+    assert 0.3 * 0.5e-3 < deepest < 0.5 * 0.5e-3
+    for turned in (height[::-1], height[:, ::-1]):
+        assert (
+            np.abs(height - turned).max() < 20e-6
+        )  # its tetrahedra are not symmetric; facets of 0.8 mm lie so far inside a ball
+    assert np.abs(state.shear_force[0]).max() < 0.01 * state.normal_force[0]
+
+
+def test_what_drives_a_soft_ball_is_what_the_case_feels(soft):
+    pad, state = soft
+    assert pad.solver is not None
+    driven, case = (pad.solver.world.wrench(name).force[0] for name in ("object", "pad"))
+    assert state.normal_force[0] > 0.1
+    assert np.abs(driven + case).max() < 0.01 * state.normal_force[0]
+    assert case == pytest.approx(pad.wrench(state)[0, :3], abs=0.01 * state.normal_force[0])
+
+
+def test_two_elastic_bodies_touch_by_hertzs_law(rigid, soft):
+    """F R/a³ = 4/3 E*, with 1/E* the sum of (1 − ν²)/E of both, within 10 %.
+
+    The constant is that of a rigid ball on the same mesh, which the layer and the coarse cells make a third larger than a half-space's.
+    """
+    gelpad = FLAT.gelpad
+    gel, rubber = ((1.0 - nu**2) / young for nu, young in ((gelpad.poisson_ratio, gelpad.youngs_modulus), (POISSON, YOUNG)))
+    moduli = []
+    for pad, state in (rigid, soft):
+        radius = math.sqrt(pad.surface(state).contact.sum() * np.prod(pad.grid.pitch) / math.pi)
+        moduli.append(0.75 * state.normal_force[0] * RADIUS / radius**3)
+    assert moduli[1] / moduli[0] == pytest.approx(gel / (gel + rubber), rel=0.1)
+    assert moduli[0] * gel == pytest.approx(1.33, rel=0.1)
+
+
+def test_a_free_ball_rests_upright_on_the_dome():
+    """Symmetric, without shear or torque, and as deep as a driven one that bears the same force."""
+    states = [ball(SENSOR, StageSpec("indent", force=0.3), dynamics=dynamics) for dynamics in ("affine", "kinematic")]
+    (pad, lying), (other, driven) = states
+    height = pad.surface(lying).height[0]
+    assert max(np.abs(height - height[::-1]).max(), np.abs(height - height[:, ::-1]).max()) < 2e-6
+    wrench = pad.wrench(lying)[0]
+    assert wrench[2] == pytest.approx(-0.3, rel=0.01)
+    assert np.abs(wrench[:2]).max() < 1e-3 * 0.3 and np.abs(wrench[3:]).max() < 1e-3 * 0.3 * RADIUS
+    deepest = other.surface(driven).indentation.max()
+    assert np.abs(height - other.surface(driven).height[0]).max() < 0.05 * deepest  # while it comes to rest, friction gives way
