@@ -5,8 +5,8 @@
 
 Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``table32`` (32 x 32 images of the Taxim table), ``raytrace64``
 (64 x 64 ray-traced images). The policy is the multilayer perceptron of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
-whose third action is replaced by what presses the pad onto the cube with about 1 N: a random policy would hardly touch it, and contact is
-what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
+a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
+policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
         begin, before = time.perf_counter(), dict(env.batch.time_s)
         action = policy(observation)
         force = -env.batch.world.state().wrench["sensor"][:, 2]
+        action[:, :2] *= 0.1  # so that the pad stays on the cube
         action[:, 2] = np.clip(0.3 * (force - 1.0), -1.0, 1.0)
         acted = time.perf_counter()
         observation = env.step(action)[0]

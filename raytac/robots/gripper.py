@@ -99,8 +99,9 @@ def floating_gripper(
         finger.add_geom(
             name=f"{side}_holder",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(0.011, depth / 2, 0.002),
-            pos=(0.0, depth / 2, -back - 2e-3),
+            # 4 mm behind the pad, as on the Panda's hand: what the pads hold must meet gel before it meets a holder.
+            size=(0.011, depth / 2 - 2e-3, 0.002),
+            pos=(0.0, depth / 2 + 2e-3, -back - 2e-3),
             mass=_FINGER,
             rgba=(0.3, 0.3, 0.32, 1.0),
         )

@@ -16,13 +16,12 @@ from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["PadOverlap", "Touch"]
 
-_PITCHES = 0.4e-3, 0.2e-3
-"""Spacings of the nodes [m]: a contact that covers enough of the first ones is measured there, a smaller one on the second."""
+_PITCHES = 0.8e-3, 0.4e-3, 0.2e-3
+"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, else on the last."""
 _ENOUGH = 150
-"""Nodes of the coarse grid, 24 mm²."""
-_NEAR = 0.3e-3
-"""A body whose nodes on the coarse grid all stay this far from the gel does not touch between them [m]: with a radius of 1 mm it would
-reach 0.04 mm further."""
+"""Nodes: 96 mm² of the first grid, 24 mm² of the second."""
+_NEAR = 0.75
+"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,17 @@ class PadOverlap:
 
     def touch(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touch | None:
         """How a body at a pose (4, 4) overlaps the pad; None where it does not. ``radius`` [m] of a ball that holds the body."""
-        coarse, fine = self._grids
-        found, near = coarse.measure(parts, pad_from_body, radius, reach=_NEAR)
-        if not near or (found is not None and np.count_nonzero(found.gap < 0.0) >= _ENOUGH):
-            return found
-        return fine.measure(parts, pad_from_body, radius)[0]
+        finest = self._grids[-1]
+        for nodes in self._grids[:-1]:
+            found, near = nodes.measure(parts, pad_from_body, radius, reach=_NEAR * nodes.pitch)
+            if not near:
+                return None
+            count = 0 if found is None else np.count_nonzero(found.gap < 0.0)
+            if count >= _ENOUGH:
+                return found
+            if count < _ENOUGH // 8:
+                break  # with half the spacing there are four times as many, at most half of enough
+        return finest.measure(parts, pad_from_body, radius)[0]
 
     def law(self, touch: Touch) -> LoadLaw:
         """Load law of the body that touches, at this place and angle."""
@@ -66,7 +71,7 @@ class _Nodes:
     def __init__(self, gelpad: GelpadSpec, pitch: float) -> None:
         grid = make_grid(gelpad, pitch)
         self.x, self.y, self.rest = grid.x, grid.y, grid.rest
-        self.cell = grid.pitch[0] * grid.pitch[1]
+        self.pitch, self.cell = pitch, grid.pitch[0] * grid.pitch[1]
         self.highest = float(grid.rest.max())
         # The rest surface is a sum of a function of x and one of y (``GelpadSpec.sag``), and so are its slopes.
         self.rest_x, self.rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)

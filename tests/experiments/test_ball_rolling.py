@@ -19,7 +19,7 @@ def test_a_short_stroke_with_the_rigid_pad(tmp_path: Path) -> None:
 
     assert value("goals_reached") == value("goals") == 1
     assert value("goal_error_mm") < 1.0 and value("ball_off_pad_centre_max_mm") < 5.5
-    # Between two parallel planes a ball that slips on neither goes exactly half as far; the dome and the dent take a little off.
+    # Between two parallel planes a ball that slips on neither goes exactly half as far; the dent adds a little: R / (2 R − δ) of the way.
     assert value("ball_over_pad_way") == pytest.approx(0.5, abs=0.03)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"metrics.json", "rigid.png", "rigid.gif", "rigid_strip.png"}
 

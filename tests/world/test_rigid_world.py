@@ -123,6 +123,26 @@ def test_a_cube_is_lifted_and_both_pads_together_carry_its_weight() -> None:
     np.testing.assert_allclose(up, [0, 0, -0.05 * G], atol=0.01 * 0.05 * G)
 
 
+def test_a_cube_taller_than_the_pads_is_gripped_by_gel_alone() -> None:
+    """The floating gripper's holders stand back from the pads: servo and gels are in balance, and nothing else touches."""
+    cube = BodySpec("cube", "box", {"length": 0.03, "width": 0.03, "height": 0.04}, position=(0.0, 0.0, 0.0), mass=0.05)
+    gripper = RobotSpec("floating_gripper", opening=0.0305, position=(0.0, 0.0, 0.0))
+    world = TactileWorld(TaskScene("grip", gripper, (cube,), gravity=(0.0, 0.0, 0.0)), outputs=("wrench",))
+    opening = world.composed.opening
+    assert opening is not None
+
+    def close(data: mujoco.MjData, time: float) -> None:
+        data.ctrl[opening] = max(0.0298, 0.0305 - 0.01 * time)
+
+    for _ in range(30):
+        state = world.step(close)
+    left, right = (state.world_from_pad[name][0, :3, 3] for name in ("left", "right"))
+    squeeze = 1e4 * (np.linalg.norm(left - right) - 0.0298)  # the servo's gain [N/m]
+    assert world.data[0].ncon == 2 and squeeze > 0.1
+    for name in ("left", "right"):
+        assert -state.wrench[name][0, 2] == pytest.approx(squeeze, rel=0.01)
+
+
 def test_reset_restores_bit_by_bit_and_only_what_was_asked() -> None:
     world = TactileWorld(replace(UP, bodies=(replace(BALL, position=(0.003, 0.0, 0.0052)),)), outputs=("wrench",), num_envs=2)
     first = [world.step() for _ in range(12)]
