@@ -32,6 +32,9 @@ _LINEAR = 1e-6
 """Residual of the linear solve [-]: a grasped body that travels must come along to a small share of ε_v dt, or friction would slip."""
 
 
+_GRAVITY = 0.0, 0.0, -9.81
+
+
 @dataclass(frozen=True)
 class ScenePad:
     """One pad of a scene; its case goes where ``world_from_pad`` says."""
@@ -74,7 +77,7 @@ class SoftScene:
         world_from_body: Mapping[str, ArrayLike],
         *,
         dt: float = 0.01,
-        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        gravity: ArrayLike | None = None,
         friction: Mapping[tuple[str, str], float] | None = None,
         ignored: Sequence[tuple[str, str]] = (),
         num_envs: int | None = None,
@@ -89,22 +92,25 @@ class SoftScene:
             world_from_pad: where the pads start, (S, 4, 4) or (B, S, 4, 4).
             world_from_body: of each body by name, (4, 4) or (B, 4, 4).
             dt: length of a step [s].
-            gravity: [m/s²], world frame, (3,) or (B, 3).
+            gravity: [m/s²], world frame, (3,) or (B, 3); None: (0, 0, −9.81), or that of ``settings``.
             friction: μ by pair of names where the rule does not fit. The rule: with a pad, the body's own coefficient if it has one, else
                 the pad's gel's; between bodies, the larger of theirs, as in MuJoCo.
             ignored: pairs of names that pass through each other.
             num_envs: B; None: as the poses say.
             device: ``cpu``, ``cuda`` or ``auto``.
-            settings: of the solver, instead of ``dt`` and this module's own (see docs/soft-pad.md).
+            settings: of the solver, instead of ``dt``, ``gravity`` and this module's own (see docs/soft-pad.md).
 
         Raises:
-            InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid.
+            InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid, or gravity and settings.
             OverlapError: bodies overlap where they start; the message names the surfaces.
         """
         self.pads = {pad.name: pad for pad in pads}
         self.bodies = {body.name: body for body in bodies}
         self._check_names(pads, bodies)
-        self.gravity = np.asarray(gravity, float)
+        if gravity is not None and settings is not None:
+            raise InputError("gravity", value=gravity, rule="must be left out where settings are given, which have their own")
+        given = (settings.gravity if settings is not None else _GRAVITY) if gravity is None else gravity
+        self.gravity = np.asarray(given, float)
         self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
         self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._of_bodies(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
@@ -137,6 +143,11 @@ class SoftScene:
         self._readers: dict[str, SoftReader] = {}
         self._on_surface = {name: self._coat_on_surface(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Environments that stay as they are until they are reset, (B,), bool."""
+        return self._failed.copy()
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
@@ -269,13 +280,16 @@ class SoftScene:
         """Grid that a pad's surface is read on."""
         return make_grid(self._pad(pad).sensor.gelpad, self._pad(pad).pitch)
 
-    def reading(self, pad: str, grid: PadGrid | None = None) -> SoftReading:
-        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed."""
+    def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
+        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed.
+
+        ``failed``: further environments (B,) that are lost, if not by this scene.
+        """
         mine = self._pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(mine.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
-        return self._readers[pad].read(self.seen(pad), self._failed)
+        return self._readers[pad].read(self.seen(pad), self._failed if failed is None else self._failed | failed)
 
     def seen(self, pad: str) -> SeenPad:
         """What the reader needs: a pad's coat and forces, and what it touches."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,6 +98,9 @@ class Travel:
             found[name] = Mover(now.pads[:, k], goal.pads[:, k], low, high)
         for name, body in self.scene.bodies.items():
             found[name] = self._mover(body, now.bodies, goal.bodies, left)
+        failed = self.scene.failed[:, None, None]
+        if failed.any():  # nothing moves there, whatever speed it had
+            found = {name: replace(mover, end=np.where(failed, mover.start, mover.end)) for name, mover in found.items()}
         return found
 
     def _mover(self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], left: float) -> Mover:

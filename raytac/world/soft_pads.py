@@ -40,6 +40,9 @@ _TOUCH = 1e-5
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
+_AT_REST = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "newton": 0, "substeps": 0}
+"""What the report says after a reset, before any step."""
+
 
 class SoftPads:
     """All pads of a world, B environments, as one ``SoftScene``."""
@@ -51,7 +54,6 @@ class SoftPads:
         *,
         level: str,
         coupling: str,
-        pitch: float,
         device: str,
     ) -> None:
         """Put the pads of all environments into the solver where MuJoCo has them.
@@ -60,7 +62,6 @@ class SoftPads:
             composed: the scene; ``datas``: its state in every environment.
             level: how finely pads are cut, one of ``PADS``.
             coupling: one of ``COUPLINGS``.
-            pitch: spacing of the grid that surfaces are read on [m].
             device: of the solver.
 
         Raises:
@@ -70,7 +71,7 @@ class SoftPads:
         self.composed, self.model = composed, composed.model
         scene = composed.scene
         pads = [
-            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), pitch)
+            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level))
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
@@ -129,8 +130,8 @@ class SoftPads:
                 self._last_led[body.spec.name][b] = starts[body.spec.name][b]
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
-            for values in self.report.values():
-                values[b] = 0
+            for key, values in self.report.items():
+                values[b] = _AT_REST[key]
             if self._coupling is not None:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
@@ -173,7 +174,7 @@ class SoftPads:
 
     def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
         """Surface and forces of one sensor, for all environments."""
-        reading = self.soft.reading(name)
+        reading = self.soft.reading(name, grid, failed)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction() -> np.ndarray:

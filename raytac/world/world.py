@@ -132,7 +132,6 @@ class TactileWorld:
             self.data,
             level=self.pad,
             coupling=self.coupling,
-            pitch=self.sensors[self.sensor_names[0]].pitch,
             device=resolve_device(self.device, ray_tracing=False),
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.part import primitive
 from raytac.physics.soft_approach import STEP, Mover, allowed_share
@@ -162,3 +163,28 @@ def test_cuda_and_cpu_press_alike():
             [scene.wrench("left")[0], scene.pose("cube")[0].ravel(), scene.stiffness("left")[0].diagonal()]
         )
     assert found["cuda"] == pytest.approx(found["cpu"], rel=1e-3, abs=1e-4)
+
+
+def test_what_failed_at_speed_does_not_cut_the_steps_of_others():
+    scene = two_pads(num_envs=2, gap=1e-3)
+    state = scene.save()
+    state.world.velocity[1, scene.world.layout.node_start[2] :] = (0.0, 0.15, 0.0)  # the cube, after both pads
+    scene.restore(state)
+    assert scene.step(fingers(1e-3)).substeps > 1
+    state.world.failed[1] = True
+    scene.restore(state)
+    assert scene.failed.tolist() == [False, True]
+    report = scene.step(fingers(1e-3))
+    assert report.substeps == 1 and report.failed.tolist() == [False, True]
+
+
+def test_gravity_is_that_of_the_settings():
+    bodies = [scene_body("cube", (primitive("box", (HALF,) * 3),), "affine", density=500.0)]
+    pads = [ScenePad("left", SENSOR, MESH), ScenePad("right", SENSOR, MESH)]
+    given = ipc.Settings(gravity=(0.0, 1.0, -2.0), d_hat=MESH.d_hat)
+    scene = SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given)
+    scene.step(fingers(5e-3))
+    assert scene.gravity == pytest.approx([0.0, 1.0, -2.0])
+    assert scene.velocity("cube")[0] == pytest.approx(given.dt * scene.gravity, rel=1e-3)
+    with pytest.raises(InputError, match=r"gravity.*left out where settings are given"):
+        SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given, gravity=(0.0, 0.0, 0.0))

@@ -59,6 +59,7 @@ def test_reset_restores(resting: TactileWorld) -> None:
     state = resting.state()
     assert state.time[0] == 0.0 and state.world_from_body["ball"][0, 2, 3] == pytest.approx(0.0051, abs=1e-12)
     np.testing.assert_array_equal(state.wrench["sensor"], 0.0)
+    assert state.report["min_gap"][0] == np.inf and state.report["min_det"][0] == 1.0 and state.report["converged"][0]
     for _ in range(30):
         again = resting.step()
     np.testing.assert_allclose(again.world_from_body["ball"], first.world_from_body["ball"], atol=1e-9)
@@ -162,3 +163,14 @@ def test_two_way_is_one_way_for_a_stiff_arm_and_a_spring_for_a_soft_one(tmp_path
     given, off = press(500.0, "two_way", 40)
     # What the servo bears is what the pad feels, and the link has moved by it.
     assert 500.0 * off == pytest.approx(given, rel=0.01) and given < 0.9 * held
+
+
+def test_what_mujoco_lost_is_not_shown_and_sensors_are_made_when_asked_for() -> None:
+    slide = replace(UP, robot=RobotSpec("floating_gripper", opening=0.04, position=(0.0, 0.0, 0.1)))
+    world = TactileWorld(slide, outputs=("wrench",), num_envs=2)
+    assert not world._sensors
+    world.data[0].qvel[0] = 1e9
+    assert world.step().failed.tolist() == [True, False]
+    surface = world.observe()[world.sensor_names[0]].surface
+    assert np.isnan(surface.height[0]).all() and np.isfinite(surface.height[1]).all()
+    assert surface.grid is world.sensors[world.sensor_names[0]].grid
