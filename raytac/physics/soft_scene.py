@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -153,7 +154,8 @@ class SoftScene:
 
     def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
         """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
-        return self._travel.part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)[0] == MOST_SUBSTEPS
+        part, refused = self._travel.part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)
+        return part == MOST_SUBSTEPS and not refused
 
     def step(
         self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
@@ -167,17 +169,23 @@ class SoftScene:
 
         Raises:
             InputError: an unknown or free body, a bad pose, or a motion near another body that would take more than
-                ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then.
+                ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then. Of several environments the one that is
+                told to move so fails instead, with a ``RuntimeWarning``, and the others go on.
         """
         begun, goal = self._now, self._goal(world_from_pad, driven)
         before: SceneState | None = None
         done, total = 0, None
         while done < MOST_SUBSTEPS:
-            part, pair = self._travel.part(done, self._now, goal, dt or self.settings.dt)
-            if part == 0:
+            part, refused = self._travel.part(done, self._now, goal, dt or self.settings.dt)
+            if refused and self.num_envs == 1:
                 if before is not None:
                     self.restore(before)
-                raise self._travel.refusal(pair, begun, goal)
+                raise self._travel.refusal(0, refused[0], begun, goal)
+            if refused:
+                for b, pair in refused.items():
+                    warnings.warn(f"failed: {self._travel.refusal(b, pair, begun, goal)}", RuntimeWarning, stacklevel=2)
+                self._fail(list(refused))
+                continue
             if part < MOST_SUBSTEPS and before is None:
                 before = self.save()
             done += part
@@ -349,6 +357,12 @@ class SoftScene:
         self.restore(SceneState(self.world.save(), Poses(cases, self._driven(places))), mask)
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
+
+    def _fail(self, envs: list[int]) -> None:
+        """Let environments stay as they are until they are reset."""
+        state = self.save()
+        state.world.failed[envs] = True
+        self.restore(state, envs)
 
     def _contact_wrench(self, name: str) -> np.ndarray:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):

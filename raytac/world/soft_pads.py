@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import ipc
-from raytac.errors import SpecError
+from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
@@ -139,8 +139,10 @@ class SoftPads:
     def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
+        So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
+
         Raises:
-            InputError: a motion too fast to be resolved near something that it may touch; the world must be reset then.
+            InputError: the same of the only environment; it has failed then, until it is reset.
         """
         scene = self.composed.scene
         interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
@@ -214,7 +216,11 @@ class SoftPads:
         self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, led: dict[str, np.ndarray], dt: float
     ) -> SceneReport:
         """The solver's step to where MuJoCo is now."""
-        report = self.soft.step(cases, led, dt)
+        try:
+            report = self.soft.step(cases, led, dt)
+        except InputError:
+            failed[:] = True  # MuJoCo is ahead of the solver
+            raise
         self._last_cases, self._last_led = cases, led
         failed |= report.failed
         alive = np.flatnonzero(~failed).tolist()

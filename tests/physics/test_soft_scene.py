@@ -107,7 +107,7 @@ def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
     through = Mover(np.eye(4)[None], pose(position=(0.1, 0, 0))[None], -box, box)
     assert allowed_share({"a": through, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.05)
     aside = pose(position=(0.0, 50e-3, 0.0))[None]
-    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (1.0, None)
+    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (np.ones(1), [None])
 
 
 def test_environments_have_their_own_poses_and_reset_alone():
@@ -188,3 +188,15 @@ def test_gravity_is_that_of_the_settings():
     assert scene.velocity("cube")[0] == pytest.approx(given.dt * scene.gravity, rel=1e-3)
     with pytest.raises(InputError, match=r"gravity.*left out where settings are given"):
         SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given, gravity=(0.0, 0.0, 0.0))
+
+
+def test_a_motion_that_is_too_fast_fails_its_environment_alone():
+    scene = two_pads(kind="kinematic", gap=1e-3, friction=0.0, num_envs=2)
+    fast = np.stack([pose(LEFT, (0.0, 6e-3, 0.0)), pose(RIGHT, (0.0, 30e-3, 0.0))])
+    assert not scene.is_small(np.stack([fingers(1e-3), fast]))
+    with pytest.warns(RuntimeWarning, match=r"failed: .*in environment 1 takes left and cube too far"):
+        report = scene.step(np.stack([fingers(0.9e-3), fast]))
+    assert report.failed.tolist() == scene.failed.tolist() == [False, True]
+    assert scene.pose("left")[0] == pytest.approx(fingers(0.9e-3)[0], abs=1e-12)
+    scene.reset([1])
+    assert not scene.step(fingers(0.9e-3)).failed.any()

@@ -83,8 +83,17 @@ def test_a_motion_that_cannot_be_resolved_is_refused() -> None:
     with pytest.raises(InputError, match="move slower or in more steps"):
         for _ in range(3):
             world.step(jump)
+    time = world.data[0].time
+    assert world.step().failed.all() and world.data[0].time == time  # MuJoCo was ahead of the solver
     world.reset()
     assert not world.step().failed.any()
+    both = TactileWorld(world.scene, num_envs=2)
+    with pytest.warns(RuntimeWarning, match="in environment 1 .*move slower or in more steps"):
+        for _ in range(3):
+            state = both.step([both.hold, jump])
+    assert state.failed.tolist() == [False, True] and state.time[0] == pytest.approx(0.03)
+    both.reset([1])
+    assert not both.step().failed.any()
 
 
 def test_a_soft_body_is_held_where_it_touches_its_holder() -> None:
