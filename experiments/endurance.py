@@ -236,6 +236,7 @@ def resume(out: Path, world: TactileWorld, args: Args) -> tuple[list[list[float]
 
 def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: float) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     table = np.array(rows)
     column = {key: table[:, k] for k, key in enumerate(ROW)}
@@ -266,6 +267,8 @@ def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: flo
     for axes, (key, (label, scale)) in zip(figure.subplots(len(PLOTTED), 1, sharex=True), PLOTTED.items(), strict=True):
         axes.plot(np.arange(1, len(rows) + 1), scale * column[key], marker="o", markersize=3)
         axes.set_ylabel(label, fontsize="small")
+        axes.ticklabel_format(axis="y", useOffset=False)
+    figure.axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.axes[-1].set_xlabel("cycle of picking up, holding and letting go")
     figure.savefig(out / "endurance.png", dpi=110)
     write_metrics(out / "metrics.json", metrics | versions())
