@@ -69,6 +69,7 @@ def _draw(axes, shot: Snapshot, limits: tuple[np.ndarray, np.ndarray]) -> None:
         axes.add_collection(PolyCollection(list(polygons), facecolor=colour, edgecolor="k", linewidth=0.2, alpha=0.6))
     axes.set(xlim=(limits[0][0], limits[1][0]), ylim=(limits[0][1], limits[1][1]), aspect="equal")
     axes.set_title(shot.title, fontsize="small")
+    axes.set_xlabel("y [mm]", fontsize="x-small")
     axes.tick_params(labelsize="x-small")
 
 
@@ -85,6 +86,7 @@ def draw_strip(shots: Sequence[Snapshot], path: Path, count: int = 6) -> None:
     figure = Figure(figsize=(2.6 * len(chosen), 3.2), layout="constrained")
     for axes, shot in zip(np.atleast_1d(figure.subplots(1, len(chosen), sharey=True)), chosen, strict=True):
         _draw(axes, shot, _limits(shots))
+    figure.axes[0].set_ylabel("z [mm]", fontsize="x-small")
     figure.savefig(path, dpi=110)
 
 
@@ -98,7 +100,9 @@ def film(shots: Sequence[Snapshot], path: Path) -> None:
     for shot in shots:
         figure = Figure(figsize=(4, 4), layout="constrained")
         canvas = FigureCanvasAgg(figure)
-        _draw(figure.subplots(), shot, _limits(shots))
+        axes = figure.subplots()
+        _draw(axes, shot, _limits(shots))
+        axes.set_ylabel("z [mm]", fontsize="x-small")
         canvas.draw()
         frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=120, loop=0)

@@ -173,9 +173,9 @@ class MarkerTracker:
         """
         if surface.batch != self.num_envs:
             raise InputError("surface", value=surface.batch, rule=f"must have {self.num_envs} environments, as this tracker")
-        # One NaN makes the sum one; the sum is several times cheaper than asking every node. First of all, since it brings the heights
-        # into the cache for those who pick some.
-        failed = ~np.isfinite(surface.height.reshape(self.num_envs, -1).sum(axis=1))
+        # One NaN makes the sum one; the sum is several times cheaper than asking every node, and half as dear by einsum as by sum. First
+        # of all, since it brings the heights into the cache for those who pick some.
+        failed = ~np.isfinite(np.einsum("bij->b", surface.height))
         samples, contacts = None, None
         if self._cells is not None:
             samples = self._cells.sample(surface)

@@ -68,6 +68,8 @@ def floating_gripper(
     spec.compiler.degree = False
     base = spec.worldbody.add_body(name="gripper", pos=position)
     base.mass, base.inertia, base.explicitinertial, base.gravcomp = _MASS, np.full(3, _INERTIA), True, 1.0
+    # Left out, MuJoCo takes the position of the body for it: a gripper at x = 0.45 m had its mass 0.45 m off its joints.
+    base.ipos = (0.0, 0.0, 0.0)
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     for name, kind, axis in zip(FRAME_JOINTS, [slide] * 3 + [hinge] * 3, [*axes, *reversed(axes)], strict=True):

@@ -13,8 +13,10 @@ def test_lift_holds_a_cube_with_both_pads(tmp_path):
     args = lift.Args(out=tmp_path / "lift", cases=("cube",), physics=("ipc",), quick=True, device="cpu")
     lift.main(args)
     found = read_metrics(tmp_path / "lift" / "metrics.json")
-    assert found["lift.held_s"] == found["lift.cube.ipc.held_s"] == pytest.approx(0.05, abs=0.02)
-    assert float(found["lift.slip_mm"]) < 0.1
+    assert found["lift.held_s"] == found["lift.cube.ipc.held_s"] == pytest.approx(0.08, abs=0.02)
+    assert float(found["lift.slip_mm"]) < 0.1 and float(found["lift.cube.ipc.hold_slip_mm"]) < 0.1
+    for key in ("weight_seen", "weight_seen_worst"):
+        assert float(found[f"lift.cube.ipc.{key}"]) == pytest.approx(1.0, abs=0.02)
     assert float(found["lift.cube.ipc.lifted_mm"]) == pytest.approx(0.4, abs=0.15)  # the servos lag
     assert float(found["lift.cube.ipc.min_gap_m"]) > 0.0 and float(found["lift.cube.ipc.min_det_f"]) > 0.0
     for name in ("cube.ipc.png", "cube.ipc_strip.png", "cube.ipc.gif"):
@@ -41,19 +43,21 @@ def test_endurance_goes_on_where_it_stopped(tmp_path):
     small = {
         "close_steps": 8,
         "lift_steps": 8,
-        "hold_steps": 2,
+        "hold_steps": 4,
         "lower_steps": 8,
-        "open_steps": 4,
+        "open_steps": 8,
         "height_mm": 0.5,
+        "gap_mm": 0.2,
         "device": "cpu",
     }
-    whole = endurance.Args(out=tmp_path / "whole", steps=60, **small)
+    whole = endurance.Args(out=tmp_path / "whole", steps=72, **small)
     endurance.main(whole)
-    for steps in (30, 60):
+    for steps in (36, 72):
         endurance.main(endurance.Args(out=tmp_path / "parts", steps=steps, **small))
     one, two = (read_metrics(tmp_path / name / "metrics.json") for name in ("whole", "parts"))
-    assert one["endurance.steps"] == two["endurance.steps"] == 60 and one["endurance.bond_m"] == 0.0
+    assert one["endurance.steps"] == two["endurance.steps"] == 72 and one["endurance.bond_m"] == 0.0
+    assert 0.3 < float(one["endurance.lifted_least_mm"]) < 0.5 and 0.0 < float(one["endurance.bond_share"]) < 1e-3
     for key in ("min_gap_m", "min_det_f", "drift_mm"):
         assert one[f"endurance.{key}"] == pytest.approx(two[f"endurance.{key}"], rel=1e-6, abs=1e-9)
     with pytest.raises(RaytacError, match="other settings"):
-        endurance.main(endurance.Args(out=tmp_path / "parts", steps=90, force=2.0, **small))
+        endurance.main(endurance.Args(out=tmp_path / "parts", steps=108, force=2.0, **small))
