@@ -69,7 +69,8 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
     ``success``, ``failed``; where environments began anew in the same step also ``final_obs`` and ``final_info`` (arrays of objects), as
-    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does.
+    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does; with
+    noise in the markers only until any environment begins anew by itself, since the observation then draws new noise for all.
     """
 
     task: ClassVar[type[Task]]
