@@ -121,7 +121,7 @@ def test_another_sensor_needs_no_python(tmp_path: Path) -> None:
 
 def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)
-    assert len(snippets) == 2
+    assert len(snippets) == 3
     snippet = snippets[0]
     monkeypatch.chdir(tmp_path)  # shipped scenes are found from anywhere
     # A process has one device, and the other tests of this one use the CPU.
@@ -147,3 +147,15 @@ def test_the_readmes_soft_example_runs(tmp_path: Path, monkeypatch: pytest.Monke
     assert frame.traction is not None and frame.traction[0, ..., 2].min() < -1e4
     assert frame.markers is not None and frame.markers.displacement_px.shape == (1, 63, 2)
     assert np.nanmax(np.abs(frame.markers.displacement_px)) > 0.5
+
+
+def test_the_readmes_world_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    snippet = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.S)[2]
+    monkeypatch.chdir(tmp_path)
+    assert "outputs=(" in snippet
+    names: dict[str, object] = {}
+    exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
+    frame = names["frame"]
+    assert isinstance(frame, TactileFrame)
+    assert frame.markers is not None and frame.markers.displacement_px.shape == (1, 99, 2)
+    assert frame.wrench is not None and not frame.wrench.any()  # the pad starts clear of the ball

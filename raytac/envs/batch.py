@@ -158,8 +158,9 @@ class TaskBatch:
         """One control step of every environment.
 
         Raises:
-            InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment), or an environment
-                that was never reset.
+            InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment), an environment
+                that was never reset, or, with simulated pads and one environment, a motion too fast to be resolved near something (it has
+                failed then; of several environments the one that moves so is in ``failed``, with a ``RuntimeWarning``).
         """
         actions = self._checked(actions)
         begin = time.perf_counter()

@@ -19,7 +19,7 @@ def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
         BackendError: PyTorch is not installed.
     """
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it
     except ImportError as error:
         raise BackendError(f"tensors need PyTorch ({error}): `pip install raytac[rl]`") from error
     return {

@@ -42,15 +42,17 @@ class Mover:
 Pair = tuple[str, str]
 
 
-def allowed_share(movers: Mapping[str, Mover], pairs: Sequence[Pair], reach: float) -> tuple[float, Pair | None]:
-    """Largest share of all ways, in (0, 1], that brings no pair of bodies too far in one step, and the pair that sets it.
+def allowed_share(movers: Mapping[str, Mover], pairs: Sequence[Pair], reach: float) -> tuple[np.ndarray, list[Pair | None]]:
+    """Largest share of all ways, in (0, 1], that brings no pair of bodies too far in one step, and the pair that sets it, by environment.
 
     Two bodies whose boxes are ``reach`` [m] apart or more may come that much nearer in one step; closer ones move by at most ``STEP``
     and ``TURN`` against each other. The distance of two boxes is bounded from below by their separation along the normals of their
     faces; boxes that one of these keeps a millimetre apart at both ends of the way are free to go. The first of a pair must not be a
     half-space.
     """
-    least, limiting = 1.0, None
+    batch = len(next(iter(movers.values())).start)
+    least = np.ones(batch)
+    limiting: list[Pair | None] = [None] * batch
     for pair in pairs:
         a, b = (movers[name] for name in pair)
         if b.is_plane:
@@ -59,9 +61,9 @@ def allowed_share(movers: Mapping[str, Mover], pairs: Sequence[Pair], reach: flo
             gap, way, turn, free_way = _against_box(a, b)
         near = np.minimum(STEP / np.maximum(way, _NOTHING), TURN / np.maximum(turn, _NOTHING))
         far = np.maximum(gap - reach, 0.0) / np.maximum(free_way, _NOTHING)
-        share = float(np.maximum(near, far).min())
-        if share < least:
-            least, limiting = share, pair
+        share = np.maximum(near, far)
+        for b in np.flatnonzero(share < least).tolist():
+            least[b], limiting[b] = share[b], pair
     return least, limiting
 
 

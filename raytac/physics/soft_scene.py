@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,9 @@ _CLOSE = 2e-8
 """A step is solved when no vertex would move further than this [m]; forces of what sticks want it small against ε_v dt."""
 _LINEAR = 1e-6
 """Residual of the linear solve [-]: a grasped body that travels must come along to a small share of ε_v dt, or friction would slip."""
+
+
+_GRAVITY = 0.0, 0.0, -9.81
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class SoftScene:
         world_from_body: Mapping[str, ArrayLike],
         *,
         dt: float = 0.01,
-        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        gravity: ArrayLike | None = None,
         friction: Mapping[tuple[str, str], float] | None = None,
         ignored: Sequence[tuple[str, str]] = (),
         num_envs: int | None = None,
@@ -89,22 +93,25 @@ class SoftScene:
             world_from_pad: where the pads start, (S, 4, 4) or (B, S, 4, 4).
             world_from_body: of each body by name, (4, 4) or (B, 4, 4).
             dt: length of a step [s].
-            gravity: [m/s²], world frame, (3,) or (B, 3).
+            gravity: [m/s²], world frame, (3,) or (B, 3); None: (0, 0, −9.81), or that of ``settings``.
             friction: μ by pair of names where the rule does not fit. The rule: with a pad, the body's own coefficient if it has one, else
                 the pad's gel's; between bodies, the larger of theirs, as in MuJoCo.
             ignored: pairs of names that pass through each other.
             num_envs: B; None: as the poses say.
             device: ``cpu``, ``cuda`` or ``auto``.
-            settings: of the solver, instead of ``dt`` and this module's own (see docs/soft-pad.md).
+            settings: of the solver, instead of ``dt``, ``gravity`` and this module's own (see docs/soft-pad.md).
 
         Raises:
-            InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid.
+            InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid, or gravity and settings.
             OverlapError: bodies overlap where they start; the message names the surfaces.
         """
         self.pads = {pad.name: pad for pad in pads}
         self.bodies = {body.name: body for body in bodies}
         self._check_names(pads, bodies)
-        self.gravity = np.asarray(gravity, float)
+        if gravity is not None and settings is not None:
+            raise InputError("gravity", value=gravity, rule="must be left out where settings are given, which have their own")
+        given = (settings.gravity if settings is not None else _GRAVITY) if gravity is None else gravity
+        self.gravity = np.asarray(given, float)
         self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
         self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._of_bodies(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
@@ -138,11 +145,17 @@ class SoftScene:
         self._on_surface = {name: self._coat_on_surface(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
 
+    @property
+    def failed(self) -> np.ndarray:
+        """Environments that stay as they are until they are reset, (B,), bool."""
+        return self._failed.copy()
+
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
     def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
         """Whether the way to these poses in ``dt`` (all as for ``step``) is one that ``step`` would make in one go."""
-        return self._travel.part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)[0] == MOST_SUBSTEPS
+        part, refused = self._travel.part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)
+        return part == MOST_SUBSTEPS and not refused
 
     def step(
         self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
@@ -156,17 +169,23 @@ class SoftScene:
 
         Raises:
             InputError: an unknown or free body, a bad pose, or a motion near another body that would take more than
-                ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then.
+                ``MOST_SUBSTEPS`` parts (6.4 mm or 128° in one step); nothing has moved then. Of several environments the one that is
+                told to move so fails instead, with a ``RuntimeWarning``, and the others go on.
         """
         begun, goal = self._now, self._goal(world_from_pad, driven)
         before: SceneState | None = None
         done, total = 0, None
         while done < MOST_SUBSTEPS:
-            part, pair = self._travel.part(done, self._now, goal, dt or self.settings.dt)
-            if part == 0:
+            part, refused = self._travel.part(done, self._now, goal, dt or self.settings.dt)
+            if refused and self.num_envs == 1:
                 if before is not None:
                     self.restore(before)
-                raise self._travel.refusal(pair, begun, goal)
+                raise self._travel.refusal(0, refused[0], begun, goal)
+            if refused:
+                for b, pair in refused.items():
+                    warnings.warn(f"failed: {self._travel.refusal(b, pair, begun, goal)}", RuntimeWarning, stacklevel=2)
+                self._fail(list(refused))
+                continue
             if part < MOST_SUBSTEPS and before is None:
                 before = self.save()
             done += part
@@ -269,13 +288,16 @@ class SoftScene:
         """Grid that a pad's surface is read on."""
         return make_grid(self._pad(pad).sensor.gelpad, self._pad(pad).pitch)
 
-    def reading(self, pad: str, grid: PadGrid | None = None) -> SoftReading:
-        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed."""
+    def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
+        """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed.
+
+        ``failed``: further environments (B,) that are lost, if not by this scene.
+        """
         mine = self._pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(mine.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
-        return self._readers[pad].read(self.seen(pad), self._failed)
+        return self._readers[pad].read(self.seen(pad), self._failed if failed is None else self._failed | failed)
 
     def seen(self, pad: str) -> SeenPad:
         """What the reader needs: a pad's coat and forces, and what it touches."""
@@ -335,6 +357,12 @@ class SoftScene:
         self.restore(SceneState(self.world.save(), Poses(cases, self._driven(places))), mask)
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
+
+    def _fail(self, envs: list[int]) -> None:
+        """Let environments stay as they are until they are reset."""
+        state = self.save()
+        state.world.failed[envs] = True
+        self.restore(state, envs)
 
     def _contact_wrench(self, name: str) -> np.ndarray:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,10 +42,10 @@ class Poses:
         pads = [between(self.pads[:, k], goal.pads[:, k], share) for k in range(self.pads.shape[1])]
         return Poses(np.stack(pads, axis=1), {name: between(self.bodies[name], p, share) for name, p in goal.bodies.items()})
 
-    def longest(self, goal: Poses) -> float:
-        """Longest way of any origin to ``goal`` [m]."""
-        ways = [np.linalg.norm((goal.pads - self.pads)[..., :3, 3], axis=-1).max()]
-        ways += [np.linalg.norm((goal.bodies[n] - p)[:, :3, 3], axis=-1).max() for n, p in self.bodies.items()]
+    def longest(self, goal: Poses, b: int) -> float:
+        """Longest way of any origin of environment ``b`` to ``goal`` [m]."""
+        ways = [np.linalg.norm((goal.pads - self.pads)[b, :, :3, 3], axis=-1).max()]
+        ways += [np.linalg.norm((goal.bodies[n] - p)[b, :3, 3]) for n, p in self.bodies.items()]
         return float(max(ways))
 
 
@@ -62,33 +62,37 @@ class Travel:
             flip = isinstance(a.solid, ipc.HalfSpace)
             self.pairs += [(b.name, a.name) if flip else (a.name, b.name) for b in others]
 
-    def part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, Pair | None]:
-        """How much of a step of ``dt`` [s] may be made next, and the pair that sets it.
+    def part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
+        """How much of a step of ``dt`` [s] may be made next, and environments where even the least part is too much, with the pair.
 
-        In ``MOST_SUBSTEPS``-ths, a power of two that ``done`` is a multiple of; 0 if even one is too much. What no one drives may be too
-        fast (a beam that snaps back): that is the solver's to resolve, in the smallest parts.
+        In ``MOST_SUBSTEPS``-ths, a power of two that ``done`` is a multiple of; what is too much counts for nothing in it. What no one
+        drives may be too fast (a beam that snaps back): that is the solver's to resolve, in the smallest parts.
         """
-        room, pair = self._room(done, self._movers(now, goal, dt * (1.0 - done / MOST_SUBSTEPS)))
-        if room < 1.0 and self._room(done, self._movers(now, goal, 0.0))[0] >= 1.0:
-            room = 1.0
+        room, pairs = self._room(done, self._movers(now, goal, dt * (1.0 - done / MOST_SUBSTEPS)))
+        if (room < 1.0).any():
+            driven = self._room(done, self._movers(now, goal, 0.0))[0]
+            room = np.where((room < 1.0) & (driven >= 1.0), 1.0, room)
+        least = room[room >= 1.0].min(initial=MOST_SUBSTEPS)
         part = MOST_SUBSTEPS
-        while part >= 1 and (part > room or done % part):
+        while part > least or done % part:
             part //= 2
-        return part, pair
+        return part, {b: pairs[b] for b in np.flatnonzero(room < 1.0).tolist()}
 
-    def _room(self, done: int, movers: Mapping[str, Mover]) -> tuple[float, Pair | None]:
-        """Sixty-fourths of the step that these motions leave, and the pair that sets it."""
+    def _room(self, done: int, movers: Mapping[str, Mover]) -> tuple[np.ndarray, list[Pair | None]]:
+        """Sixty-fourths of the step that these motions leave in every environment (B,), and the pairs that set it."""
         pairs = [(a, b) for a, b in self.pairs if not (_is_still(movers[a]) and _is_still(movers[b]))]
-        share, pair = allowed_share(movers, pairs, _REACH * self.scene.world.d_hat)
-        return (MOST_SUBSTEPS - done) * share * (1.0 + 1e-9), pair
+        share, limiting = allowed_share(movers, pairs, _REACH * self.scene.world.d_hat)
+        return (MOST_SUBSTEPS - done) * share * (1.0 + 1e-9), limiting
 
-    def refusal(self, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
-        """The error of a motion that cannot be resolved."""
+    def refusal(self, b: int, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
+        """The error of a motion of environment ``b`` that cannot be resolved."""
+        where = f"in environment {b} " if self.scene.num_envs > 1 else ""
         rule = (
-            f"takes {' and '.join(pair or ())} too far against each other where they are near: at most {MOST_SUBSTEPS * STEP * 1e3:.3g} mm "
+            f"{where}takes {' and '.join(pair or ())} too far against each other where they are near: "
+            f"at most {MOST_SUBSTEPS * STEP * 1e3:.3g} mm "
             f"or {np.degrees(MOST_SUBSTEPS * TURN):.3g} degrees in one step of {self.scene.settings.dt} s; move slower or in more steps"
         )
-        return InputError("world_from_pad", value=f"ways of up to {now.longest(goal) * 1e3:.3g} mm", rule=rule)
+        return InputError("world_from_pad", value=f"ways of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
     def _movers(self, now: Poses, goal: Poses, left: float) -> dict[str, Mover]:
         found = {}
@@ -98,6 +102,9 @@ class Travel:
             found[name] = Mover(now.pads[:, k], goal.pads[:, k], low, high)
         for name, body in self.scene.bodies.items():
             found[name] = self._mover(body, now.bodies, goal.bodies, left)
+        failed = self.scene.failed[:, None, None]
+        if failed.any():  # nothing moves there, whatever speed it had
+            found = {name: replace(mover, end=np.where(failed, mover.start, mover.end)) for name, mover in found.items()}
         return found
 
     def _mover(self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], left: float) -> Mover:

@@ -78,7 +78,7 @@ class ComposedScene:
     start: np.ndarray
     """Positions (nq,) at the start."""
     ctrl: np.ndarray
-    """Controls (nu,) at the start: what position actuators hold there, 0 for motors."""
+    """Controls (nu,) at the start: the keyframe's, or with which position actuators hold what is there and motors are idle."""
 
 
 def compose(scene: TaskScene, physics: str) -> ComposedScene:
@@ -103,6 +103,9 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shapes: dict[str, tuple[Part, ...]] = {}
     for i, body in enumerate(scene.bodies):
+        if body.name in (mounted.name for mounted in robot.sensors):
+            rule = "a sensor of the robot has this name"
+            raise SpecError(rule, file=scene.source, key=f"body[{i}].name", value=body.name)
         shapes[body.name] = _parts(scene, i)
         if body.dynamics == "soft":
             if physics == "rigid":
@@ -267,6 +270,8 @@ def _start(
         for body in bodies.values():
             if body.is_free:
                 start[body.qpos : body.qpos + 7] = *body.spec.position, *body.spec.quaternion
+    elif robot.model not in ROBOTS:
+        _balance_servos(model, start, ctrl)
     if arm is not None and robot.model in ("panda_one_sensor", "panda_two_fingers"):
         joints = np.array(READY if robot.joints is None else robot.joints)
         outside = (joints < arm.range[:, 0]) | (joints > arm.range[:, 1])
@@ -288,3 +293,19 @@ def _start(
         for joint in model.wrap_objid[first : first + count]:
             start[model.jnt_qposadr[joint]] = gap / count
     return start, ctrl
+
+
+def _balance_servos(model: mujoco.MjModel, start: np.ndarray, ctrl: np.ndarray) -> None:
+    """Set controls (nu,) of position servos so that at rest at ``start`` they give no force: g u + b₀ + b₁ l = 0 for the length l."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    mujoco.mj_fwdPosition(model, data)
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+    servo = (
+        (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+        & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
+        & (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
+        & (gain != 0.0)
+        & (bias[:, 1] != 0.0)
+    )
+    ctrl[servo] = -(bias[servo, 0] + bias[servo, 1] * data.actuator_length[servo]) / gain[servo]

@@ -70,7 +70,7 @@ class Touching:
     """The other side: likewise, or None for what stands still."""
     push: np.ndarray | None = None
     """Normal force on ``body`` that w₀ has [N], world frame, (3,): where K would turn it into a pull, the contact opens and both are gone.
-    None: a contact that never opens."""
+    What else w₀ has of this contact, friction and torque, stays until the solver's next answer. None: a contact that never opens."""
 
 
 @dataclass

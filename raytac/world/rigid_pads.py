@@ -101,18 +101,21 @@ class RigidPads:
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
             for _ in range(round(scene.control_timestep / scene.timestep)):
                 touching = self._step(data, b, controller)
-                if is_lost(data):
+                if touching is None:
                     failed[b] = True
                     break
             else:
+                assert touching is not None
                 self._read_forces(data, b, touching)
                 mujoco.mj_kinematics(self.model, data)  # so that poses are those of the end of the step
 
-    def _step(self, data: mujoco.MjData, b: int, control: Controller) -> list[tuple[str, int]]:
-        """One step of MuJoCo with the pads' contacts, which are returned: sensor and index of the contact."""
+    def _step(self, data: mujoco.MjData, b: int, control: Controller) -> list[tuple[str, int]] | None:
+        """One step of MuJoCo with the pads' contacts, which are returned: sensor and index of the contact; None where it breaks down."""
         model = self.model
         mujoco.mj_step1(model, data)
         touching = self._add_contacts(data, b)
+        if touching is None:
+            return None
         if touching:
             # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
             mujoco.mj_makeConstraint(model, data)
@@ -121,7 +124,7 @@ class RigidPads:
             mujoco.mj_referenceConstraint(model, data)
         control(data, float(data.time))
         mujoco.mj_step2(model, data)
-        return touching
+        return None if is_lost(data) else touching
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
@@ -181,8 +184,8 @@ class RigidPads:
         near = self._is_near(pad, pad_from_body, i)
         return pad.overlap.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
 
-    def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]]:
-        """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact)."""
+    def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]] | None:
+        """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact), None if its memory for contacts is full."""
         found, model = [], self.model
         for name, pad in self.pads.items():
             for i, body in enumerate(self.bodies):
@@ -196,7 +199,8 @@ class RigidPads:
                 if law is None:
                     law = self._laws[b][name, i] = pad.overlap.law(touch)
                 self._fill(data, pad, i, touch, law, compliance)
-                mujoco.mj_addContact(model, data, self._contact)
+                if mujoco.mj_addContact(model, data, self._contact) != 0:
+                    return None
                 found.append((name, int(data.ncon) - 1))
         return found
 

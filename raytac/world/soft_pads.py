@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import ipc
-from raytac.errors import SpecError
+from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
@@ -40,6 +40,9 @@ _TOUCH = 1e-5
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
+_AT_REST = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "newton": 0, "substeps": 0}
+"""What the report says after a reset, before any step."""
+
 
 class SoftPads:
     """All pads of a world, B environments, as one ``SoftScene``."""
@@ -51,7 +54,6 @@ class SoftPads:
         *,
         level: str,
         coupling: str,
-        pitch: float,
         device: str,
     ) -> None:
         """Put the pads of all environments into the solver where MuJoCo has them.
@@ -60,7 +62,6 @@ class SoftPads:
             composed: the scene; ``datas``: its state in every environment.
             level: how finely pads are cut, one of ``PADS``.
             coupling: one of ``COUPLINGS``.
-            pitch: spacing of the grid that surfaces are read on [m].
             device: of the solver.
 
         Raises:
@@ -70,7 +71,7 @@ class SoftPads:
         self.composed, self.model = composed, composed.model
         scene = composed.scene
         pads = [
-            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), pitch)
+            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level))
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
@@ -129,8 +130,8 @@ class SoftPads:
                 self._last_led[body.spec.name][b] = starts[body.spec.name][b]
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
-            for values in self.report.values():
-                values[b] = 0
+            for key, values in self.report.items():
+                values[b] = _AT_REST[key]
             if self._coupling is not None:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
@@ -138,8 +139,10 @@ class SoftPads:
     def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
+        So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
+
         Raises:
-            InputError: a motion too fast to be resolved near something that it may touch; the world must be reset then.
+            InputError: the same of the only environment; it has failed then, until it is reset.
         """
         scene = self.composed.scene
         interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
@@ -173,7 +176,7 @@ class SoftPads:
 
     def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
         """Surface and forces of one sensor, for all environments."""
-        reading = self.soft.reading(name)
+        reading = self.soft.reading(name, grid, failed)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction() -> np.ndarray:
@@ -213,7 +216,11 @@ class SoftPads:
         self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, led: dict[str, np.ndarray], dt: float
     ) -> SceneReport:
         """The solver's step to where MuJoCo is now."""
-        report = self.soft.step(cases, led, dt)
+        try:
+            report = self.soft.step(cases, led, dt)
+        except InputError:
+            failed[:] = True  # MuJoCo is ahead of the solver
+            raise
         self._last_cases, self._last_led = cases, led
         failed |= report.failed
         alive = np.flatnonzero(~failed).tolist()

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 
 from raytac.device import resolve_device
-from raytac.errors import InputError
+from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
 from raytac.markers.contacts import chosen_envs
 from raytac.physics.batch_check import rigid_poses
@@ -38,6 +39,9 @@ __all__ = ["TactileWorld"]
 
 _OVERLAP = 1e-4
 """How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
+
+_BEYOND = 1e-2
+"""How far joints may start beyond their range [rad or m]: MuJoCo's limits give way, and a start may be recorded at one (a guess)."""
 
 
 class TactileWorld:
@@ -132,7 +136,6 @@ class TactileWorld:
             self.data,
             level=self.pad,
             coupling=self.coupling,
-            pitch=self.sensors[self.sensor_names[0]].pitch,
             device=resolve_device(self.device, ray_tracing=False),
         )
 
@@ -169,8 +172,10 @@ class TactileWorld:
             bodies: where free bodies start instead: name to ``world_from_body`` (n, 4, 4).
 
         Raises:
-            InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid.
-            OverlapError: bodies overlap at a start that is given, with simulated pads.
+            InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid, or joints out of
+                their range.
+            OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
+                pad a start may be one in contact, as it was recorded, so overlap is not looked for.
         """
         chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
         places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
@@ -181,12 +186,38 @@ class TactileWorld:
             rigid_poses(f"bodies[{name!r}]", places[name], len(chosen))
         if joints is not None:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
-        self._start_over(chosen, joints, places)
-        self._pads.reset(chosen, self.data, None if joints is None and not places else places)
+            self._check_joints(joints, chosen)
+        if joints is None and not places:
+            self._start_over(chosen)
+            self._pads.reset(chosen, self.data)
+        else:
+            self._start_elsewhere(chosen, joints, places)
         for sensor in self._sensors.values():
             if sensor.markers is not None:
                 sensor.reset_markers(chosen)
         return self.state()
+
+    def _start_elsewhere(self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray]) -> None:
+        """A reset to starts that are given; as before if they cannot be."""
+        before, failed = [copy(self.data[b]) for b in envs], self._failed.copy()
+        self._start_over(envs, joints, bodies)
+        try:
+            self._pads.reset(envs, self.data, bodies)
+        except OverlapError:
+            for b, data in zip(envs, before, strict=True):
+                mujoco.mj_copyData(self.data[b], self.model, data)
+            self._failed[:] = failed
+            raise
+
+    def _check_joints(self, joints: np.ndarray, envs: Sequence[int]) -> None:
+        arm = self.arm
+        if arm is None:
+            return
+        outside = np.argwhere((joints < arm.range[:, 0] - _BEYOND) | (joints > arm.range[:, 1] + _BEYOND))
+        if len(outside):
+            row, i = (int(k) for k in outside[0])
+            rule = f"of environment {envs[row]} must be within {arm.joints[i]}'s {arm.range[i].tolist()} rad or m"
+            raise InputError("joints", value=float(joints[row, i]), rule=rule)
 
     @staticmethod
     def _checked_start(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -223,7 +254,9 @@ class TactileWorld:
             control: how the actuators are driven (see ``Control``); None is ``hold``.
 
         Raises:
-            InputError: controls of the wrong shape or number, or not finite.
+            InputError: controls of the wrong shape or number, or not finite; with simulated pads a motion too fast to be resolved near
+                something that it may touch, in the only environment (it has failed then). Of several environments the one that moves so
+                is marked in ``failed``, with a ``RuntimeWarning``.
         """
         self._pads.advance(self.data, self._controllers(self.hold if control is None else control), self._failed)
         return self.state()

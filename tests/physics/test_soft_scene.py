@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.part import primitive
 from raytac.physics.soft_approach import STEP, Mover, allowed_share
@@ -106,7 +107,7 @@ def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
     through = Mover(np.eye(4)[None], pose(position=(0.1, 0, 0))[None], -box, box)
     assert allowed_share({"a": through, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.05)
     aside = pose(position=(0.0, 50e-3, 0.0))[None]
-    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (1.0, None)
+    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (np.ones(1), [None])
 
 
 def test_environments_have_their_own_poses_and_reset_alone():
@@ -162,3 +163,40 @@ def test_cuda_and_cpu_press_alike():
             [scene.wrench("left")[0], scene.pose("cube")[0].ravel(), scene.stiffness("left")[0].diagonal()]
         )
     assert found["cuda"] == pytest.approx(found["cpu"], rel=1e-3, abs=1e-4)
+
+
+def test_what_failed_at_speed_does_not_cut_the_steps_of_others():
+    scene = two_pads(num_envs=2, gap=1e-3)
+    state = scene.save()
+    state.world.velocity[1, scene.world.layout.node_start[2] :] = (0.0, 0.15, 0.0)  # the cube, after both pads
+    scene.restore(state)
+    assert scene.step(fingers(1e-3)).substeps > 1
+    state.world.failed[1] = True
+    scene.restore(state)
+    assert scene.failed.tolist() == [False, True]
+    report = scene.step(fingers(1e-3))
+    assert report.substeps == 1 and report.failed.tolist() == [False, True]
+
+
+def test_gravity_is_that_of_the_settings():
+    bodies = [scene_body("cube", (primitive("box", (HALF,) * 3),), "affine", density=500.0)]
+    pads = [ScenePad("left", SENSOR, MESH), ScenePad("right", SENSOR, MESH)]
+    given = ipc.Settings(gravity=(0.0, 1.0, -2.0), d_hat=MESH.d_hat)
+    scene = SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given)
+    scene.step(fingers(5e-3))
+    assert scene.gravity == pytest.approx([0.0, 1.0, -2.0])
+    assert scene.velocity("cube")[0] == pytest.approx(given.dt * scene.gravity, rel=1e-3)
+    with pytest.raises(InputError, match=r"gravity.*left out where settings are given"):
+        SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given, gravity=(0.0, 0.0, 0.0))
+
+
+def test_a_motion_that_is_too_fast_fails_its_environment_alone():
+    scene = two_pads(kind="kinematic", gap=1e-3, friction=0.0, num_envs=2)
+    fast = np.stack([pose(LEFT, (0.0, 6e-3, 0.0)), pose(RIGHT, (0.0, 30e-3, 0.0))])
+    assert not scene.is_small(np.stack([fingers(1e-3), fast]))
+    with pytest.warns(RuntimeWarning, match=r"failed: .*in environment 1 takes left and cube too far"):
+        report = scene.step(np.stack([fingers(0.9e-3), fast]))
+    assert report.failed.tolist() == scene.failed.tolist() == [False, True]
+    assert scene.pose("left")[0] == pytest.approx(fingers(0.9e-3)[0], abs=1e-12)
+    scene.reset([1])
+    assert not scene.step(fingers(0.9e-3)).failed.any()

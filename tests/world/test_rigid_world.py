@@ -205,6 +205,7 @@ WRONG = [
         "overlap by 3.1 mm at the start",
     ),
     (replace(UP, bodies=(replace(BALL, name="sensor_body"),)), SpecError, "the robot has a body of this name"),
+    (replace(UP, bodies=(replace(BALL, name="sensor"),)), SpecError, "body\\[0\\].name.*a sensor of the robot has this name"),
     (replace(UP, robot=RobotSpec("panda_one_sensor", joints=(3.0,) + (0.0,) * 6)), SpecError, "must be within joint1's"),
     (replace(UP, robot=RobotSpec("floating_gripper", opening=0.1)), SpecError, "as wide as the gripper opens"),
 ]
@@ -252,3 +253,30 @@ def test_an_mjcf_robot_carries_its_sensors(tmp_path: Path) -> None:
     assert world.sensor_names == ("tip",) and world.arm is not None
     np.testing.assert_allclose(world.state().world_from_pad["tip"][0, :3, 3], [0.0, 0.0, 0.22], atol=1e-12)
     assert world.step().world_from_pad["tip"][0, 2, 3] == pytest.approx(0.22, abs=1e-6)  # held against gravity
+
+
+def test_position_servos_hold_where_the_file_puts_them(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        """<mujoco><worldbody><body name="link" pos="0 0 0.2"><joint name="turn" type="hinge" axis="0 0 1" ref="40"/>
+        <geom size="0.01" pos="0.1 0 0" mass="1"/></body></worldbody><actuator><position joint="turn" kp="50" gear="2"/></actuator>
+        </mujoco>""",
+        "utf-8",
+    )
+    (tmp_path / "scene.toml").write_text(
+        '[robot]\nmodel = "arm.xml"\n[[robot.mount]]\nname = "tip"\nat = "link"\nposition_mm = [0, 0, 30]\n', "utf-8"
+    )
+    world = TactileWorld(tmp_path / "scene.toml", outputs=())
+    assert world.composed.ctrl == pytest.approx(2.0 * np.radians(40.0))
+    start = world.data[0].qpos.copy()
+    for _ in range(5):
+        world.step()
+    np.testing.assert_allclose(world.data[0].qpos, start, atol=1e-9)
+
+
+def test_a_contact_that_mujoco_has_no_room_for_fails_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = TactileWorld(UP, outputs=("wrench",), num_envs=2)
+    while not world.step().wrench["sensor"].any():
+        pass
+    add, full = mujoco.mj_addContact, world.data[0]
+    monkeypatch.setattr(mujoco, "mj_addContact", lambda model, data, contact: 1 if data is full else add(model, data, contact))
+    assert world.step().failed.tolist() == [True, False]

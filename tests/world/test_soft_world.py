@@ -59,6 +59,7 @@ def test_reset_restores(resting: TactileWorld) -> None:
     state = resting.state()
     assert state.time[0] == 0.0 and state.world_from_body["ball"][0, 2, 3] == pytest.approx(0.0051, abs=1e-12)
     np.testing.assert_array_equal(state.wrench["sensor"], 0.0)
+    assert state.report["min_gap"][0] == np.inf and state.report["min_det"][0] == 1.0 and state.report["converged"][0]
     for _ in range(30):
         again = resting.step()
     np.testing.assert_allclose(again.world_from_body["ball"], first.world_from_body["ball"], atol=1e-9)
@@ -82,8 +83,17 @@ def test_a_motion_that_cannot_be_resolved_is_refused() -> None:
     with pytest.raises(InputError, match="move slower or in more steps"):
         for _ in range(3):
             world.step(jump)
+    time = world.data[0].time
+    assert world.step().failed.all() and world.data[0].time == time  # MuJoCo was ahead of the solver
     world.reset()
     assert not world.step().failed.any()
+    both = TactileWorld(world.scene, num_envs=2)
+    with pytest.warns(RuntimeWarning, match="in environment 1 .*move slower or in more steps"):
+        for _ in range(3):
+            state = both.step([both.hold, jump])
+    assert state.failed.tolist() == [False, True] and state.time[0] == pytest.approx(0.03)
+    both.reset([1])
+    assert not both.step().failed.any()
 
 
 def test_a_soft_body_is_held_where_it_touches_its_holder() -> None:
@@ -162,3 +172,14 @@ def test_two_way_is_one_way_for_a_stiff_arm_and_a_spring_for_a_soft_one(tmp_path
     given, off = press(500.0, "two_way", 40)
     # What the servo bears is what the pad feels, and the link has moved by it.
     assert 500.0 * off == pytest.approx(given, rel=0.01) and given < 0.9 * held
+
+
+def test_what_mujoco_lost_is_not_shown_and_sensors_are_made_when_asked_for() -> None:
+    slide = replace(UP, robot=RobotSpec("floating_gripper", opening=0.04, position=(0.0, 0.0, 0.1)))
+    world = TactileWorld(slide, outputs=("wrench",), num_envs=2)
+    assert not world._sensors
+    world.data[0].qvel[0] = 1e9
+    assert world.step().failed.tolist() == [True, False]
+    surface = world.observe()[world.sensor_names[0]].surface
+    assert np.isnan(surface.height[0]).all() and np.isfinite(surface.height[1]).all()
+    assert surface.grid is world.sensors[world.sensor_names[0]].grid

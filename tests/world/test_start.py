@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from raytac.errors import InputError
+from raytac.errors import InputError, OverlapError
 from raytac.specs import load_sensor, load_task
 from raytac.world.world import TactileWorld
 
@@ -71,3 +72,24 @@ def test_a_robot_can_carry_a_sensor_that_is_no_file() -> None:
     scene = load_task("roll_ball")
     world = TactileWorld(replace(scene, robot=replace(scene.robot, sensor=soft)), outputs=("wrench",))
     assert world.sensors["sensor"].spec.gelpad.youngs_modulus == 1e4
+
+
+@pytest.mark.parametrize("physics", ["rigid", "ipc"])
+def test_a_start_that_cannot_be_changes_nothing(physics: str) -> None:
+    world = TactileWorld("roll_ball", physics=physics, outputs=("wrench",), num_envs=2)
+    before = world.step()
+    at = shifted(world, "ball", 2, 0.0)
+    tool = before.world_from_pad["sensor"][0, :3, 3]
+    at[1, :3, 3] = tool  # in the pad
+    joints = np.repeat(world.composed.start[world.arm.qpos][None], 2, axis=0)  # type: ignore[union-attr]
+    joints[1, 3] = 1.0
+    wrong: list[tuple[dict[str, Any], str]] = [({"joints": joints}, "of environment 1 must be within")]
+    wrong += [({"bodies": {"ball": at}}, "overlap")] if physics == "ipc" else []
+    for starts, text in wrong:
+        with pytest.raises((InputError, OverlapError), match=text):
+            world.reset(**starts)
+        after = world.state()
+        np.testing.assert_array_equal(after.time, before.time)
+        np.testing.assert_array_equal(after.joints, before.joints)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(after.world_from_body["ball"], before.world_from_body["ball"])
+    assert not world.step().failed.any()
