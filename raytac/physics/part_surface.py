@@ -11,7 +11,7 @@ from raytac.errors import InputError
 from raytac.gel.part import Part
 from raytac.gel.relief import relief_part
 
-__all__ = ["SAG", "object_surface", "part_surface"]
+__all__ = ["SAG", "enclosed_volume", "object_surface", "part_surface"]
 
 SAG = 2e-6
 """How far a facet may lie inside a curved part [m]: far below what a pad's own triangles miss."""
@@ -161,3 +161,9 @@ def _relief(part: Part) -> ipc.TriMesh:
     faces = np.concatenate([rising, back_of[rising][:, ::-1]])
     used, faces = np.unique(faces, return_inverse=True)
     return ipc.TriMesh(np.concatenate([front, back])[used], faces.reshape(-1, 3))
+
+
+def enclosed_volume(surface: ipc.TriMesh) -> float:
+    """Volume [m³] that a closed surface bounds (divergence theorem); positive where its faces look outwards."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)

@@ -10,7 +10,7 @@ import numpy as np
 import ipc
 from raytac.errors import InputError
 from raytac.gel.part import Part
-from raytac.physics.part_surface import SAG, object_surface
+from raytac.physics.part_surface import SAG, enclosed_volume, object_surface
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec
@@ -191,8 +191,7 @@ def object_body(
 
 def _volume(surface: ipc.TriMesh) -> float:
     """Volume [m³] that a closed surface bounds."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    volume = enclosed_volume(surface)
     if not volume > 0.0:
         raise InputError("object.dynamics", value="affine", rule="needs a closed surface with its faces outwards")
     return volume

@@ -22,7 +22,7 @@ from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
 from raytac.physics.objects import object_parts
 from raytac.physics.pad_reading import PadReading
-from raytac.physics.part_surface import object_surface
+from raytac.physics.part_surface import enclosed_volume, object_surface
 from raytac.physics.soft_bodies import SceneBody, scene_body
 from raytac.physics.soft_mesh import pad_mesh
 from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
@@ -259,7 +259,7 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
     if body.dynamics == "fixed" or (body.dynamics == "free" and body.owner == "mujoco"):
         return scene_body(body.name, parts, "kinematic", friction=body.friction_on_gel)
     if body.dynamics == "free":
-        density = body.density if body.mass is None else body.mass / _volume(parts)
+        density = body.density if body.mass is None else body.mass / enclosed_volume(object_surface(parts))
         return scene_body(body.name, parts, "affine", density=density, friction=body.friction_on_gel)
     held = None if body.held_by is None else _holder(scene, index)
     low, high = _extent(parts)
@@ -285,13 +285,6 @@ def _pair_friction(scene: TaskScene) -> dict[tuple[str, str], float]:
 def _extent(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
     vertices = object_surface(parts).vertices
     return vertices.min(axis=0), vertices.max(axis=0)
-
-
-def _volume(parts: Sequence[Part]) -> float:
-    """Of the surface that the solver gives a body [m³]."""
-    surface = object_surface(parts)
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
