@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
@@ -15,6 +16,7 @@ from raytac.physics.rigid import RigidPad
 from raytac.physics.soft import SoftPad
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.soft_reading import UNSOLVED, UnsolvedContactWarning
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
@@ -107,6 +109,46 @@ def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
     assert np.linalg.norm(moved[..., :2], axis=-1).max() > 10e-6
     assert np.abs(moved - moved[::-1] * [1.0, -1.0, 1.0]).max() < 2e-7
     assert np.abs(moved - moved[:, ::-1] * [-1.0, 1.0, 1.0]).max() < 2e-7
+
+
+def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
+    pad, states = pressed
+    for state in states:
+        surface, reading = pad.surface(state), state.reading
+        assert surface.coat is not None and reading is not None
+        x, y, z = surface.coat.positions[0].T
+        inside = (np.abs(x) < 8e-3) & (np.abs(y) < 6e-3)
+        node = [np.interp(at[inside], line, np.arange(len(line))) for at, line in ((y, pad.grid.y), (x, pad.grid.x))]
+        shown = map_coordinates(surface.height[0].astype(float), node, order=1)
+        assert np.abs(z[inside] - shown).max() < (
+            0.3e-6 if surface.contact.any() else 2e-6
+        )  # bilinear on a dome, or a spline's own nodes
+    touching = reached(states).reading
+    assert np.abs(touching.surface.coat.positions - touching.vertices).max() > 20e-6  # the mesh alone is not there
+
+
+def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
+    """What touches sticks: on cells as wide as the contact the mesh spreads by 30 µm, markers may not."""
+    pad = soft(press(indent(0.3e-3)))
+    reading = pad.peak(pad.run()).reading
+    assert reading is not None and reading.surface.coat is not None
+    rest = reading.surface.coat.mesh.rest
+    under = np.hypot(*rest[:, :2].T) < 1.2e-3
+    mesh, skin = (np.linalg.norm((at - rest)[0, under, :2], axis=1) for at in (reading.vertices, reading.surface.coat.positions))
+    assert under.sum() == 5 and mesh.max() > 25e-6 and skin.max() < 6e-6
+
+
+def test_a_contact_that_is_not_found_is_told_of_once(monkeypatch):
+    from raytac.gel import fine_contact
+
+    pad = soft(press(indent(0.3e-3)))
+    state = pad.peak(pad.run())
+    assert state.reading is not None and state.reading.residual[0] < 1e-6
+    monkeypatch.setattr(fine_contact, "_ROUNDS", 2)
+    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as told:
+        states = list(pad.run(2))
+    left = [state.reading.residual[0] for state in states if state.reading is not None]
+    assert len(told) == 1 and np.isnan(left[0]) and left[-1] > UNSOLVED
 
 
 def test_a_release_leaves_the_pad_at_rest(pressed):
