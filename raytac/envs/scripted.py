@@ -1,12 +1,16 @@
-"""Policies by hand, from what the batch knows: they show that a task can be done, and how well."""
+"""Policies by hand, from the state that the batch knows: they show that a task can be done, and what a policy without touch of its own could
+earn."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
 
 import numpy as np
 
 from raytac.envs.batch import TaskBatch
 
-__all__ = ["balance_pole", "lift_cube", "push_cube", "roll_ball"]
+__all__ = ["SCRIPTED", "balance_pole", "lift_cube", "push_cube", "roll_ball"]
 
 GAINS = np.array([-5.2, -5.0, -32.4, -4.6])
 """Of x, ẋ, θ, θ̇."""
@@ -41,9 +45,7 @@ def balance_pole(batch: TaskBatch) -> np.ndarray:
     commanded = batch._action[:, :2] * 4e-3 / batch.control_timestep
     away = batch.steering._target[:, :2, 3] - batch._start_tool[:2, 3]
     push = np.einsum("k,kbi->bi", GAINS, np.stack([away, commanded, lean, rate]))
-    action = np.zeros((len(axis), 4))
-    action[:, :2] = np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 4e-3, -1.0, 1.0)
-    return action
+    return np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 4e-3, -1.0, 1.0)
 
 
 def lift_cube(batch: TaskBatch) -> np.ndarray:
@@ -58,3 +60,12 @@ def lift_cube(batch: TaskBatch) -> np.ndarray:
     action[:, :3] = np.clip(target / 5e-3, -1.0, 1.0) * np.where(held, 0.4, 1.0)[:, None]
     action[:, 3] = np.where(held, np.where(force > 12.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
     return action
+
+
+SCRIPTED: Final[Mapping[str, Callable[[TaskBatch], np.ndarray]]] = {
+    "PushCube": push_cube,
+    "BalancePole": balance_pole,
+    "LiftCube": lift_cube,
+    "RollBall": roll_ball,
+}
+"""Actions (B, k) from a batch, by the name of the task."""
