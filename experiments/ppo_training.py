@@ -8,6 +8,7 @@ of processes and one version of all libraries).
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import random
@@ -224,7 +225,9 @@ class Learner:
         try:
             self.model.policy.load_state_dict(saved.policy)
         except RuntimeError as error:
-            raise InputError("checkpoint", value=saved.recipe, rule=f"must be of this task and these observations ({error})") from error
+            raise InputError(
+                "checkpoint", value=saved.recipe, rule=f"must be of this task and these observations ({error})"
+            ) from error
         if saved.optimizer:
             self.model.policy.optimizer.load_state_dict(saved.optimizer)
         assert isinstance(self.normaliser.obs_rms, dict)
@@ -322,10 +325,8 @@ class Training:
         from stable_baselines3.common.logger import Logger, make_output_format
 
         formats = []
-        try:
+        with contextlib.suppress(ImportError, AssertionError):  # not installed: the CSV files hold all that it would show
             formats.append(make_output_format("tensorboard", str(folder)))
-        except (ImportError, AssertionError):
-            pass  # it is not installed; the CSV files hold all that it would show
         self.learner.model.set_logger(Logger(str(folder), formats))
 
     @property

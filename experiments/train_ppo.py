@@ -4,9 +4,9 @@
     python experiments/train_ppo.py --task BalancePole --steps 300000 --side-by-side --most-s 540
 
 The same command again goes on where it was, after Ctrl-C, a crash or ``--most-s``. Each pair of touch and seed is one training in
-``<out>/<tactile>/seed<k>/``: ``progress.csv`` (one row a rollout), ``evaluation.csv`` (one a segment), ``checkpoint.pt`` (to resume) and, where
-TensorBoard is installed, its events. ``<out>/`` gets ``metrics.json``, ``curves.png`` where Matplotlib is installed, and for each training
-``policy_<tactile>_seed<k>.pt``, which ``experiments/play.py`` plays.
+``<out>/<tactile>/seed<k>/``: ``progress.csv`` (one row a rollout), ``evaluation.csv`` (one a segment), ``checkpoint.pt`` (to resume)
+and, where TensorBoard is installed, its events. ``<out>/`` gets ``metrics.json``, ``curves.png`` where Matplotlib is installed, and
+``policy_<tactile>_seed<k>.pt`` of each training, which ``experiments/play.py`` plays.
 """
 
 from __future__ import annotations
@@ -19,9 +19,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # small matrices gain nothing from threads; must precede NumPy
-    os.environ.setdefault(_name, "1")
 
 import tyro
 
@@ -186,10 +183,13 @@ def _final_s(args: Args, last: float, recipe: Any) -> float:
 
 def _side_by_side(jobs: list[_Job]) -> None:
     """Each in a process of its own; Ctrl-C reaches all of them, and each ends by itself."""
+    from raytac.envs.sb3 import one_thread
+
     context = multiprocessing.get_context("spawn")
     running = [context.Process(target=_child, args=(job,), name=job.name) for job in jobs]
-    for process in running:
-        process.start()
+    with one_thread():
+        for process in running:
+            process.start()
     try:
         for process in running:
             process.join()

@@ -1,6 +1,6 @@
 """Learning curves of ``experiments/train_ppo.py``: median and range over seeds, with and without touch.
 
-    python experiments/training_curves.py runs/train_ppo/PushCube
+python experiments/training_curves.py runs/train_ppo/PushCube
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def draw_curves(folder: Path, *, title: str | None = None) -> Path:
     Raises:
         InputError: no training was evaluated there.
     """
-    kinds = sorted({path.parent.parent.name for path in folder.glob("*/seed*/evaluation.csv")}, key=lambda name: (name == "none", name))
+    kinds = sorted(
+        {path.parent.parent.name for path in folder.glob("*/seed*/evaluation.csv")}, key=lambda name: (name == "none", name)
+    )
     if not kinds:
         raise InputError("folder", value=folder, rule="must hold trainings: <tactile>/seed<k>/evaluation.csv")
     figure = Figure(figsize=(7.2, 2.7), layout="constrained")

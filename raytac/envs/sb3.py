@@ -6,7 +6,8 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -17,12 +18,27 @@ from stable_baselines3.common.vec_env import VecEnv
 from raytac.envs.environments import TactileVectorEnv
 from raytac.errors import InputError
 
-__all__ = ["ProcessVecEnv", "TactileVecEnv"]
+__all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Observations = dict[str, np.ndarray]
 Answer = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Processes started within have one thread of BLAS: small matrices gain nothing from more, and many processes share the cores."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 class _DictVecEnv(VecEnv):
@@ -31,7 +47,7 @@ class _DictVecEnv(VecEnv):
     def close(self) -> None:
         """Nothing is held but memory."""
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """The attribute of the vector, once for every environment asked for."""
         return [self._attribute(attr_name)] * len(list(self._get_indices(indices)))
 
@@ -40,15 +56,15 @@ class _DictVecEnv(VecEnv):
             return None
         raise AttributeError(name)
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Refused: environments of one world share everything."""
         raise InputError("attr_name", value=attr_name, rule="cannot be set: environments of a vector share their world")
 
-    def env_method(self, method_name: str, *args: Any, indices: None | int | Iterable[int] = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **kwargs: Any) -> list[Any]:
         """Refused: environments of one world have no methods of their own."""
         raise InputError("method_name", value=method_name, rule="cannot be called: environments of a vector share their world")
 
-    def env_is_wrapped(self, wrapper_class: type, indices: None | int | Iterable[int] = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
         """None is."""
         return [False] * len(list(self._get_indices(indices)))
 
@@ -95,7 +111,8 @@ class TactileVecEnv(_DictVecEnv):
 class ProcessVecEnv(_DictVecEnv):
     """``processes`` vectors side by side, each in a process with a world of its own: one ``VecEnv`` of all their environments.
 
-    Physics runs on one core a world, so this is how a machine of many cores is used. Ctrl-C reaches the caller alone, and workers end with it.
+    Physics runs on one core a world, so this is how a machine of many cores is used. Ctrl-C reaches
+    the caller alone, and workers end with it.
     """
 
     def __init__(self, kind: type[TactileVectorEnv], *, num_envs: int, processes: int, seed: int = 0, **options: Any) -> None:
@@ -116,10 +133,8 @@ class ProcessVecEnv(_DictVecEnv):
             raise InputError("num_envs", value=num_envs, rule=rule)
         each = num_envs // processes
         context = multiprocessing.get_context("spawn")
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a worker starts
         self._workers: list[tuple[Any, Connection]] = []
-        try:
+        with one_thread():
             for k in range(processes):
                 mine, theirs = context.Pipe()
                 arguments = theirs, kind, each, {**options, "seed": seed + k}
@@ -127,9 +142,6 @@ class ProcessVecEnv(_DictVecEnv):
                 worker.start()
                 theirs.close()
                 self._workers.append((worker, mine))
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
         self._each = each
         spaces = self._answers()
         super().__init__(num_envs, *spaces[0])

@@ -15,7 +15,9 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     Unlike p̂ ± z √(p̂ (1 − p̂) / n) it stays within 0 and 1 and has a width at p̂ = 0 and 1. Raises ``InputError`` without trials.
     """
     if trials < 1 or not 0 <= successes <= trials:
-        raise InputError("successes", value=(successes, trials), rule="must be from 0 to the number of trials, which must be at least 1")
+        raise InputError(
+            "successes", value=(successes, trials), rule="must be from 0 to the number of trials, which must be at least 1"
+        )
     share, square = successes / trials, z * z / trials
     middle = share + 0.5 * square
     half = math.sqrt(share * (1.0 - share) * square + 0.25 * square * square)

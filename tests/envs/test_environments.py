@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 import raytac.envs
 import raytac.envs.lift_cube
-from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv
-from raytac.envs import scripted
+from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv, scripted
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
