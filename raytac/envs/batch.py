@@ -165,7 +165,7 @@ class TaskBatch:
         """
         actions = self._checked(actions)
         begin = time.perf_counter()
-        state = self.world.step(self.steering.controllers(actions))
+        state = self.world.step(self.steering.controller(actions))
         done = time.perf_counter()
         self.time_s["physics"] += done - begin
         failed = state.failed
@@ -208,7 +208,7 @@ class TaskBatch:
     def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
         """Observations of all; environments not in ``which`` (B,) keep theirs, and their sensors see nothing new."""
         tool, body, goal = self._tool, self._body, self._goal
-        at, turn = tool[:, :3, 3], np.stack([pose_error(pose, self._start_tool)[3:] for pose in tool])
+        at, turn = tool[:, :3, 3], pose_error(tool, self._start_tool)[:, 3:]
         parts = [
             (at - self._start_tool[:3, 3]) / _LENGTH,
             turn,
@@ -259,4 +259,4 @@ def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> Obse
 
 def _twist(before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
     """Velocity and angular velocity (B, 6) between poses (B, 4, 4)."""
-    return np.stack([pose_error(a, b) for a, b in zip(after, before, strict=True)]) / dt
+    return pose_error(after, before) / dt
