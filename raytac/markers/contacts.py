@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.components import find_edges, join_runs
 
-__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "chosen_envs", "contact_boxes"]
+__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "contact_boxes"]
 
 CELL = 0.4e-3
 """Largest cell over which a contact is averaged [m], unless the pad's grid is coarser; narrower gaps do not part two contacts."""
@@ -233,7 +234,8 @@ class ContactTracker:
 
     def __init__(self, batch: int) -> None:
         self.batch = batch
-        self.reset()
+        self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
+        self._pose: list[_Pose | None] = [None] * batch
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Forget the history of environments: a mask (B,), a list, or None for all.
@@ -241,10 +243,6 @@ class ContactTracker:
         Raises:
             InputError: an environment that does not exist, or a mask of the wrong length.
         """
-        if envs is None:
-            self._contacts: list[list[_Contact]] = [[] for _ in range(self.batch)]
-            self._pose: list[_Pose | None] = [None] * self.batch
-            return
         for b in chosen_envs(envs, self.batch):
             self._contacts[b] = []
             self._pose[b] = None
@@ -284,22 +282,6 @@ def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def chosen_envs(envs: np.ndarray | list[int], batch: int) -> list[int]:
-    """Numbers of the environments that a mask (B,) or a list names.
-
-    Raises:
-        InputError: an environment that does not exist, or a mask of the wrong length.
-    """
-    chosen = np.asarray(envs)
-    if chosen.dtype == bool:
-        if chosen.shape != (batch,):
-            raise InputError("envs", value=chosen.shape, rule=f"a mask must have shape ({batch},)")
-        return np.flatnonzero(chosen).tolist()
-    if chosen.size and (chosen.min() < 0 or chosen.max() >= batch):
-        raise InputError("envs", value=chosen.tolist(), rule=f"must name environments 0 to {batch - 1}")
-    return chosen.astype(int).ravel().tolist()
 
 
 def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float, ...]) -> list[_Contact]:

@@ -9,8 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.surface import GelSurface, PadGrid, summary
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker, chosen_envs
+from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.sampling import height_at
@@ -146,7 +147,7 @@ class MarkerTracker:
         Raises:
             InputError: an environment that does not exist.
         """
-        which = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        which = chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
 
