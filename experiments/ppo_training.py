@@ -65,8 +65,8 @@ class Recipe:
     """Steps of each environment between two updates."""
     segment: int = 20
     """Rollouts between two checkpoints."""
-    epochs: int = 6
-    minibatch: int = 512
+    epochs: int = 10
+    minibatch: int = 256
     learning_rate: float = 1e-3
     gamma: float = 0.98
     gae_lambda: float = 0.95

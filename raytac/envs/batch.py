@@ -222,9 +222,15 @@ class TaskBatch:
             found["body"] = np.concatenate([(body[:, :3, 3] - at) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
         found = {name: values.astype(np.float32) for name, values in found.items()}
         if self.observers:
-            frames = self.world.observe()
+            looked = any(observer.settings.needs_frames for observer in self.observers.values())
+            frames, state = (self.world.observe(), None) if looked else ({}, self.world.state())
             for name, observer in self.observers.items():
-                seen = observer.observe(frames[name], self.world.sensors[name] if observer.settings.difference else None, which)
+                if state is None:
+                    seen = observer.observe(
+                        frames[name], self.world.sensors[name] if observer.settings.difference else None, which
+                    )
+                else:
+                    seen = observer.observe_wrench(state.wrench[name], state.failed, which)
                 found |= {f"{name}_{modality}": values for modality, values in seen.items()}
         return found
 

@@ -141,8 +141,24 @@ class TactileObserver:
         if batch != self.num_envs:
             raise InputError("frame", value=batch, rule=f"must have {self.num_envs} environments, as this observer")
         failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
+        return self._finished({name: getattr(self, f"_{name}")(frame, sensor) for name in self.settings.modalities}, failed, envs)
+
+    def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """As ``observe``, where nothing but the ``wrench`` is observed, from the world's own: no sensor need look at the pad.
+
+        Raises:
+            InputError: more is observed, a wrench that is not (B, 6), or that is not finite where the environment has not failed.
+        """
+        if self.settings.needs_frames:
+            raise InputError(
+                "modalities", value=self.settings.modalities, rule="must be the wrench alone; otherwise give a frame"
+            )
+        if wrench.shape != (self.num_envs, 6):
+            raise InputError("wrench", value=wrench.shape, rule=f"must have the shape {(self.num_envs, 6)}")
+        return self._finished({"wrench": self._scaled("wrench", wrench)}, failed, envs)
+
+    def _finished(self, found: dict[str, np.ndarray], failed: np.ndarray, envs: np.ndarray | None) -> dict[str, np.ndarray]:
         kept = failed if envs is None else failed | ~envs
-        found = {name: getattr(self, f"_{name}")(frame, sensor) for name in self.settings.modalities}
         for name, values in found.items():
             self._check_finite(name, values, failed)
         made = {name: self._stacked(name, values, kept) for name, values in found.items()}
