@@ -7,20 +7,46 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
-__all__ = ["between", "inverse", "nearest_rotation", "quaternion", "quaternions", "rotations", "turn_angle"]
+__all__ = [
+    "between",
+    "inverse",
+    "nearest_rotation",
+    "quaternion",
+    "quaternions",
+    "rotation_of",
+    "rotation_vector",
+    "rotations",
+    "turn_angle",
+]
 
 
-def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit quaternion wxyz of a rotation matrix (3, 3)."""
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion w, x, y, z (4,) of a rotation matrix (3, 3)."""
     found = np.empty(4)
     mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation, float).ravel())
-    return tuple((found / np.linalg.norm(found)).tolist())
+    return found
+
+
+def rotation_of(quaternion: ArrayLike) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion w, x, y, z."""
+    found = np.empty(9)
+    mujoco.mju_quat2Mat(found, np.asarray(quaternion, float))
+    return found.reshape(3, 3)
+
+
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """Axis times angle [rad] (3,) of a rotation matrix (3, 3); at most π long."""
+    found = np.empty(3)
+    mujoco.mju_quat2Vel(found, quaternion(rotation), 1.0)
+    return found
 
 
 def quaternions(poses: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz of poses (B, 4, 4), shape (B, 4)."""
-    return np.array([quaternion(pose[:3, :3]) for pose in poses])
+    found = np.array([quaternion(pose[:3, :3]) for pose in poses])
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def inverse(poses: np.ndarray) -> np.ndarray:
@@ -53,9 +79,7 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
     found = np.tile(np.eye(4), (len(start), 1, 1))
     for pose, one in zip(found, q / np.linalg.norm(q, axis=1, keepdims=True), strict=True):
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, one)
-        pose[:3, :3] = matrix.reshape(3, 3)
+        pose[:3, :3] = rotation_of(one)
     found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
     return found
 

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.physics.rotation import rotation_vector
 
-__all__ = ["check_pose", "pose", "pose_error", "quaternion", "world_from_site"]
+__all__ = ["check_pose", "pose", "pose_error", "world_from_site"]
 
 _ORTHONORMAL = 1e-6
 """How far RᵀR of a rotation may be from 1."""
@@ -41,13 +42,6 @@ def check_pose(name: str, value: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion w, x, y, z (4,) of a rotation matrix (3, 3)."""
-    result = np.zeros(4)
-    mujoco.mju_mat2Quat(result, np.ascontiguousarray(rotation, float).ravel())
-    return result
-
-
 def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
     """Pose (4, 4) of a site by its index, as the last ``mj_kinematics`` (or step) left it."""
     return pose(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
@@ -55,6 +49,5 @@ def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
 
 def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
     """What leads from b to a (6,), in world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long."""
-    turn = np.zeros(3)
-    mujoco.mju_quat2Vel(turn, quaternion(world_from_a[:3, :3] @ world_from_b[:3, :3].T), 1.0)
+    turn = rotation_vector(world_from_a[:3, :3] @ world_from_b[:3, :3].T)
     return np.concatenate([world_from_a[:3, 3] - world_from_b[:3, 3], turn])

@@ -23,6 +23,7 @@ from raytac.gel.traction import CoatTraction
 from raytac.physics.objects import object_parts
 from raytac.physics.pad_reading import PadReading
 from raytac.physics.part_surface import enclosed_volume, object_surface
+from raytac.physics.rotation import quaternion
 from raytac.physics.soft_bodies import SceneBody, scene_body
 from raytac.physics.soft_mesh import pad_mesh
 from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
@@ -241,7 +242,7 @@ class SoftPads:
             poses = self.soft.pose(body.spec.name)
             for b in envs:
                 datas[b].mocap_pos[body.mocap] = poses[b, :3, 3]
-                mujoco.mju_mat2Quat(datas[b].mocap_quat[body.mocap], np.ascontiguousarray(poses[b, :3, :3]).ravel())
+                datas[b].mocap_quat[body.mocap] = quaternion(poses[b, :3, :3])
         if self._own:
             for b in envs:
                 mujoco.mj_kinematics(self.model, datas[b])
