@@ -69,7 +69,7 @@ def test_press_balances_forces_and_stays_apart() -> None:
 
 def test_forces_by_pair_add_up_to_those_of_each_body() -> None:
     """Normal forces and friction of two balls on one pad, summed contact by contact, against what the solver's gradient says."""
-    bodies = [bonded_pad(small_pad())]
+    bodies: list = [bonded_pad(small_pad())]
     for name, x in (("left", -2.5e-3), ("right", 2.5e-3)):
         bodies.append(ipc.KinematicBody(name, ipc.icosphere(2e-3, 2), ipc.Pose((x, 0.0, 2e-3 + GAP))))
     world = ipc.World(bodies, ipc.Settings(dt=0.01, d_hat=1e-4, friction=0.5), num_envs=2, device="cpu")
