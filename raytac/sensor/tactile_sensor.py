@@ -190,23 +190,22 @@ class TactileSensor:
         self,
         scene: str | Path | PressScene,
         *,
-        offsets: np.ndarray | None = None,
-        depths: np.ndarray | None = None,
         progress: bool = False,
+        **own: Any,
     ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
 
-        ``offsets`` and ``depths`` are as for ``load``. ``progress``: a simulated pad, which takes seconds to minutes, shows its stages and
-        the solver's steps in a bar on standard error, if that is a terminal.
+        ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a simulated pad, which takes seconds to
+        minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
 
         Raises:
-            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
+            InputError: an argument of ``load`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
         press = press_scene(scene)
         validate_press(self.spec, press)
         start = time.perf_counter()
-        pad = self.load(press, offsets=offsets, depths=depths)
+        pad = self.load(press, **own)
         states = pad.run(progress=progress) if self.physics == "ipc" else pad.run()  # type: ignore[call-arg]
         state = pad.peak(self._followed(states))  # type: ignore[arg-type]
         physics_ms = 1e3 * (time.perf_counter() - start)
@@ -214,17 +213,30 @@ class TactileSensor:
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
 
     def load(
-        self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
+        self,
+        scene: str | Path | PressScene,
+        *,
+        offsets: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+        shears: np.ndarray | None = None,
+        twists: np.ndarray | None = None,
+        seeds: Sequence[int] | None = None,
     ) -> RigidPad | SoftPad:
         """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
 
         Args:
             scene: name of a shipped press scene, path of a scene file, or a scene.
             offsets: added to the object's x, y per environment [m], pad frame, shape (B, 2) with B = ``num_envs``; None is none.
-            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's; as for the next three,
+                None leaves the scene's, and what is not finite makes its environment fail.
+            rotations: turn of the object about its origin, before the press, axes of the pad frame, wxyz, shape (B, 4).
+            shears: target of every ``shear`` stage along x, y [m], shape (B, 2).
+            twists: target of every ``twist`` stage [rad], shape (B,).
+            seeds: of the markers' perturbations, one an environment; None goes on with the streams that there are.
 
         Raises:
-            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
+            InputError: an argument of the wrong shape or out of range.
             SpecError: the scene breaks a rule.
             BackendError: a simulated pad is asked for, and its solver cannot run here.
             RaytacError: the object overlaps a simulated pad where it starts.
@@ -243,8 +255,13 @@ class TactileSensor:
             seed=self.seed,
             offsets=offsets,
             depths=depths,
+            rotations=rotations,
+            shears=shears,
+            twists=twists,
         )
         self._is_narrow = False
+        if seeds is not None and self.markers is not None:
+            self.marker_tracker.reseed(range(self.num_envs), seeds)
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
