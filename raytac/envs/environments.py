@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from raytac.envs.batch import Outcome, TaskBatch
 from raytac.envs.task import Task
 from raytac.errors import InputError
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.observe import gymnasium_space
 
 __all__ = ["TactileEnv", "TactileVectorEnv"]
@@ -121,7 +121,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             InputError: seeds of another number than environments, or a mask of another shape.
         """
         mask = (options or {}).get("reset_mask")
-        envs = list(range(self.num_envs)) if mask is None else chosen_envs(np.asarray(mask), self.num_envs)
+        envs = chosen_envs(mask, self.num_envs)
         if seed is not None:
             seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
             if len(seeds) != self.num_envs:

@@ -61,8 +61,8 @@ class Perturber:
             return None
         return self.settings.noise_px * np.stack([stream.standard_normal((count, 2)) for stream in self._streams])
 
-    def visible(self, count: int) -> np.ndarray:
-        """Which markers are found, (B, M), bool."""
+    def visible(self, count: int) -> np.ndarray | None:
+        """Which markers are found, (B, M), bool; None where none is lost."""
         if self.settings.dropout == 0:
-            return np.ones((len(self._streams), count), bool)
+            return None
         return np.stack([stream.random(count) >= self.settings.dropout for stream in self._streams])

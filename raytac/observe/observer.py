@@ -10,7 +10,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.observe.cells import CellMeans
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout
@@ -115,7 +115,7 @@ class TactileObserver:
         Raises:
             InputError: an environment that does not exist.
         """
-        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)  # type: ignore[arg-type]
+        chosen = chosen_envs(envs, self.num_envs)
         self._fresh[chosen] = True
         if self._drift is not None:
             self._drift.reset(chosen)

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 import ipc
 from raytac.errors import InputError, OverlapError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import PadGrid
-from raytac.physics.batch_check import batch_of, env_mask, rigid_poses
+from raytac.physics.batch_check import batch_of, rigid_poses
 from raytac.physics.rotation import inverse, nearest_rotation, quaternion, quaternions
 from raytac.physics.soft_bodies import SceneBody, pad_body
 from raytac.physics.soft_cast import Cast, ScenePad
@@ -306,7 +307,7 @@ class SoftScene:
 
     def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
         """Put environments, a mask (B,) or a list, None for all, back to a saved state; there are no contact forces until the next step."""
-        mask = env_mask(envs, self.num_envs)
+        mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         self.world.restore(state.world, mask)
         self._now.pads[mask] = state.poses.pads[mask]
         for name, pose in state.poses.bodies.items():
@@ -324,7 +325,7 @@ class SoftScene:
         Raises:
             OverlapError: bodies overlap at these poses; nothing has changed then.
         """
-        mask = env_mask(envs, self.num_envs)
+        mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         if world_from_pad is None and world_from_body is None:
             self.restore(SceneState(self._begin, Poses(self._start[0], self._cast.driven(self._start[1]))), mask)
             return

@@ -16,7 +16,7 @@ import numpy as np
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.physics.batch_check import rigid_poses
 from raytac.physics.rotation import quaternion
 from raytac.physics.solver import check_solver
@@ -178,7 +178,7 @@ class TactileWorld:
             OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
                 pad a start may be one in contact, as it was recorded, so overlap is not looked for.
         """
-        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        chosen = chosen_envs(envs, self.num_envs)
         places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
         free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
         for name in places:
