@@ -140,14 +140,10 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
     assert (metrics["presses"], metrics["presses_reused"]) == (4, 2)
     still = metrics["held_out.fots.normal.truth_mean_um"]
     assert isinstance(still, float) and 0 < float(metrics["held_out.fots.normal.mean_um"]) < 0.7 * still
-    text = (out / "marker_motion.toml").read_text()
     motion = load_marker_motion(out / "marker_motion.toml")
     for part in ("Presses held out", "level coarse", "warp-lang", "simulated on cpu"):
         assert part in motion.provenance
     assert f"held out: normal {float(metrics['held_out.fots.normal.mean_um']):.1f} um" in motion.provenance
-    # From kept presses the same fit comes out to the last digit.
-    assert main(args) == 0
-    assert len(begun) == 5 and (out / "marker_motion.toml").read_text() == text
 
 
 def test_a_base_must_not_have_a_base(tmp_path: Path) -> None:
