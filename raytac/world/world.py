@@ -18,10 +18,11 @@ from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
 from raytac.gel.batch import chosen_envs
 from raytac.physics.batch_check import rigid_poses
+from raytac.physics.rotation import quaternion
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import body_poses, quaternion, site_poses
+from raytac.robots.pose import body_poses, site_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
 from raytac.specs.press import PADS
