@@ -101,9 +101,10 @@ class FineContact:
         rest + (w − E w) − A p,   with p >= 0, never above the object's underside, and p = 0 where below it:
 
     the mesh's own normal contact is exchanged for one that is found anew on the fine grid (a linear complementarity problem). What
-    remains of the solver, w − E w, is all that is neither: friction, shear and twist, large strain, the gel's way sideways. The finer
-    the mesh, the less E w and A p differ. (Correction by the difference of two discretisations of a simplified operator: K. Böhmer,
-    P. Hemker and H. Stetter, The defect correction approach, Computing Suppl. 5, 1984.)
+    remains of the solver, w − E w, is all that is neither: friction, shear and twist, large strain, the gel's way sideways. It jumps
+    from vertices that touch, where it is 0, to those beside them, and which do is the mesh's doing: waves of two cells, which are not the
+    gel's, are taken out of it. The finer the mesh, the less E w and A p differ. (Correction by the difference of two discretisations of
+    a simplified operator: K. Böhmer, P. Hemker and H. Stetter, The defect correction approach, Computing Suppl. 5, 1984.)
 
     A is the layer's exact compliance (``layer_compliance``) over cosines, as if the pad were continued by its mirror image, and the
     difference that the pad's true sides make, on the coat's own mesh, where it is smooth.
@@ -127,6 +128,7 @@ class FineContact:
         mesh = surface.mesh
         self._compliance = compliance
         self.sides = (compliance - continued).astype(np.float32)
+        self._even_y, self._even_x = _evening(mesh.lines_y), _evening(mesh.lines_x).T
         self.series_x, self.series_y = CosineSeries(x), CosineSeries(y)
         waves = np.hypot(self.series_x.wave_numbers[None, :], self.series_y.wave_numbers[:, None])
         hats = self.series_y.hat[:, None] * self.series_x.hat
@@ -149,7 +151,8 @@ class FineContact:
             clear: z of the object's underside less the coat at rest [m], over the fine grid; not finite where there is no object.
         """
         held = self._holding(upwards, self.touching(load))
-        rise = self.surface.rise(places, upwards - self._compliance @ held)
+        left = self._even_y @ (upwards - self._compliance @ held).reshape(self.surface.mesh.shape) @ self._even_x
+        rise = self.surface.rise(places, left.ravel())
         overlap = self.here.lattice(rise) - np.where(np.isfinite(clear), clear, _FAR)
         start = sandwich(self.force_y.T, load.reshape(self.surface.mesh.shape), self.force_x.T)
         pressure = np.zeros(overlap.shape, np.float32)
@@ -224,6 +227,15 @@ class _Window:
             keep = not overlapping.any()
             pressure[overlapping] -= stride * gap[overlapping]
         return best
+
+
+def _evening(lines: np.ndarray) -> np.ndarray:
+    """Takes waves of two cells out of values on ``lines`` (n,) and leaves straight ones as they are; (n, n), the ends stay."""
+    cell, n = np.diff(lines), len(lines)
+    out = np.eye(n)
+    for i in range(1, n - 1):
+        out[i, i - 1 : i + 2] = 0.5 * cell[i] / (cell[i - 1] + cell[i]), 0.5, 0.5 * cell[i - 1] / (cell[i - 1] + cell[i])
+    return out
 
 
 def _span(used: np.ndarray) -> slice:

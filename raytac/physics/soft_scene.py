@@ -266,7 +266,7 @@ class SoftScene:
 
     def skin(self, name: str, seen_from: str) -> tuple[np.ndarray, np.ndarray]:
         """Surface of a soft body, or of another pad, without facets if it has a ``SoftSkin``; as ``mesh``."""
-        skin = None if name in self.pads else self._body(name).skin
+        skin = None if name in self.pads else self._cast.body(name).skin
         if skin is None:
             return self.mesh(name, seen_from)
         return skin.carried(self._into(seen_from, self.world.positions(name))), skin.faces

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raytac.gel.coat_surface import CoatSurface
-from raytac.gel.fine_contact import FineContact, FineGrid
+from raytac.gel.fine_contact import FineContact, FineGrid, _evening
 from raytac.gel.layer_compliance import CosineSeries, layer_compliance, layer_spread
 from raytac.gel.pad import make_grid
 from raytac.gel.skin_motion import SkinMotion, sampled
@@ -216,3 +216,10 @@ def test_sampling_is_bilinear():
     at_x, at_y = np.random.default_rng(0).uniform([[-1.0], [0.0]], [[2.0], [1.0]], (2, 50))
     assert sampled(field, x, y, at_x, at_y) == pytest.approx(1.0 + 2.0 * at_x - 3.0 * at_y + 0.5 * at_x * at_y)
     assert sampled(field, x, y, np.array([9.0]), np.array([0.5])) == sampled(field, x, y, np.array([2.0]), np.array([0.5]))
+
+
+def test_waves_of_two_cells_are_taken_out_and_straight_lines_stay():
+    lines = np.array([0.0, 0.4, 0.7, 1.2, 2.0, 2.1, 3.0])
+    even = _evening(lines)
+    assert np.allclose(even @ (3.0 - 2.0 * lines), 3.0 - 2.0 * lines)
+    assert np.abs((even @ (-1.0) ** np.arange(7))[1:-1]).max() < 1e-12

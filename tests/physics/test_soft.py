@@ -128,10 +128,14 @@ def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
 
 
 def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
-    """What touches sticks: on cells as wide as the contact the mesh spreads by 30 µm, markers may not."""
-    pad = soft(press(indent(0.3e-3)))
+    """What touches sticks: on cells as wide as the contact the mesh spreads by 30 µm, markers may not.
+
+    The area of contact is that of a pad with cells of 0.25 mm, 4.43 mm² (``experiments/bench_coat.py --shapes ball``), within 3 %.
+    """
+    pad = SoftPad(SENSOR, press(indent(0.3e-3)), pitch=0.1e-3)
     reading = pad.peak(pad.run()).reading
     assert reading is not None and reading.surface.coat is not None
+    assert reading.surface.contact.sum() * np.prod(pad.grid.pitch) == pytest.approx(4.43e-6, rel=0.03)
     rest = reading.surface.coat.mesh.rest
     under = np.hypot(*rest[:, :2].T) < 1.2e-3
     mesh, skin = (np.linalg.norm((at - rest)[0, under, :2], axis=1) for at in (reading.vertices, reading.surface.coat.positions))
@@ -204,8 +208,10 @@ def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
     one, two = rigid.surface(state), pad.surface(reached(states))
     both = one.contact[0] & two.contact[0]
     assert both.sum() > 20 and np.abs(one.height[0] - two.height[0])[both].max() < 10e-6
-    areas = [surface.contact.sum() * PITCH**2 for surface in (one, two)]
-    assert areas[1] == pytest.approx(areas[0], rel=0.35)  # coarse cells of 1 mm
+    # What the rigid pad touches, about π R δ as on a half-space, the simulated one touches too, and more, as a layer does, but not 2 π R δ.
+    assert one.contact[0].sum() * PITCH**2 == pytest.approx(math.pi * RADIUS * 0.6e-3, rel=0.06)
+    assert two.contact[0][one.contact[0]].mean() > 0.99
+    assert 1.1 < two.contact[0].sum() * PITCH**2 / (math.pi * RADIUS * 0.6e-3) < 1.6
     # The gel hardly changes its volume: pressed down in one place it comes up around it, which Gaussians cannot.
     assert two.indentation.min() < -5e-6 and one.indentation.min() > -1e-7
     rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
@@ -424,20 +430,22 @@ def test_the_rigid_pad_refuses_a_soft_object():
 
 
 def test_force_against_depth_is_the_bonded_layers():
-    """Without friction, small strain: Dimitriadis' law of a sphere on a bonded layer, which LoadLaw is held to, within 5 %."""
+    """Without friction, small strain, cells of 0.4 mm in the middle: Dimitriadis' law of a sphere on a bonded layer, as in LoadLaw.
+
+    The exponent of force over depth is met within 5 %. The force itself is up to 12 % too large, since the contact's radius has 2.5 cells;
+    with five it is within 5 % (tests/ipc/test_statics.py).
+    """
     fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
     scene = press(indent(0.15e-3), indent(0.3e-3))
     pad = soft(scene, FRICTIONLESS, pad=pad_mesh(SENSOR.gelpad, fine))
     force = [state.normal_force[0] for state in pad.run()][1:]
-    grid = pad.grid
     x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
     gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)
     law = LoadLaw(gap + SENSOR.gelpad.sag(x, y), 1e-5**2, SENSOR.gelpad)
     slope = math.log(force[1] / force[0]) / math.log(2.0)
     expected = math.log(law.force(0.3e-3) / law.force(0.15e-3)) / math.log(2.0)
     assert slope == pytest.approx(expected, rel=0.05)
-    assert force[1] == pytest.approx(law.force(0.3e-3), rel=0.12)
-    assert len(grid.x) > 10
+    assert law.force(0.3e-3) < force[1] < 1.12 * law.force(0.3e-3)
 
 
 def test_an_untouched_pad_needs_no_solver():
