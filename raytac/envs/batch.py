@@ -59,7 +59,7 @@ class TaskBatch:
         num_envs: int = 1,
         physics: str | None = None,
         pad: str | None = None,
-        tactile: ObservationSettings | Sequence[str] | str | None = ("markers",),
+        tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
         action: str = "pose",
         randomization: Randomization | None = None,
@@ -75,7 +75,8 @@ class TaskBatch:
             task: what is played.
             num_envs: number of environments B.
             physics, pad, device: as of ``TactileWorld``.
-            tactile: what is observed of every sensor: settings, or modalities alone; None leaves touch out, and nothing of it is computed.
+            tactile: what is observed of every sensor: settings, or modalities alone; "task" is as the task has it; None leaves touch out,
+                and nothing of it is computed.
             body_seen: whether the body's pose and velocity are observed; None is as the task has it.
             action: one of ``ACTIONS``.
             randomization: of sensors and cameras; None is none.
@@ -94,7 +95,7 @@ class TaskBatch:
         if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
             raise InputError("max_episode_steps", value=steps, rule="must be a whole number >= 1")
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, int(steps)
-        settings = _settings(tactile)
+        settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
         probe = TactileObserver(loaded.robot.sensor, settings, num_envs=num_envs, randomization=randomization, seed=seed)
@@ -164,7 +165,7 @@ class TaskBatch:
         """
         actions = self._checked(actions)
         begin = time.perf_counter()
-        state = self.world.step(self.steering.controllers(actions))
+        state = self.world.step(self.steering.controller(actions))
         done = time.perf_counter()
         self.time_s["physics"] += done - begin
         failed = state.failed
@@ -207,7 +208,7 @@ class TaskBatch:
     def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
         """Observations of all; environments not in ``which`` (B,) keep theirs, and their sensors see nothing new."""
         tool, body, goal = self._tool, self._body, self._goal
-        at, turn = tool[:, :3, 3], np.stack([pose_error(pose, self._start_tool)[3:] for pose in tool])
+        at, turn = tool[:, :3, 3], pose_error(tool, self._start_tool)[:, 3:]
         parts = [
             (at - self._start_tool[:3, 3]) / _LENGTH,
             turn,
@@ -258,4 +259,4 @@ def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> Obse
 
 def _twist(before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
     """Velocity and angular velocity (B, 6) between poses (B, 4, 4)."""
-    return np.stack([pose_error(a, b) for a, b in zip(after, before, strict=True)]) / dt
+    return pose_error(after, before) / dt

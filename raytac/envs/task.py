@@ -89,6 +89,8 @@ class Task(ABC):
     max_episode_steps: ClassVar[int]
     body_seen: ClassVar[bool]
     """Whether the body's pose is observed unless said otherwise."""
+    tactile: ClassVar[tuple[str, ...]] = ("markers",)
+    """Modalities of every sensor unless said otherwise."""
 
     @abstractmethod
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:

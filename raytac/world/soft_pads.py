@@ -31,7 +31,7 @@ from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
 from raytac.world.coupling import Coupling
 from raytac.world.soft_answers import soft_answers
-from raytac.world.state import Controller, is_lost
+from raytac.world.state import Drive, lost
 
 __all__ = ["SoftPads"]
 
@@ -136,7 +136,7 @@ class SoftPads:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
 
-    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
         So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
@@ -150,7 +150,7 @@ class SoftPads:
         for step in range(1, steps + 1):
             for b, data in enumerate(datas):
                 if not failed[b]:
-                    failed[b] = not self._ahead(data, b, controllers[b])
+                    failed[b] = not self._ahead(data, b, drive)
             since += 1
             cases, led = self._now(datas, failed)
             # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
@@ -190,14 +190,14 @@ class SoftPads:
         """None: the solver refuses a start in which bodies overlap."""
         return []
 
-    def _ahead(self, data: mujoco.MjData, b: int, control: Controller) -> bool:
+    def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
         """One step of MuJoCo; returns whether the state is still sound."""
         mujoco.mj_step1(self.model, data)
-        control(data, float(data.time))
+        drive([b])
         if self._coupling is not None:
             self._coupling.apply(data, b)
         mujoco.mj_step2(self.model, data)
-        if is_lost(data):
+        if lost([data])[0]:
             return False
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)

@@ -21,7 +21,7 @@ from raytac.physics.batch_check import rigid_poses
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import pose, quaternion
+from raytac.robots.pose import body_poses, quaternion, site_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
 from raytac.specs.press import PADS
@@ -29,7 +29,7 @@ from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.rigid_pads import RigidPads
-from raytac.world.state import Control, Controller, WorldState
+from raytac.world.state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.physics.soft_scene import SoftScene
@@ -258,7 +258,7 @@ class TactileWorld:
                 something that it may touch, in the only environment (it has failed then). Of several environments the one that moves so
                 is marked in ``failed``, with a ``RuntimeWarning``.
         """
-        self._pads.advance(self.data, self._controllers(self.hold if control is None else control), self._failed)
+        self._pads.advance(self.data, self._drive(self.hold if control is None else control), self._failed)
         return self.state()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
@@ -269,14 +269,12 @@ class TactileWorld:
 
     def state(self) -> WorldState:
         """What the world is like now."""
-        arm, names = self.arm, self.composed.bodies
-        lost = self._failed
-        pads = {m.name: _stack([m.world_from_pad(d) for d in self.data], lost) for m in self.composed.sensors}
-        bodies = {
-            name: _stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in self.data], lost)
-            for name, body in names.items()
-        }
-        joints = None if arm is None else _stack([d.qpos[arm.qpos] for d in self.data], lost)
+        arm, lost = self.arm, self._failed
+        pads = {m.name: site_poses(self.data, int(self.model.site(m.site).id)) for m in self.composed.sensors}
+        bodies = {name: body_poses(self.data, body.index) for name, body in self.composed.bodies.items()}
+        joints = None if arm is None else np.array([d.qpos for d in self.data])[:, arm.qpos]
+        for values in (*pads.values(), *bodies.values(), *(() if joints is None else (joints,))):
+            values[lost] = np.nan
         wrench = {name: np.where(lost[:, None], np.nan, self._pads.wrench(name)) for name in self.sensor_names}
         return WorldState(
             np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
@@ -319,21 +317,37 @@ class TactileWorld:
         poses = self.state().world_from_body[name]
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
 
-    def _controllers(self, control: Control) -> list[Controller]:
+    def _drive(self, control: Control) -> Drive:
+        """What writes the controls of environments, from any way to say it."""
+        if isinstance(control, BatchController):
+            return lambda envs: control.drive(self.data, envs)
         if isinstance(control, np.ndarray):
-            values = np.asarray(control, float)
-            if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
-                rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
-                raise InputError("control", value=values.shape, rule=rule)
-            return [_constant(row) for row in np.broadcast_to(values, (self.num_envs, self.model.nu))]
-        if callable(control):
-            return [control] * self.num_envs
-        if len(control) != self.num_envs:
-            raise InputError("control", value=len(control), rule=f"must be one controller, or one for each of {self.num_envs}")
-        for controller in control:
+            rows = self._constant_controls(control)
+
+            def write(envs: Sequence[int] | np.ndarray) -> None:
+                for b in envs:
+                    self.data[b].ctrl[:] = rows[b]
+
+            return write
+        each = [control] * self.num_envs if callable(control) else list(control)
+        if len(each) != self.num_envs:
+            raise InputError("control", value=len(each), rule=f"must be one controller, or one for each of {self.num_envs}")
+        for controller in each:
             if not callable(controller):
                 raise InputError("control", value=controller, rule="must be a controller; constant controls are a NumPy array")
-        return list(control)
+
+        def call(envs: Sequence[int] | np.ndarray) -> None:
+            for b in envs:
+                each[b](self.data[b], float(self.data[b].time))
+
+        return call
+
+    def _constant_controls(self, control: np.ndarray) -> np.ndarray:
+        values = np.asarray(control, float)
+        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
+            rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
+            raise InputError("control", value=values.shape, rule=rule)
+        return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
     def _check_start(self) -> None:
         """Refuse a start in which bodies overlap."""
@@ -347,16 +361,3 @@ class TactileWorld:
             if depth > _OVERLAP:
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 raise InputError("body", value=body, rule=rule)
-
-
-def _constant(values: np.ndarray) -> Controller:
-    def write(data: mujoco.MjData, time: float) -> None:
-        data.ctrl[:] = values
-
-    return write
-
-
-def _stack(rows: list[np.ndarray], failed: np.ndarray) -> np.ndarray:
-    stacked = np.stack(rows).astype(float)
-    stacked[failed] = np.nan
-    return stacked

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 import raytac.envs
 import raytac.envs.lift_cube
-from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv
+from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv, scripted
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
@@ -20,7 +20,6 @@ from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
-from tests.envs import scripted
 
 ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
 
@@ -141,7 +140,7 @@ def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
     batch.reset(range(4), [np.random.default_rng(b) for b in range(4)])
     ended = np.zeros(4, bool)
     for _ in range(150):
-        out = batch.step(np.zeros((4, 4)))
+        out = batch.step(np.zeros((4, 2)))
         fresh = out.terminated & ~ended
         assert (out.terms["terminated"][fresh] == -2.0).all() and (out.terms["alive"][fresh] == 0.0).all()
         ended |= out.terminated
