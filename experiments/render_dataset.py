@@ -101,6 +101,7 @@ def main(args: Args) -> RunReport | None:
         "rendered.shards": report.rendered,
         "render_s": report.render_s,
         **({"presses_per_s": report.presses / report.render_s} if report.presses else {}),
+        **({} if report.steady_presses_per_s is None else {"steady.presses_per_s": report.steady_presses_per_s}),
         **machine(),
         **versions(),
     }

@@ -17,6 +17,7 @@ from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import PadGrid
 from raytac.markers import MarkerPerturbation
+from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
@@ -108,6 +109,7 @@ class DatasetPlan:
         for sensor in sweep.sensors:
             self._check_reach(sensor)
             TactileSensor(sensor, **self.sensor_options(1), device="cpu")
+            self._check_markers(sensor)
 
     # --- shards ----------------------------------------------------------------------------------------------------------------
 
@@ -253,6 +255,14 @@ class DatasetPlan:
             if max(-ends[0], ends[1]) > 0.5 * size:
                 rule = f"must lie on the pad of {sensor.name}: {axis} in ±{0.5e3 * size:.4g} mm"
                 raise self._error(f"{axis}_mm", ends, rule)
+
+    def _check_markers(self, sensor: SensorSpec) -> None:
+        """Refuse shifts and turns of the pattern that take a marker out of the view, now and not at the press that draws them."""
+        largest = self.randomization.markers
+        if self.sweep.markers is not None and largest.moves_pattern:
+            ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])
+            shift, turn = largest.shift * ends[:, :2], largest.turn * ends[:, 2]
+            MarkerPattern.of(sensor, self.resolution(sensor), shift=shift, turn=turn)
 
     def _error(self, key: str, ends: tuple[float, float], rule: str) -> RaytacError:
         return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=[float(f"{v * 1e3:.6g}") for v in ends])

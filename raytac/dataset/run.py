@@ -42,6 +42,8 @@ class RunReport:
     """Presses of the whole data set that failed."""
     render_s: float
     """Time from the first shard's start to the last one's end [s], with what workers load first."""
+    steady_presses_per_s: float | None
+    """Presses a second after the first shard came, when all is loaded; None if no more than that was rendered."""
     device: str
 
 
@@ -104,7 +106,7 @@ def render_dataset(
         _check_room(folder, plan, missing, say)
         write_description(folder, describe(plan, _ordered(records), None))
         job = RenderJob(plan, device, batch)
-        start, done = time.perf_counter(), 0
+        start, done, first = time.perf_counter(), 0, None
         if missing:
             results = (
                 render_here(job, missing) if engine == "local" else render_on_ray(job, missing, workers=workers, address=address)
@@ -114,12 +116,14 @@ def render_dataset(
                 for result in results:
                     records[result.shard] = store.write(result)
                     done += len(result.rows)
+                    first = first or (time.perf_counter(), done)
                     bar.update(len(result.rows))
         took = time.perf_counter() - start
         whole = _ordered(records)
         write_description(folder, describe(plan, whole, write_manifest(folder, whole)))
     failed = sum(row["status"] == "failed" for record in whole for row in record.rows)
-    return RunReport(folder, len(missing), done, failed, took, str(whole[-1].made_by["device"]))
+    steady = (done - first[1]) / (start + took - first[0]) if first is not None and done > first[1] else None
+    return RunReport(folder, len(missing), done, failed, took, steady, str(whole[-1].made_by["device"]))
 
 
 def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
