@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ContactPairs", "RigidMotion", "StepReport", "Wrench"]
+__all__ = ["ContactPairs", "PairForces", "RigidMotion", "StepReport", "Wrench"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -73,6 +73,21 @@ class ContactPairs:
     normal: Floats
     gap: Floats
     force: Floats
+
+
+@dataclass(frozen=True)
+class PairForces:
+    """What the first of two bodies bears from the second, world frame.
+
+    Attributes:
+        normal: sum of the normal forces [N], shape (B, 3).
+        place: where they act in the mean [m], shape (B, 3); NaN where the two do not touch.
+        wrench: all forces, friction included [N], and their torque about ``place`` [N m], shape (B, 6).
+    """
+
+    normal: Floats
+    place: Floats
+    wrench: Floats
 
 
 @dataclass(frozen=True)

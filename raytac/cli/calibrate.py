@@ -24,7 +24,8 @@ class CalibrateArgs(SolverOptions):
 
     Writes marker_motion.toml (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model
     against surface tracking on presses that the fit did not see) and metrics.json. Without --out the folder is
-    runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error or Ctrl-C leaves the folder as it was.
+    runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error or Ctrl-C leaves these files as they were; presses that are
+    finished stay in presses/, and the same command goes on from there.
     """
 
     what: Annotated[Literal["markers"], tyro.conf.Positional]

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from raytac.envs.batch import Outcome, TaskBatch
 from raytac.envs.task import Task
 from raytac.errors import InputError
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.observe import gymnasium_space
 
 __all__ = ["TactileEnv", "TactileVectorEnv"]
@@ -69,8 +69,8 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
     ``success``, ``failed``; where environments began anew in the same step also ``final_obs`` and ``final_info`` (arrays of objects), as
-    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does; with
-    noise in the markers only until any environment begins anew by itself, since the observation then draws new noise for all.
+    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does, noise
+    of cameras and markers included.
     """
 
     task: ClassVar[type[Task]]
@@ -121,7 +121,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             InputError: seeds of another number than environments, or a mask of another shape.
         """
         mask = (options or {}).get("reset_mask")
-        envs = list(range(self.num_envs)) if mask is None else chosen_envs(np.asarray(mask), self.num_envs)
+        envs = chosen_envs(mask, self.num_envs)
         if seed is not None:
             seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
             if len(seeds) != self.num_envs:
@@ -136,7 +136,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment."""
         late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
-        out = self.batch.step(np.asarray(actions))
+        out = self.batch.step(np.asarray(actions), np.isin(np.arange(self.num_envs), late) if len(late) else None)
         observation, terms = out.observation, {name: term.copy() for name, term in out.terms.items()}
         reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
         success, failed = out.success.copy(), out.failed.copy()

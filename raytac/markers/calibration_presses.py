@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from raytac.errors import RaytacError
+from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.surface import GelSurface
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FIT", "HELD_OUT", "LOADS", "QUICK_FIT", "QUICK_HELD_OUT", "Press", "PressFrame", "press_frames"]
+__all__ = [
+    "FIT",
+    "HELD_OUT",
+    "LOADS",
+    "QUICK_FIT",
+    "QUICK_HELD_OUT",
+    "Press",
+    "PressFrame",
+    "PressStates",
+    "press_frames",
+    "simulate_press",
+]
 
 LOADS = ("normal", "shear", "twist")
 """Kinds of load that errors are given for."""
@@ -119,8 +130,20 @@ class PressFrame:
     surface: GelSurface
 
 
-def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> Iterator[PressFrame]:
-    """Run a press on the simulated pad of level ``pad`` and give its states in order.
+@dataclass(frozen=True)
+class PressStates:
+    """What the simulated pad says of one press, in N states: all that takes long to find out."""
+
+    loads: tuple[str, ...]
+    """Kind of load of each state, as in ``PressFrame``."""
+    poses: np.ndarray
+    """``pad_from_object``, shape (N, 4, 4)."""
+    coat: DeformedCoat
+    """The coat, its states in place of environments."""
+
+
+def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> PressStates:
+    """Run a press on the simulated pad of level ``pad``.
 
     Raises:
         BackendError: the solver is not installed.
@@ -130,15 +153,32 @@ def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "c
     from raytac.physics.solver import check_solver
 
     check_solver("a press on the simulated pad")
-    from raytac.physics.rigid import RigidPad
     from raytac.physics.soft import SoftPad
 
-    scene = press.scene()
-    soft = SoftPad(sensor, scene, pitch=_PITCH, pad=pad, device=device)
-    rigid = RigidPad(sensor, scene, pitch=_PITCH)
+    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=pad, device=device)
+    loads, poses, coats = [], [], []
     for state in soft.run(steps_per_stage=_STEPS):
         if state.failed.any():
             raise RaytacError(f"the press {press} did not settle")
-        load = {"indent": "normal", "start": "start"}.get(state.kind, state.kind)
-        by_geometry = rigid.surface_from_pose(np.asarray(state.pad_from_object))
-        yield PressFrame(press, load, replace(by_geometry, coat=soft.surface(state).coat))
+        coat = soft.surface(state).coat
+        assert coat is not None
+        loads.append({"indent": "normal"}.get(state.kind, state.kind))
+        poses.append(np.asarray(state.pad_from_object)[0])
+        coats.append(coat.positions[0])
+    return PressStates(tuple(loads), np.stack(poses), DeformedCoat(coat.mesh, np.stack(coats)))
+
+
+def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
+    """The states of a press, in order, with what the rigid pad makes of the object at the same poses.
+
+    Raises:
+        SpecError: the press does not fit this sensor.
+    """
+    from raytac.physics.rigid import RigidPad
+
+    rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)
+    frames = []
+    for load, pose, positions in zip(states.loads, states.poses, states.coat.positions, strict=True):
+        surface = rigid.surface_from_pose(pose[None])
+        frames.append(PressFrame(press, load, replace(surface, coat=DeformedCoat(states.coat.mesh, positions[None]))))
+    return frames

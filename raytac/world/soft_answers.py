@@ -35,18 +35,17 @@ def soft_answers(scene: SoftScene, links: Mapping[str, int]) -> list[Answer]:
     answers: list[Answer] = []
     for b in range(scene.num_envs):
         contacts = []
-        for (one, two), (force, place) in pressing.items():
-            size = float(np.linalg.norm(force[b]))
+        for (one, two), found in pressing.items():
             sides = [links.get(name, name if name in free else None) for name in (one, two)]
-            if size == 0.0 or sides == [None, None]:
+            if not found.normal[b].any() or sides == [None, None]:
                 continue
-            first, other, push = sides[0], sides[1], force[b]
+            first, other, sign = sides[0], sides[1], 1.0
             if first is None:
-                first, other, push = sides[1], None, -force[b]
+                first, other, sign = sides[1], None, -1.0
             pads = [bounds[name][b] for name in (one, two) if name in bounds]
             stiffness = _weakest(pads) if pads else np.diag([_HARD] * 3 + [0.0] * 3)
             assert first is not None
-            contacts.append(Touching(first, stiffness, place[b], other, push))
+            contacts.append(Touching(first, stiffness, found.place[b], other, sign * found.normal[b], sign * found.wrench[b]))
         answers.append((wrench[:, :][b], contacts, {name: partners[b] for name, partners in free.items()}))
     return answers
 

@@ -16,12 +16,13 @@ import numpy as np
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.physics.batch_check import rigid_poses
+from raytac.physics.rotation import quaternion
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import body_poses, quaternion, site_poses
+from raytac.robots.pose import body_poses, site_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
 from raytac.specs.press import PADS
@@ -177,7 +178,7 @@ class TactileWorld:
             OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
                 pad a start may be one in contact, as it was recorded, so overlap is not looked for.
         """
-        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        chosen = chosen_envs(envs, self.num_envs)
         places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
         free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
         for name in places:
@@ -280,14 +281,20 @@ class TactileWorld:
             np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
         )
 
-    def observe(self, sensors: Sequence[str] | None = None) -> dict[str, TactileFrame]:
+    def observe(
+        self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
+    ) -> dict[str, TactileFrame]:
         """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
 
         Markers that follow a contact's history (``fots``) see only what is observed: call it every control step if they are asked for.
 
+        ``envs`` (a mask (B,) or a list) gives frames with one row an environment named, and nothing of the others goes on: no noise is
+        drawn for them and no history written. One that is named twice has two rows that are the same.
+
         Raises:
-            InputError: an unknown sensor; as ``TactileSensor.update``.
+            InputError: an unknown sensor or environment; as ``TactileSensor.update``.
         """
+        rows = None if envs is None else chosen_envs(envs, self.num_envs)
         chosen = self.sensor_names if sensors is None else tuple(sensors)
         for name in chosen:
             if name not in self.sensor_names:
@@ -295,7 +302,7 @@ class TactileWorld:
         frames = {}
         for name in chosen:
             sensor = self.sensors[name]
-            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
+            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed, rows), rows)
         return frames
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:

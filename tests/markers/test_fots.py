@@ -73,8 +73,7 @@ def test_the_sum_over_cells_alone_equals_a_loop_over_cells(sensor: SensorSpec, g
     kernel = FotsKernel(cells.x, cells.y, device="cpu")
     markers = marker_centres(sensor.markers)
     constants = FotsConstants(2e8, 1e5, 1e5, 1e-3, 1e5, 0.5)
-    none = np.zeros((1, 1), bool), np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), np.zeros((1, 1))
-    none += np.zeros((1, 1, 3)), np.zeros((1, 1))
+    none = np.zeros((1, 1, 12))
     moved = kernel.displacement(markers[None], samples.depth, samples.boxes, none, constants)[0]
     expected = np.zeros_like(markers)
     for j, i in zip(*np.nonzero(samples.contact[0]), strict=True):

@@ -34,13 +34,13 @@ def moved(
     """Markers (M, 2) moved by contacts (G_x, G_y, Δs_x, Δs_y, Δθ, T_xx, T_xy, T_yy, h̄), by the kernel."""
     cells = ContactCells.over(grid)
     kernel = FotsKernel(cells.x, cells.y, device="cpu")
-    table = np.array(contacts)[None]
-    parts = np.ones(table.shape[:2], bool), table[..., :2], table[..., 2:4], table[..., 4], table[..., 5:8], table[..., 8]
+    unread = np.full((len(contacts), 2), 1e3)
+    table = np.concatenate([np.ones((len(contacts), 1)), np.array(contacts), unread], axis=1)[None]
     nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
     samples = nothing if depth is None else depth[None].astype(np.float32)
     box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
     constants = FotsConstants(gain, 1e5, 0.8e5, 1e-3, 1.2e5, 0.5, punch)
-    return kernel.displacement(markers[None], samples, box, parts, constants)[0].astype(float)
+    return kernel.displacement(markers[None], samples, box, table, constants)[0].astype(float)
 
 
 def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, gain: float, depth: np.ndarray) -> np.ndarray:
