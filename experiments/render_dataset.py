@@ -17,10 +17,11 @@ from typing import Annotated
 
 import tyro
 
-from raytac.dataset import ENGINES, DatasetPlan, RunReport, render_dataset, verify_dataset
+from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.io.png import write_png
 from raytac.physics.solver import hush_solver
 from raytac.report.machine import machine
 from raytac.sensor import OPTICS, PHYSICS
@@ -57,6 +58,8 @@ class Args(CommonOptions):
     """Presses computed at once: more suit a GPU."""
     compress: bool = False
     """Deflate the arrays: smaller files, slower to read."""
+    sheet: int = 0
+    """Write sheet.png, a contact sheet of so many presses; 0 is none."""
     verify: bool = False
     """Render nothing: compare all files of the data set with their checksums."""
 
@@ -89,6 +92,8 @@ def main(args: Args) -> RunReport | None:
         progress=True,
         say=print,
     )
+    if args.sheet:
+        write_png(out / "sheet.png", contact_sheet(PressDataset(out), args.sheet))
     metrics = {
         "experiment": "render_dataset",
         "sweep": plan.sweep.name,

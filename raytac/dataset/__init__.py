@@ -8,6 +8,7 @@ from raytac.dataset.loader import PressDataset
 from raytac.dataset.plan import DatasetPlan, Presses
 from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.dataset.run import Check, RunReport, render_dataset, verify_dataset
+from raytac.dataset.sheet import contact_sheet
 
 __all__ = [
     "ARRAYS",
@@ -22,6 +23,7 @@ __all__ = [
     "RunReport",
     "ShardRenderer",
     "ShardResult",
+    "contact_sheet",
     "render_dataset",
     "verify_dataset",
 ]

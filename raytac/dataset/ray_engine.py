@@ -102,12 +102,15 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
         job, device=job.device if gpus else "cpu"
     )  # by value: what Ray starts again must not depend on an object's life
     actors = [Worker.options(scheduling_strategy="SPREAD").remote(told) for _ in range(count)]
-    for error in ray.get([actor.prepare.remote(waiting[0]) for actor in actors] if waiting else []):
-        if error:
-            raise BackendError(f"a worker cannot render: {error}")
+    # One before the others: it may bake a table, which those on its machine then find.
+    for some in (actors[:1], actors[1:]) if waiting else ():
+        for error in ray.get([actor.prepare.remote(waiting[0]) for actor in some]):
+            if error:
+                raise BackendError(f"a worker cannot render: {error}")
     waiting.reverse()
     begun: dict[int, int] = {}
-    running: dict[Any, tuple[Any, int]] = {}
+    running: dict[Any, tuple[Any, int | None]] = {}
+    """What workers are at: a shard, or None while one that died comes back."""
 
     def give(actor: Any) -> None:
         if waiting:
@@ -123,12 +126,23 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
         actor, shard = running.pop(done)
         try:
             result = ray.get(done)
-        except ray.exceptions.RayActorError:
-            if begun[shard] < _ATTEMPTS:
+        except ray.exceptions.RayActorError as error:
+            if shard is None:
+                if not running:
+                    raise BackendError(
+                        f"no worker is left ({error}); run again to go on with the shards that are missing"
+                    ) from error
+                continue
+            again = begun[shard] < _ATTEMPTS
+            (waiting if again else lost).append(shard)
+            if again:
                 warnings.warn(f"the worker of shard {shard} died: the shard is rendered again", RuntimeWarning, stacklevel=2)
-                waiting.append(shard)
-            else:
-                lost.append(shard)
+            # Until Ray has started it again every call would fail at once; one that is retried waits for that.
+            running[actor.prepare.options(max_task_retries=-1).remote(shard)] = actor, None
+            continue
+        if shard is None:
+            if result:
+                raise BackendError(f"a worker that came back cannot render: {result}")
             give(actor)
             continue
         if isinstance(result, str):

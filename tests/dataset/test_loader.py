@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.dataset import DatasetPlan, PressDataset, render_dataset
+from raytac.dataset import DatasetPlan, PressDataset, contact_sheet, render_dataset
 from raytac.dataset.loader import open_shard
 from raytac.dataset.shard import npz_bytes
 from raytac.errors import InputError
@@ -86,3 +86,19 @@ def test_a_mapped_shard_is_what_numpy_reads(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found[name], values)
             np.testing.assert_array_equal(read[name], values)
             assert found[name].dtype == values.dtype
+
+
+def test_a_contact_sheet_shows_where_each_press_is_deepest(folders: dict[bool, Path]) -> None:
+    data = PressDataset(folders[False])
+    sheet = contact_sheet(data, 5, columns=3)
+    (rows, columns), gap = data[0]["height"].shape, 4
+    assert sheet.shape == (2 * (rows + gap) + gap, 3 * (columns + gap) + gap, 3) and sheet.dtype == np.uint8
+    assert (sheet[-rows - gap :, -columns - gap :] == 255).all()  # there is no sixth
+    for i in range(5):
+        top, left = gap + i // 3 * (rows + gap), gap + i % 3 * (columns + gap)
+        tile = sheet[top : top + rows, left : left + columns, 0]
+        deepest = data.shared(i)["rest_height"] - data[i]["height"]
+        assert tile[np.unravel_index(deepest.argmax(), deepest.shape)] == tile.min()
+        assert tile.min() == pytest.approx(255 * (1 - deepest.max() / 1e-3), abs=1)
+    with pytest.raises(InputError, match="columns = 0"):
+        contact_sheet(data, columns=0)

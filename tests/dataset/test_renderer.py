@@ -48,6 +48,16 @@ def test_a_press_is_what_the_sensor_alone_gives(sweep: SweepSpec) -> None:
     plan = DatasetPlan(replace(sweep, randomization={}, marker_perturbation={}))
     result = ShardRenderer(RenderJob(plan, "cpu", batch=4)).render(0)
     presses = plan.presses(0)
+    sensor = TactileSensor(
+        sweep.sensors[0],
+        physics="rigid",
+        optics="phong",
+        outputs=("rgb", "height", "wrench"),
+        markers="fots",
+        resolution=sweep.resolution,
+        pitch=sweep.pitch,
+        device="cpu",
+    )
     for row in (0, 3):
         scene = sweep.objects[presses.scene[row]]
         turn, own = presses.rotations[row], scene.object.quaternion
@@ -58,16 +68,7 @@ def test_a_press_is_what_the_sensor_alone_gives(sweep: SweepSpec) -> None:
             StageSpec("indent", depth=float(presses.press_depth[row])),
             StageSpec("shear", shear=(float(presses.shear_x[row]), float(presses.shear_y[row]))),
         )
-        alone = TactileSensor(
-            sweep.sensors[0],
-            physics="rigid",
-            optics="phong",
-            outputs=("rgb", "height", "wrench"),
-            markers="fots",
-            resolution=sweep.resolution,
-            pitch=sweep.pitch,
-            device="cpu",
-        ).press(replace(scene, object=target, trajectory=stages))
+        alone = sensor.press(replace(scene, object=target, trajectory=stages))
         assert alone.rgb is not None and alone.height is not None and alone.wrench is not None and alone.markers is not None
         assert np.abs(result.arrays["rgb"][row].astype(int) - alone.rgb[0]).max() <= 1
         np.testing.assert_allclose(result.arrays["height"][row], alone.height[0], atol=1e-8)

@@ -11,6 +11,7 @@ from experiments.render_dataset import Args, main
 from raytac.dataset import PressDataset
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
+from raytac.io.png import read_png
 
 SWEEP = """
 objects = ["sphere"]
@@ -25,10 +26,11 @@ depth_mm = [0.2, 0.8]
 def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "small.toml").write_text(SWEEP)
     asked: dict[str, Any] = {"sweep": str(tmp_path / "small.toml"), "out": tmp_path / "data", "device": "cpu"}
-    args = Args(**asked, count=3, shard_size=2, seed=9, outputs="height", batch=2)
+    args = Args(**asked, count=3, shard_size=2, seed=9, outputs="height", batch=2, sheet=3)
     main(args)
     data = PressDataset(tmp_path / "data")
     assert len(data) == 3 and set(data[0]) == {"index", "height", "pad_from_object"} and data.description["plan"]["seed"] == 9
+    assert read_png(tmp_path / "data/sheet.png").shape[2] == 3
     metrics = read_metrics(tmp_path / "data/metrics.json")
     assert metrics["presses"] == 3 and metrics["rendered.shards"] == 2 and isinstance(metrics["presses_per_s"], float)
     (tmp_path / "data/shards/000001.npz").unlink()
