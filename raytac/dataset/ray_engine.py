@@ -82,10 +82,14 @@ def _start(ray: Any, workers: int | None, address: str | None) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use over the network
     options: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "configure_logging": False}
     if address is not None or "RAY_ADDRESS" in os.environ:
-        del options["include_dashboard"]
-        ray.init(address=address, **options)
+        options = {"address": address, "log_to_driver": False, "configure_logging": False}
     else:
-        ray.init(num_cpus=max(os.cpu_count() or 1, workers or 1), **options)
+        options["num_cpus"] = max(os.cpu_count() or 1, workers or 1)
+    try:
+        ray.init(**options)
+    except Exception as error:  # of many kinds, Exception itself among them
+        ray.shutdown()
+        raise BackendError(f"Ray does not start, or cannot be reached ({type(error).__name__}: {error})") from error
 
 
 def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -> Iterator[ShardResult]:

@@ -22,7 +22,14 @@ ray = pytest.importorskip("ray", reason="Ray is not installed")
 def local_ray():
     """One Ray for all tests here: to start it takes seconds."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init(num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False, configure_logging=False)
+    for attempt in range(4):  # it gives itself 30 s to start, which a busy machine may not keep
+        try:
+            ray.init(num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False, configure_logging=False)
+            break
+        except Exception:
+            ray.shutdown()
+            if attempt == 3:
+                raise
     yield
     ray.shutdown()
 
