@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,8 +46,15 @@ class CalibrateArgs(SolverOptions):
         self.prepare_solver("calibrate markers")
         name = sensor.name + ("-quick" if self.quick else "")
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
-        for path in run_calibrate_markers(
-            sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
-        ):
+        try:
+            written = run_calibrate_markers(
+                sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
+            )
+        except KeyboardInterrupt:
+            print(
+                f"raytac: interrupted; finished presses are kept in {out}, the same command goes on from there", file=sys.stderr
+            )
+            return 130
+        for path in written:
             print(path)
         return 0

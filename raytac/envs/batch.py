@@ -13,6 +13,7 @@ import numpy as np
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.errors import InputError
+from raytac.gel.batch import rounded_envs
 from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver
 from raytac.robots.pose import pose_error
@@ -155,8 +156,10 @@ class TaskBatch:
         self._speed[envs], self._body_speed[envs] = 0.0, 0.0
         return self._observe(np.isin(np.arange(self.num_envs), envs))
 
-    def step(self, actions: np.ndarray) -> Outcome:
+    def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> Outcome:
         """One control step of every environment.
+
+        ``unseen`` (B,): environments that are reset next, so that their sensors are not asked and draw no noise.
 
         Raises:
             InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment), an environment
@@ -190,7 +193,7 @@ class TaskBatch:
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
         judged = time.perf_counter()
         self.time_s["reward"] += judged - done
-        observation = self._observe(np.ones(self.num_envs, bool))
+        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
         self.time_s["observation"] += time.perf_counter() - judged
         return Outcome(observation, reward, terminated, truncated, terms, verdict.success & ~failed, failed)
 
@@ -206,7 +209,7 @@ class TaskBatch:
         return found
 
     def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of all; environments not in ``which`` (B,) keep theirs, and their sensors see nothing new."""
+        """Observations of all; the sensors of environments not in ``which`` (B,) are not asked and keep what they gave last."""
         tool, body, goal = self._tool, self._body, self._goal
         at, turn = tool[:, :3, 3], pose_error(tool, self._start_tool)[:, 3:]
         parts = [
@@ -221,11 +224,17 @@ class TaskBatch:
             axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)
             found["body"] = np.concatenate([(body[:, :3, 3] - at) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
         found = {name: values.astype(np.float32) for name, values in found.items()}
-        if self.observers:
-            frames = self.world.observe()
-            for name, observer in self.observers.items():
-                seen = observer.observe(frames[name], self.world.sensors[name] if observer.settings.difference else None, which)
-                found |= {f"{name}_{modality}": values for modality, values in seen.items()}
+        rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
+        looked = any(observer.settings.needs_frames for observer in self.observers.values())
+        frames = self.world.observe(envs=rows) if looked and which.any() else {}
+        state = self.world.state() if self.observers and not looked else None
+        for name, observer in self.observers.items():
+            sensor = self.world.sensors[name] if observer.settings.difference else None
+            if state is not None:
+                seen = observer.observe_wrench(state.wrench[name], state.failed, which)
+            else:
+                seen = observer.observe(frames[name], sensor, rows) if frames else observer.last()
+            found |= {f"{name}_{modality}": values for modality, values in seen.items()}
         return found
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:

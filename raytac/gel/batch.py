@@ -7,7 +7,13 @@ from numpy.typing import ArrayLike
 
 from raytac.errors import InputError
 
-__all__ = ["chosen_envs"]
+__all__ = ["chosen_envs", "rounded_envs"]
+
+
+def rounded_envs(envs: list[int], batch: int) -> list[int]:
+    """The same with the last of them named again, up to a power of two or ``batch``: kernels are recorded for each number of rows."""
+    count = min(1 << max(len(envs) - 1, 0).bit_length(), batch)
+    return [*envs, *envs[-1:] * (count - len(envs))]
 
 
 def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared or twisted."""
+"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared, twisted, or both at once."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ __all__ = [
     "simulate_press",
 ]
 
-LOADS = ("normal", "shear", "twist")
+LOADS = ("normal", "shear", "twist", "combined")
 """Kinds of load that errors are given for."""
 _PITCH = 0.1e-3
 _STEPS = 4
-"""States a stage."""
+"""States a stage; of a press with shear and twist, steps of either, in turn."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m] or twisted by ``twist`` [rad]."""
+    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m], twisted by ``twist`` [rad], or both:
+    a step of one, a step of the other, and so on.
+    """
 
     name: str
     kind: str
@@ -47,13 +49,19 @@ class Press:
     turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Quaternion (w, x, y, z) that turns the object before it is pressed."""
 
+    @property
+    def is_combined(self) -> bool:
+        return any(self.shear) and self.twist != 0.0
+
     def scene(self) -> PressScene:
         target = ObjectSpec(self.kind, self.params, (*self.place, 0.0), self.turned, 0.1)
         stages = [StageSpec("indent", depth=self.depth)]
-        if any(self.shear):
-            stages.append(StageSpec("shear", shear=self.shear))
-        if self.twist:
-            stages.append(StageSpec("twist", twist=self.twist))
+        steps = _STEPS if self.is_combined else 1
+        for k in range(1, steps + 1):
+            if any(self.shear):
+                stages.append(StageSpec("shear", shear=(k / steps * self.shear[0], k / steps * self.shear[1])))
+            if self.twist:
+                stages.append(StageSpec("twist", twist=k / steps * self.twist))
         return PressScene(self.name, target, tuple(stages))
 
     def __str__(self) -> str:
@@ -84,6 +92,19 @@ def _presses(
     return sheared, twisted
 
 
+def _both(
+    name: str,
+    kind: str,
+    params: dict[str, float | int | str],
+    place: tuple[float, float],
+    depth: float,
+    shear: tuple[float, float],
+    twist_deg: float,
+) -> Press:
+    """An object sheared and twisted at once."""
+    return Press(name, kind, params, place, depth, shear=shear, twist=math.radians(twist_deg))
+
+
 def _lying(angle_deg: float) -> tuple[float, float, float, float]:
     """Quaternion that lays a standing cylinder along x and turns it about z."""
     half = math.radians(angle_deg) / 2
@@ -110,8 +131,11 @@ HELD_OUT = (
         "bar", "cylinder", {"radius": 2.5e-3, "length": 8e-3}, (-0.5e-3, 0.5e-3), 0.8e-3, (0.3e-3, 0.7e-3), -20.0, _lying(30.0)
     ),
     *_presses("ball6-slides", "sphere", {"radius": 6e-3}, (1.5e-3, 1.0e-3), 0.3e-3, (-0.6e-3, -1.0e-3), -40.0),
+    _both("ball6-both", "sphere", {"radius": 6e-3}, (1.5e-3, 1.0e-3), 0.35e-3, (-0.8e-3, 0.2e-3), 35.0),
+    _both("punch2-both", "cylinder", {"radius": 2e-3, "length": 6e-3}, (2.0e-3, -1.0e-3), 0.3e-3, (0.2e-3, 0.7e-3), 45.0),
+    _both("cone-both", "cone", {"radius": 4e-3, "height": 3e-3, "tip_radius": 1.5e-3}, (-2.0e-3, 1.0e-3), 0.4e-3, (0.4e-3, -0.5e-3), -35.0),
 )  # fmt: skip
-"""Presses that no fit sees: other objects, other places, other directions; a bar that lies, and a ball that slides."""
+"""Presses that no fit sees: other objects, other places, other directions; a bar that lies, a ball that slides, and shear with twist."""
 QUICK_FIT, QUICK_HELD_OUT = FIT[:2], HELD_OUT[:2]
 """Few presses, to see that all runs."""
 
@@ -157,12 +181,13 @@ def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = 
 
     soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=pad, device=device)
     loads, poses, coats = [], [], []
-    for state in soft.run(steps_per_stage=_STEPS):
+    names = {"indent": "normal"} | ({"shear": "combined", "twist": "combined"} if press.is_combined else {})
+    for state in soft.run(steps_per_stage=1 if press.is_combined else _STEPS):
         if state.failed.any():
             raise RaytacError(f"the press {press} did not settle")
         coat = soft.surface(state).coat
         assert coat is not None
-        loads.append({"indent": "normal"}.get(state.kind, state.kind))
+        loads.append(names.get(state.kind, state.kind))
         poses.append(np.asarray(state.pad_from_object)[0])
         coats.append(coat.positions[0])
     return PressStates(tuple(loads), np.stack(poses), DeformedCoat(coat.mesh, np.stack(coats)))

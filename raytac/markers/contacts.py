@@ -247,24 +247,28 @@ class ContactTracker:
             self._contacts[b] = []
             self._pose[b] = None
 
-    def update(self, surface: GelSurface, samples: ContactSamples) -> Contacts:
+    def update(self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None) -> Contacts:
         """Contacts of ``surface``, whose ``samples`` are given; call once for every surface, in order.
+
+        ``envs``: which environment each of its rows is of; None is all.
 
         Raises:
             InputError: a surface of another number of environments.
         """
-        if surface.batch != self.batch:
-            raise InputError("surface", value=surface.batch, rule=f"must have {self.batch} environments, as this tracker")
+        chosen = range(self.batch) if envs is None else envs
+        if surface.batch != len(chosen):
+            raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")
         pose = surface.pad_from_object
-        now: list[_Pose | None] = [None] * self.batch if pose is None else np.asarray(pose).tolist()
-        self._contacts = [
+        now: list[_Pose | None] = [None] * len(chosen) if pose is None else np.asarray(pose).tolist()
+        history = [(self._contacts[b], self._pose[b]) for b in chosen]
+        contacts = [
             _followed(found, before, _motion(last, at)) if found and before else found
-            for found, before, last, at in zip(_find(samples), self._contacts, self._pose, now, strict=True)
+            for found, (before, last), at in zip(_find(samples), history, now, strict=True)
         ]
-        self._pose = now
-        count = max(1, max(map(len, self._contacts)))
-        rows = [[(1.0, *c) for c in contacts] + [_NO_CONTACT] * (count - len(contacts)) for contacts in self._contacts]
-        return Contacts(np.array(rows))
+        for b, found, at in zip(chosen, contacts, now, strict=True):
+            self._contacts[b], self._pose[b] = found, at
+        count = max(1, max(map(len, contacts)))
+        return Contacts(np.array([[(1.0, *c) for c in found] + [_NO_CONTACT] * (count - len(found)) for found in contacts]))
 
 
 def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:

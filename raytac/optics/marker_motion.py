@@ -20,8 +20,14 @@ distance from G_c (``_outside`` has both for an ellipse), t = A / r and g(t) = t
     twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
 
 On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
-of mean indentation h̄ sticks up to |Δs| = c h̄ A and |Δθ| A = ``TWIST_SLIP`` c h̄ A, and slips beyond: by Coulomb, where 8 G A Δs / (2 − ν)
-reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G).
+of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄: by Coulomb, where 8 G A Δs / (2 − ν) reaches
+μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G). Force F and couple M together stay on or within
+an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for sliding manipulation, IJRR 15(6),
+1996); beyond it the contact slips along the ellipsoid's normal. So what is left of Δs and Δθ, in which F and M are linear, is
+
+    Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
+
+(closest point, in elastic energy, as of ideal plasticity; b is the ratio of F_max Δs_max to M_max Δθ_max on incompressible rubber).
 """
 
 from __future__ import annotations
@@ -49,6 +55,9 @@ _PACKET = 4
 TWIST_SLIP = 3 * math.pi / 16
 """Way at the edge of a contact when it spins over the shear when it slides, both as far as it would stick: of a ball on incompressible
 rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so 9π/32 / (2 − ν)."""
+
+_LIMIT_STEPS = 3
+"""Newton steps of ``_limited``: to float32's rounding at any shear and twist (a test compares with bisection)."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +233,7 @@ def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: An
     a, b, c = row
     radius = dr.sqrt(dr.sqrt(dr.maximum(b.z * c.x - b.w * b.w, 1e-24)))
     most = slip * c.y * radius
-    way = _at_most(mi.Vector2f(a.w, b.x), most)
+    way, turn = _limited(mi.Vector2f(a.w, b.x), b.y, most, TWIST_SLIP * slip * c.y)
     out = place - (mi.Point2f(a.y, a.z) - way)
     beyond = _outside(out, b.z, b.w, c.x)
     r2 = radius * radius + beyond
@@ -234,9 +243,24 @@ def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: An
     fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
     along = dr.dot(out, way) / dr.maximum(dr.squared_norm(out), 1e-18) * out
     sheared = share * fade * ((asin - kappa * g) * way + 2 * kappa * g * along)
-    widest = TWIST_SLIP * most / radius
     wt = share * (asin - g)
-    return share * fade * asin, sheared, wt, wt * _turned(mi, out, dr.clip(b.y, -widest, widest))
+    return share * fade * asin, sheared, wt, wt * _turned(mi, out, turn)
+
+
+def _limited(way: Any, turn: Any, most: Any, widest: Any) -> tuple[Any, Any]:
+    """The shear and the twist that are left where the contact slips, of those that the object has made.
+
+    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be.
+    """
+    ratio = 1 / TWIST_SLIP**2
+    x0, y0 = dr.norm(way) / dr.maximum(most, 1e-12), dr.abs(turn) / dr.maximum(widest, 1e-12)
+    gamma = dr.maximum(dr.maximum(x0 - 1, (y0 - 1) / ratio), 0)
+    for _ in range(_LIMIT_STEPS):
+        p, q = 1 + gamma, 1 + ratio * gamma
+        x2, y2 = dr.square(x0 / p), dr.square(y0 / q)
+        n = dr.sqrt(x2 + y2)
+        gamma += n * n * dr.maximum(n - 1, 0) / dr.maximum(x2 / p + ratio * y2 / q, 1e-12)
+    return way / (1 + gamma), turn / (1 + ratio * gamma)
 
 
 def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> Any:

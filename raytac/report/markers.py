@@ -73,13 +73,13 @@ def run_calibrate_markers(
 
     from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
     from raytac.report.markers_figure import write_arrows, write_errors
-    from raytac.report.press_store import PressStore
+    from raytac.report.press_store import PressStore, press_code
 
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
         solver = resolve_device(device, ray_tracing=False)
-        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, say=tqdm.write)
+        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=tqdm.write)
         pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress, store=store)
         press_s = time.perf_counter() - began
         names = {press.name for press in fit}

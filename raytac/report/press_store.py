@@ -17,7 +17,7 @@ from raytac.io.metrics import versions
 from raytac.markers.calibration_presses import Press, PressStates
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PressStore"]
+__all__ = ["PressStore", "press_code"]
 
 _CODE = ("ipc", "raytac.physics")
 """Packages of which every module may change what a press does."""
@@ -26,12 +26,13 @@ _CODE = ("ipc", "raytac.physics")
 class PressStore:
     """One ``.npz`` a press in ``folder``, under a digest of all that shapes it: gelpad, press, level, device, code and versions."""
 
-    def __init__(self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, say: Callable[[str], object] = print) -> None:
-        """``say`` tells of presses that cannot be used."""
+    def __init__(
+        self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, code: str, say: Callable[[str], object] = print
+    ) -> None:
+        """``code``: see ``press_code``; ``say`` tells of presses that cannot be used."""
         self.folder, self._say = Path(folder), say
         self.reused = 0
         """Presses that were read and not damaged."""
-        code = code_digest("raytac.markers.calibration_presses", *_modules())
         self._basis = repr((gelpad, pad, device, code, versions(("numpy", "warp-lang"))))
 
     def read(self, press: Press) -> PressStates | None:
@@ -72,6 +73,11 @@ class PressStore:
 
     def _path(self, press: Press) -> Path:
         return self.folder / f"{press.name}-{hashlib.sha256((self._basis + repr(press)).encode()).hexdigest()[:20]}.npz"
+
+
+def press_code() -> str:
+    """Digest of the source code that a press depends on: the presses' own, and all of the solver and of physics."""
+    return code_digest("raytac.markers.calibration_presses", *_modules())
 
 
 def _modules() -> list[str]:

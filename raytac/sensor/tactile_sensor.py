@@ -266,10 +266,12 @@ class TactileSensor:
             self._tracker.reset()
         return self._pad
 
-    def update(self, state: ContactState | GelSurface | PadReading) -> TactileFrame:
+    def update(self, state: ContactState | GelSurface | PadReading, envs: Sequence[int] | None = None) -> TactileFrame:
         """Frame of a gel surface, of a state of the physics that ``load`` or ``press`` set up, or of what a world's pad reads.
 
         With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
+
+        ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
 
         Raises:
             InputError: a state, and no scene was loaded, or another one than the state is of.
@@ -292,7 +294,7 @@ class TactileSensor:
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None
         if self.markers is not None:
-            markers = self.marker_tracker.update(surface)
+            markers = self.marker_tracker.update(surface, envs)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
         return self._frame(surface, markers, done, time_ms, force=force, force_law_area=area, failed=failed, **forces)
@@ -333,11 +335,16 @@ class TactileSensor:
             **fields,
         )
 
-    def rest(self) -> TactileFrame:
-        """Frame of one untouched pad (B = 1), what every difference image is taken from; markers keep their history."""
-        start, surface, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+    def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
+        """Frame of untouched pads, what every difference image is taken from; markers keep their history.
+
+        ``envs``: as in which environments the markers are placed, one row each; all are alike but for a pattern that is shifted or turned.
+        """
+        start, one, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+        height, contact, centre = (np.repeat(v, len(envs), axis=0) for v in (one.height, one.contact, one.contact_centre))
+        surface = GelSurface(self.grid, height, contact, centre)
         if self.markers is not None:
-            markers = self.marker_tracker.at_rest()
+            markers = self.marker_tracker.at_rest(envs)
             surface = self._dotted(surface, markers)
         done = time.perf_counter()
         return self._frame(surface, markers, done, {"surface": 1e3 * (done - start)})

@@ -145,9 +145,12 @@ class RigidPads:
                 found += [(name, body.spec.name, float(depth)) for depth in touches.depth]
         return found
 
-    def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
-        """Surface and forces of one sensor on the nodes of ``grid``, for all environments."""
-        pad = self.pads[name]
+    def reading(
+        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
+    ) -> PadReading:
+        """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
+        pad, rows = self.pads[name], np.arange(len(datas)) if envs is None else np.asarray(envs)
+        datas, failed = [datas[b] for b in rows.tolist()], failed[rows]
         if name not in self._shown or self._shown[name][0] is not grid:
             self._shown[name] = grid, ElasticSurround(grid)
         height = np.full((len(datas), *grid.shape), np.inf)
@@ -168,12 +171,12 @@ class RigidPads:
             height[near] = np.minimum(height[near], under)
         height[failed] = np.nan
         # From one body to another is no motion of either.
-        before = self._pressed[name]
+        before = self._pressed[name][rows]
         poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
-        self._pressed[name] = np.where(failed, before, pressed)
+        self._pressed[name][rows] = np.where(failed, before, pressed)
         surface = self._shown[name][1].surface(height, poses)
-        wrench = np.where(failed[:, None], np.nan, self._wrench[name])
-        return PadReading(surface, wrench, failed.copy(), lambda: _traction(surface, wrench))
+        wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
+        return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
 
     def _is_near(self, pad: _Pad, pad_from_body: np.ndarray, i: int) -> np.ndarray:
         """Whether a body at poses (B, 4, 4) may reach the pad's box, (B,)."""
@@ -188,6 +191,8 @@ class RigidPads:
         """Where a body touches a pad; ``env`` counts the poses (n, 4, 4) given."""
         pad_from_body = _relative(world_from_pad, world_from_body)
         near = np.flatnonzero(self._is_near(pad, pad_from_body, i))
+        if not len(near):
+            return pad.overlap.none
         touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[near], self._radius[i])
         return replace(touches, env=near[touches.env])
 

@@ -194,8 +194,10 @@ class SoftPads:
         """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
         return self._wrench[name].copy()
 
-    def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
-        """Surface and forces of one sensor, for all environments."""
+    def reading(
+        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
+    ) -> PadReading:
+        """Surface and forces of one sensor, for the environments named, one row each; None is all."""
         reading = self.soft.reading(name, grid, failed)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
@@ -204,7 +206,8 @@ class SoftPads:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        return PadReading(reading.surface, wrench, failed.copy(), traction)
+        found = PadReading(reading.surface, wrench, failed.copy(), traction)
+        return found if envs is None else found.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """None: the solver refuses a start in which bodies overlap."""

@@ -281,14 +281,20 @@ class TactileWorld:
             np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
         )
 
-    def observe(self, sensors: Sequence[str] | None = None) -> dict[str, TactileFrame]:
+    def observe(
+        self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
+    ) -> dict[str, TactileFrame]:
         """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
 
         Markers that follow a contact's history (``fots``) see only what is observed: call it every control step if they are asked for.
 
+        ``envs`` (a mask (B,) or a list) gives frames with one row an environment named, and nothing of the others goes on: no noise is
+        drawn for them and no history written. One that is named twice has two rows that are the same.
+
         Raises:
-            InputError: an unknown sensor; as ``TactileSensor.update``.
+            InputError: an unknown sensor or environment; as ``TactileSensor.update``.
         """
+        rows = None if envs is None else chosen_envs(envs, self.num_envs)
         chosen = self.sensor_names if sensors is None else tuple(sensors)
         for name in chosen:
             if name not in self.sensor_names:
@@ -296,7 +302,7 @@ class TactileWorld:
         frames = {}
         for name in chosen:
             sensor = self.sensors[name]
-            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
+            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed, rows), rows)
         return frames
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
