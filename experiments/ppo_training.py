@@ -13,7 +13,7 @@ import csv
 import os
 import random
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
@@ -33,7 +33,7 @@ from raytac.errors import InputError
 from raytac.observe import ObservationSettings
 from raytac.report.proportion import wilson_interval
 
-__all__ = ["KINDS", "Checkpoint", "Evaluation", "Learner", "Recipe", "Training", "evaluate", "tactile_settings"]
+__all__ = ["HELD_OUT", "KINDS", "Checkpoint", "Evaluation", "Learner", "Recipe", "Training", "evaluate", "tactile_settings"]
 
 KINDS: Mapping[str, type[TactileVectorEnv]] = {
     "PushCube": PushCubeVectorEnv,
@@ -41,7 +41,7 @@ KINDS: Mapping[str, type[TactileVectorEnv]] = {
     "LiftCube": LiftCubeVectorEnv,
     "RollBall": RollBallVectorEnv,
 }
-_HELD_OUT = 2**31
+HELD_OUT = 2**31
 """Seeds of evaluation start here; those of training are below."""
 _SMALL = 64
 """Observations of up to so many numbers go into the network as they are."""
@@ -61,17 +61,17 @@ class Recipe:
     processes: int = 1
     history: int = 1
     """Last observations that the policy is given."""
-    rollout: int = 128
+    rollout: int = 64
     """Steps of each environment between two updates."""
-    segment: int = 10
+    segment: int = 20
     """Rollouts between two checkpoints."""
     epochs: int = 10
     minibatch: int = 256
-    learning_rate: float = 3e-4
-    gamma: float = 0.99
+    learning_rate: float = 1e-3
+    gamma: float = 0.98
     gae_lambda: float = 0.95
     clip_range: float = 0.2
-    log_std: float = -1.0
+    log_std: float = -0.5
     """Logarithm of the first standard deviation of an action."""
     entropy: float = 0.0
     hidden: int = 64
@@ -129,6 +129,28 @@ class KeyedExtractor(BaseFeaturesExtractor):
         return torch.cat([way(observations[name]) for name, way in self.ways.items()], dim=1)
 
 
+class _Without(VecEnvWrapper):
+    """Takes modalities away from what is observed."""
+
+    def __init__(self, venv: VecEnv, hidden: Sequence[str]) -> None:
+        assert isinstance(venv.observation_space, spaces.Dict)
+        self._kept = [name for name in venv.observation_space.spaces if not name.endswith(tuple(f"_{m}" for m in hidden))]
+        super().__init__(venv, spaces.Dict({name: venv.observation_space[name] for name in self._kept}))
+
+    def reset(self) -> dict[str, np.ndarray]:
+        return self._cut(self.venv.reset())
+
+    def step_wait(self) -> Any:
+        observation, reward, done, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = self._cut(info["terminal_observation"])
+        return self._cut(observation), reward, done, infos
+
+    def _cut(self, observation: Any) -> dict[str, np.ndarray]:
+        return {name: observation[name] for name in self._kept}
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """A recipe, how far it is, and every number that training changes. On disk: tensors, numbers and names, no code."""
@@ -167,8 +189,17 @@ class Checkpoint:
 class Learner:
     """Environments, their normaliser and PPO's networks, by a recipe."""
 
-    def __init__(self, recipe: Recipe, **overrides: Any) -> None:
-        """``overrides``: further options of ``TaskBatch``. Raises ``InputError`` for an unknown task or modality."""
+    def __init__(self, recipe: Recipe, *, hidden: Sequence[str] = (), **overrides: Any) -> None:
+        """Make all.
+
+        Args:
+            recipe: what is trained.
+            hidden: modalities that ``overrides`` make the environments observe for a picture, but that the policy is not given.
+            overrides: options of ``TactileVectorEnv`` in place of those of the recipe.
+
+        Raises:
+            InputError: an unknown task or modality.
+        """
         if recipe.task not in KINDS:
             raise InputError("task", value=recipe.task, rule="must be a known task", choices=tuple(KINDS))
         self.recipe = recipe
@@ -179,7 +210,8 @@ class Learner:
             self.base = ProcessVecEnv(kind, num_envs=count, processes=recipe.processes, seed=recipe.seed, **options)
         else:
             self.base = TactileVecEnv(kind(count, seed=recipe.seed, **options))
-        stacked: VecEnv = VecFrameStack(self.base, recipe.history) if recipe.history > 1 else self.base
+        seen: VecEnv = _Without(self.base, hidden) if hidden else self.base
+        stacked: VecEnv = VecFrameStack(seen, recipe.history) if recipe.history > 1 else seen
         space = stacked.observation_space
         assert isinstance(space, spaces.Dict)
         numbers = [name for name, box in space.spaces.items() if box.dtype == np.float32]
@@ -261,7 +293,7 @@ def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluat
     returns, lengths, successes = [], [], 0
     try:
         while len(returns) < episodes:
-            env.seed(_HELD_OUT + first_seed + len(returns))
+            env.seed(HELD_OUT + first_seed + len(returns))
             observation, running = env.reset(), np.ones(env.num_envs, bool)
             while running.any():
                 observation, _, done, infos = env.step(learner.predict(observation))  # type: ignore[arg-type]
@@ -373,7 +405,7 @@ class Training:
 
 
 def _training_seed(seed: int, steps: int) -> int:
-    return int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) % (_HELD_OUT - 2**20)
+    return int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) % (HELD_OUT - 2**20)
 
 
 def _seed_all(seed: int, steps: int) -> None:

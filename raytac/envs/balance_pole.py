@@ -17,7 +17,7 @@ class BalancePole(Task):
 
     scene: ClassVar = "balance_pole"
     body: ClassVar = "pole"
-    motion: ClassVar = Motion(("x", "y"), (4e-3, 4e-3), (0.35, -0.10, 0.55), (0.55, 0.10, 0.55), leash=0.02)
+    motion: ClassVar = Motion(("x", "y"), (2e-3, 2e-3), (0.35, -0.10, 0.55), (0.55, 0.10, 0.55), leash=0.02)
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = False
     tactile: ClassVar = ("markers", "wrench")
@@ -53,7 +53,7 @@ class BalancePoleEnv(TactileEnv):
     `balance_pole`). Nothing but friction holds its foot, and it falls by itself once it
     leans by more than about 1°.
 
-    Action, Box(-1, 1, (2,)): what the target of the pad moves along world x and y (4 mm a step at 1); the target leads the pad by at most
+    Action, Box(-1, 1, (2,)): what the target of the pad moves along world x and y (2 mm a step at 1); the target leads the pad by at most
     20 mm along an axis and stays in x 0.35 to 0.55, y ±0.10 m.
 
     `action="joints"`: see docs/rl.md. A step is 20 ms.

@@ -225,10 +225,15 @@ class TaskBatch:
             found["body"] = np.concatenate([(body[:, :3, 3] - at) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
         found = {name: values.astype(np.float32) for name, values in found.items()}
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
-        frames = self.world.observe(envs=rows) if self.observers and which.any() else {}
+        looked = any(observer.settings.needs_frames for observer in self.observers.values())
+        frames = self.world.observe(envs=rows) if looked and which.any() else {}
+        state = self.world.state() if self.observers and not looked else None
         for name, observer in self.observers.items():
             sensor = self.world.sensors[name] if observer.settings.difference else None
-            seen = observer.observe(frames[name], sensor, rows) if frames else observer.last()
+            if state is not None:
+                seen = observer.observe_wrench(state.wrench[name], state.failed, which)
+            else:
+                seen = observer.observe(frames[name], sensor, rows) if frames else observer.last()
             found |= {f"{name}_{modality}": values for modality, values in seen.items()}
         return found
 

@@ -41,10 +41,10 @@ def balance_pole(batch: TaskBatch) -> np.ndarray:
     """A linear quadratic regulator of a pole on a cart: state x, ẋ, θ, θ̇, input ẍ; thin rod, θ̈ = 3g/2L θ − 3/2L ẍ."""
     axis, spin = batch._body[:, :3, 2], batch._body_speed[:, 3:]
     lean, rate = axis[:, :2], np.stack([spin[:, 1], -spin[:, 0]], axis=1)
-    commanded = batch._action[:, :2] * 4e-3 / batch.control_timestep
+    commanded = batch._action[:, :2] * 2e-3 / batch.control_timestep
     away = batch.steering._target[:, :2, 3] - batch._start_tool[:2, 3]
     push = np.einsum("k,kbi->bi", GAINS, np.stack([away, commanded, lean, rate]))
-    return np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 4e-3, -1.0, 1.0)
+    return np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 2e-3, -1.0, 1.0)
 
 
 def lift_cube(batch: TaskBatch) -> np.ndarray:

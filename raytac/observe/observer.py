@@ -150,6 +150,28 @@ class TactileObserver:
             name: self._rgb(frame, sensor, rows) if name == "rgb" else getattr(self, f"_{name}")(frame)
             for name in self.settings.modalities
         }
+        return self._finished(found, failed, rows)
+
+    def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
+        """As ``observe``, where nothing but the ``wrench`` is observed, from the world's own: no sensor need look at the pad.
+
+        Args:
+            wrench: of all environments (B, 6).
+            failed: which of them have failed, (B,), bool.
+            envs: mask (B,) of those that are new; the others keep what they observed last.
+
+        Raises:
+            InputError: more is observed, a wrench that is not (B, 6), or that is not finite where the environment has not failed.
+        """
+        if self.settings.needs_frames:
+            rule = "must be the wrench alone; otherwise give a frame"
+            raise InputError("modalities", value=self.settings.modalities, rule=rule)
+        if wrench.shape != (self.num_envs, 6):
+            raise InputError("wrench", value=wrench.shape, rule=f"must have the shape {(self.num_envs, 6)}")
+        rows = np.flatnonzero(envs)
+        return self._finished({"wrench": self._scaled("wrench", wrench[rows])}, failed[rows], rows)
+
+    def _finished(self, found: dict[str, np.ndarray], failed: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
         for name, values in found.items():
             self._check_finite(name, values, failed, rows)
         if failed.any():

@@ -276,3 +276,16 @@ def test_a_simulated_pad_is_a_setting_that_changes_no_shape() -> None:
     for _ in range(2):  # up to first touch: a step in contact takes seconds
         seen = soft.step(np.array([[0, 0, -1.0], [0, 0, 0.0]], np.float32))[0]
     assert soft.observation_space.contains(seen) and seen["sensor_wrench"][0, 2] < 0.0 == seen["sensor_wrench"][1, 2]
+
+
+def test_the_wrench_alone_is_the_wrench_that_is_seen_beside_markers() -> None:
+    both, alone = (RollBallVectorEnv(2, tactile=t, max_episode_steps=5) for t in (("markers", "wrench"), ("wrench",)))
+    seen = [env.reset(seed=0)[0]["sensor_wrench"] for env in (both, alone)]
+    pressed = False
+    for _ in range(7):
+        np.testing.assert_array_equal(seen[0], seen[1])
+        seen = [env.step(np.array([[0.2, 0, -1.0], [0, 0.1, -0.5]], np.float32))[0]["sensor_wrench"] for env in (both, alone)]
+        pressed |= bool((seen[0][:, 2] < 0.0).any())
+    assert pressed
+    with pytest.raises(InputError, match="alone"):
+        both.batch.observers["sensor"].observe_wrench(np.zeros((2, 6)), np.zeros(2, bool), np.ones(2, bool))
