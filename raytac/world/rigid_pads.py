@@ -15,7 +15,7 @@ elastic foundation, one contact is made and put among MuJoCo's own:
 MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad carries a tangential force without shearing first.
 
 All environments go in lock-step: in every step of MuJoCo the contacts of all of them are found at once, and MuJoCo is called for one after
-the other. Its own share of the time is a few per cent, so threads for it would gain nothing.
+the other, since its own share of the time is small (docs/rl.md, Speed).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -191,6 +191,8 @@ class RigidPads:
         """Where a body touches a pad; ``env`` counts the poses (n, 4, 4) given."""
         pad_from_body = _relative(world_from_pad, world_from_body)
         near = np.flatnonzero(self._is_near(pad, pad_from_body, i))
+        if not len(near):
+            return pad.overlap.none
         touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[near], self._radius[i])
         return replace(touches, env=near[touches.env])
 
