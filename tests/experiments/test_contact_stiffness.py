@@ -19,5 +19,5 @@ def test_a_ball_presses_no_stiffer_than_the_bound_says(tmp_path) -> None:
 
 
 def test_unknown_shapes_are_named() -> None:
-    with pytest.raises(InputError, match="shapes = 'cup'.*ball, face, plate"):
+    with pytest.raises(InputError, match=r"shapes = 'cup'.*ball, face, plate"):
         contact_stiffness.main(contact_stiffness.Args(shapes=("cup",)))

@@ -98,7 +98,7 @@ def test_a_stretched_beam_slips_out_snaps_back_and_comes_to_rest_where_it_was(tm
     )
     world = twist.make_world(args)
     record, _, times = twist.twist(world, args)
-    found = twist.summary(record, times)
+    found = {key: float(value) for key, value in twist.summary(record, times).items()}
     assert found["snapped"] == 1 and found["min_gap_m"] > 0.0 and found["min_det_f"] > 0.0
     assert found["longest_mm"] > 4.0 and abs(found["left_mm"]) < 0.05 and found["unconverged_steps"] == 0
     pull, normal, height = np.array(record.wrench)[:, 2], np.array(record.normal), np.array(record.tip)[:, 2]
