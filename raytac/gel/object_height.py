@@ -15,7 +15,7 @@ from raytac.gel.relief import looks_down, relief_underside
 __all__ = ["object_bounds", "object_height"]
 
 
-_NODES = 16384
+_NODES = 32768
 """Nodes of all environments that are worked on at once: what stays in a core's cache."""
 
 

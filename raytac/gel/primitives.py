@@ -81,7 +81,7 @@ def _ellipsoid(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.n
 def _cylinder(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     o, d = line_in_part(pose, x, y)
     side = _quadric(d[0] ** 2 + d[1] ** 2, o[0] * d[0] + o[1] * d[1], o[0] ** 2 + o[1] ** 2 - size[0] ** 2)
-    return _entry(pose, 2, 3) + _common(side, _slab(o[2], d[2], -size[1], size[1]))
+    return _entry(pose, 2, 3) + _common(side, _slab(pose, 2, x, y, -size[1], size[1]))
 
 
 def _capsule(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -92,8 +92,7 @@ def _capsule(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.nda
 
 
 def _box(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    o, d = line_in_part(pose, x, y)
-    return _entry(pose, 2, 3) + _common(*(_slab(o[k], d[k], -size[k], size[k]) for k in range(3)))
+    return _entry(pose, 2, 3) + _common(*(_slab(pose, k, x, y, -size[k], size[k]) for k in range(3)))
 
 
 def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -112,7 +111,7 @@ def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarra
     a = np.where(np.abs(a) > 1e-12, a, 1e-12)
     b = o[0] * d[0] + o[1] * d[1] - rho**2 * above * d[2]
     c = o[0] ** 2 + o[1] ** 2 - (rho * above) ** 2
-    slab = _slab(o[2], d[2], tangent, height)
+    slab = _slab(pose, 2, x, y, tangent, height)
     flat = _common(_quadric(np.where(a > 0.0, a, 1.0), b, c), slab)
     # Where the line is steeper than the flank it is inside before the first root (one nappe) and after the second (the other).
     root = np.sqrt(np.clip(b * b - a * c, 0.0, None))
@@ -221,12 +220,18 @@ def _quadric(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Interval:
     return _where_flat(flat, c <= 0.0, found) if flat.any() else found
 
 
-def _slab(o: np.ndarray, d: np.ndarray, low: float, high: float) -> Interval:
-    """Interval of t with low <= o + t d <= high, d (…, 1, 1)."""
+def _slab(pose: np.ndarray, k: int, x: np.ndarray, y: np.ndarray, low: float, high: float) -> Interval:
+    """Interval of t with low <= o_k + t d_k <= high; o_k is a sum of a function of x and one of y, and so are its ends."""
+    across, along = _entry(pose, 0, k) * (x - _entry(pose, 0, 3)), _entry(pose, 1, k) * (y - _entry(pose, 1, 3))
+    d = _entry(pose, 2, k)
     flat = np.abs(d) < 1e-14
-    slope = np.where(flat, 1.0, d)
-    found = (np.where(d > 0.0, low, high) - o) / slope, (np.where(d > 0.0, high, low) - o) / slope
-    return _where_flat(flat, (o >= low) & (o <= high), found) if flat.any() else found
+    inverse = 1.0 / np.where(flat, 1.0, d)
+    start = (np.where(d > 0.0, low, high) - across) * inverse - along * inverse
+    found = start, start + (high - low) * np.abs(inverse)
+    if not flat.any():
+        return found
+    o = across + along
+    return _where_flat(flat, (o >= low) & (o <= high), found)
 
 
 def _where_flat(flat: np.ndarray, inside: np.ndarray, interval: Interval) -> Interval:
@@ -236,12 +241,14 @@ def _where_flat(flat: np.ndarray, inside: np.ndarray, interval: Interval) -> Int
     return np.where(flat, always, start), np.where(flat, -always, end)
 
 
-def _common(*intervals: Interval) -> np.ndarray:
-    """Start of the intersection of intervals; inf where it is empty."""
-    start, end = intervals[0]
-    for other_start, other_end in intervals[1:]:
-        start, end = np.maximum(start, other_start), np.minimum(end, other_end)
-    return np.where(start <= end, start, np.inf)
+def _common(first: Interval, *others: Interval) -> np.ndarray:
+    """Start of the intersection of intervals, of which the first is overwritten; inf where it is empty."""
+    start, end = first
+    for other_start, other_end in others:
+        np.maximum(start, other_start, out=start)
+        np.minimum(end, other_end, out=end)
+    np.copyto(start, np.inf, where=start > end)
+    return start
 
 
 UNDERSIDES: dict[str, Underside] = {

@@ -50,6 +50,11 @@ class PadOverlap:
         self._grids = [_Nodes(gelpad, pitch) for pitch in _PITCHES]
         self.highest = self._grids[-1].highest
 
+    @property
+    def none(self) -> Touches:
+        """No overlap."""
+        return _joined([])
+
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
         """How a body at poses (B, 4, 4) overlaps the pad. ``radius`` [m] of a ball about the body's origin that holds it."""
         found: list[Touches] = []
@@ -99,17 +104,18 @@ class _Nodes:
         self.highest = float(grid.rest.max())
         # The rest surface is a sum of a function of x and one of y (``GelpadSpec.sag``), and so are its slopes.
         self.rest_x, self.rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)
+        self._rest = grid.rest
         self.slope_x, self.slope_y = np.gradient(self.rest_x, grid.x), np.gradient(self.rest_y, grid.y)
 
     def gaps(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float, below: float) -> _Gaps:
         """Gaps at poses (n, 4, 4); a body that stays ``below`` [m] above the highest gel may read inf."""
         columns, rows = (_window(line, pad_from_body[:, k, 3], radius) for k, line in enumerate((self.x, self.y)))
-        if len(columns) == len(rows) == 1:
-            x, y = self.x[columns[0]], self.y[rows[0]]
+        if columns.shape[1] == len(self.x) and rows.shape[1] == len(self.y):
+            x, y = self.x, self.y
         else:
             x, y = (np.broadcast_to(v, (len(pad_from_body), v.shape[1])) for v in (self.x[columns], self.y[rows]))
         values = object_height(parts, pad_from_body, x, y, below=self.highest + below)
-        values -= self.rest_x[columns][:, None, :] + self.rest_y[rows][:, :, None]
+        values -= self._rest if x.ndim == 1 else self.rest_x[columns][:, None, :] + self.rest_y[rows][:, :, None]
         return _Gaps(values, columns, rows, values.min(axis=(1, 2)))
 
     def measure(self, gaps: _Gaps, env: np.ndarray, chosen: np.ndarray) -> Touches:

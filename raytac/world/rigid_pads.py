@@ -191,6 +191,8 @@ class RigidPads:
         """Where a body touches a pad; ``env`` counts the poses (n, 4, 4) given."""
         pad_from_body = _relative(world_from_pad, world_from_body)
         near = np.flatnonzero(self._is_near(pad, pad_from_body, i))
+        if not len(near):
+            return pad.overlap.none
         touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[near], self._radius[i])
         return replace(touches, env=near[touches.env])
 
