@@ -15,7 +15,7 @@ from raytac.io.metrics import read_metrics
 pytest.importorskip("stable_baselines3")
 
 from experiments.play import Args, main
-from experiments.ppo_training import Learner, Recipe
+from experiments.ppo_learner import Learner, Recipe
 from experiments.training_curves import draw_curves
 
 
