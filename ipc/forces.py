@@ -13,7 +13,7 @@ from ipc.layout import Layout
 from ipc.potential import Potential
 from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
 
-__all__ = ["bond_wrench", "contact_pairs", "host", "pair_forces", "plane_forces", "rigid_motion"]
+__all__ = ["bond_wrench", "contact_pairs", "host", "pair_forces", "plane_forces", "rigid_motion", "touching"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
@@ -151,3 +151,15 @@ def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion
     momentum = np.cross(arm, np.einsum("nm,bmi->bni", mass, v - velocity[:, None])).sum(axis=1)
     spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
     return RigidMotion(total, centre, inertia, velocity, spin)
+
+
+def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:
+    """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+    found = potential.collision.contacts
+    pair = host(found.pair)
+    there = np.zeros((len(pair), len(layout.pairs)), bool)
+    env, k = np.nonzero(np.arange(pair.shape[1]) < host(found.count)[:, None])
+    there[env, pair[env, k]] = True
+    mine = np.flatnonzero((layout.pairs == body).any(axis=1) & there.any(axis=0))
+    other = layout.pairs[mine].sum(axis=1) - body
+    return {layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}

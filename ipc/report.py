@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ContactPairs", "PairForces", "RigidMotion", "StepReport", "Wrench"]
+__all__ = ["ContactPairs", "PairForces", "PatchMotion", "RigidMotion", "StepReport", "Wrench"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -101,6 +101,25 @@ class Wrench:
 
     force: Floats
     torque: Floats
+
+
+@dataclass(frozen=True)
+class PatchMotion:
+    """A patch of a bonded body that moves as a whole, in one environment, world frame (see ``ipc/patch_motion.py``).
+
+    Attributes:
+        mass: of what moves with it [kg].
+        inertia: about ``centre`` [kg m²], shape (3, 3).
+        centre: mean of its nodes [m], shape (3,).
+        velocity: of the centre [m/s] and about it [rad/s], shape (6,).
+        stiffness: that the body holds it with, about ``centre`` [N/m], [N m/rad], shape (6, 6), symmetric.
+    """
+
+    mass: float
+    inertia: Floats
+    centre: Floats
+    velocity: Floats
+    stiffness: Floats
 
 
 @dataclass(frozen=True)

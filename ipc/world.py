@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from ipc.arguments import env_mask, per_env, unit_pose
 from ipc.bodies import AffineBody, Body, HalfSpace, SoftBody
 from ipc.errors import IpcError
-from ipc.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion
+from ipc.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
 from ipc.layout import build_layout, rotation_matrix
 from ipc.newton import Newton
 from ipc.overlap import check_overlap
+from ipc.patch_motion import RestPatches
 from ipc.potential import Potential
-from ipc.report import ContactPairs, PairForces, RigidMotion, StepReport, Wrench
+from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.state import State, start_state, teleported
 
@@ -70,6 +71,7 @@ class World:
         self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
         self._newton = Newton(self._potential, self.layout, self.settings)
         self._failed = np.zeros(num_envs, bool)
+        self._patches: dict[int, RestPatches] = {}
         frames = self.layout.frame_pose
         # What the device is told before a step, kept here so that telling it costs one copy and no wait.
         self._goal_p = np.zeros((num_envs, len(frames), 3))
@@ -296,17 +298,21 @@ class World:
             raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
         return rigid_motion(self.layout, self._potential, body)
 
+    def held_patch(self, name: str, env: int) -> PatchMotion | None:
+        """The part of a bonded soft body that bore contact forces at the end of the last step, as if it moved as a whole.
+
+        None where nothing touches what is free of it. The first call for a body inverts its rest matrix.
+        """
+        body = self._index(name)
+        if not isinstance(self.bodies[body], SoftBody) or not self.layout.framed[body]:
+            raise IpcError(f"{name!r} is no soft body with bonded vertices")
+        if body not in self._patches:
+            self._patches[body] = RestPatches(self.layout, self.settings, body)
+        return self._patches[body].loaded(self._potential, env)
+
     def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
         """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
-        body = self._index(name)
-        found = self._potential.collision.contacts
-        count, pair = host(found.count), host(found.pair)
-        there = np.zeros((self.num_envs, len(self.layout.pairs)), bool)
-        env, k = np.nonzero(np.arange(pair.shape[1]) < count[:, None])
-        there[env, pair[env, k]] = True
-        mine = np.flatnonzero((self.layout.pairs == body).any(axis=1) & there.any(axis=0))
-        other = self.layout.pairs[mine].sum(axis=1) - body
-        return {self.layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}
+        return touching(self.layout, self._potential, self._index(name))
 
     # --- state -----------------------------------------------------------------------------------------------------------------
 

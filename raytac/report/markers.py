@@ -6,6 +6,7 @@ import datetime
 import math
 import time
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,8 @@ class MotionReport:
     """On held-out presses."""
     fit_errors: list[ModelError]
     """Of FOTS, and of FOTS as published, on the presses that both were fitted to."""
+    by_press: list[tuple[str, ModelError]]
+    """Of FOTS on every press, in words, under its last kind of load; those of the fit first."""
     times_ms: dict[str, float]
     """Median time of a frame of every model, at the probes."""
     probes: int
@@ -146,8 +149,12 @@ def calibrate_markers(
     grid = fit[0].surface.grid
     errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
     fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", PUBLISHED), device=device)
+    by_press = []
+    for name, group in groupby([*fit, *held_out], key=lambda frame: str(frame.press)):
+        rows, _ = model_errors(fitted, list(group), grid, models=("fots",), device=device)
+        by_press.append((name, rows[-1]))
     markers = probe_sensor(sensor).markers
-    report = MotionReport(motion, errors, fit_errors, times, markers.rows * markers.columns, held_out)
+    report = MotionReport(motion, errors, fit_errors, by_press, times, markers.rows * markers.columns, held_out)
     return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad, device)))
 
 
@@ -215,7 +222,7 @@ def error_metrics(key: str, row: ModelError) -> dict[str, Metric]:
 
 
 def error_table(report: MotionReport) -> str:
-    """Errors of every model as a Markdown table."""
+    """Errors of every model, and those of FOTS on every press, as Markdown tables."""
     lines = [
         "# Marker models against surface tracking on held-out presses",
         "",
@@ -231,4 +238,9 @@ def error_table(report: MotionReport) -> str:
             f"| {row.model} | {row.load} | {row.frames} | {1e6 * row.mean:.1f} | {1e6 * row.p95:.1f} | {moved} | {row.mean_px:.2f} | "
             f"{1e6 * row.size:.1f} | {report.times_ms[row.model]:.2f} |"
         )
+    held_out = {str(frame.press) for frame in report.held_out}
+    lines += ["", "## FOTS by press", "", "| press | | load | mean [µm] | p95 [µm] | truth [µm] |", "|---|---|---|---|---|---|"]
+    for press, row in report.by_press:
+        part = "held out" if press in held_out else "fit"
+        lines.append(f"| {press} | {part} | {row.load} | {1e6 * row.mean:.1f} | {1e6 * row.p95:.1f} | {1e6 * row.size:.1f} |")
     return "\n".join(lines) + "\n"

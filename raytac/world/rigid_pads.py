@@ -15,7 +15,7 @@ elastic foundation, one contact is made and put among MuJoCo's own:
 MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad carries a tangential force without shearing first.
 
 All environments go in lock-step: in every step of MuJoCo the contacts of all of them are found at once, and MuJoCo is called for one after
-the other. Its own share of the time is a few per cent, so threads for it would gain nothing.
+the other, since its own share of the time is small (docs/rl.md, Speed).
 """
 
 # pyright: reportAttributeAccessIssue=false
