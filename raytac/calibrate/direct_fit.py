@@ -337,11 +337,11 @@ class DirectFit:
                 damping *= 4
             if not after < cost:
                 break
-            done = cost - after < 2e-4 * cost
+            done = cost - after < 1e-4 * cost
             state, cost, damping = new, after, max(damping / 5, 1e-7)
             if tick is not None:
                 tick(state, cost)
-            if done and k > 5:
+            if done and k > 3:
                 break
         return state
 

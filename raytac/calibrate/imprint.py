@@ -53,17 +53,21 @@ def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
     return total[:, -1:] - total
 
 
-def circles_on_pad(sensor: SensorSpec, circles: np.ndarray) -> np.ndarray:
-    """x, y and radius [m] on the pad at rest of circles x, y, radius [px of the sensor's resolution], (N, 3)."""
+def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
+    """x, y and radius [m] in the pad frame of circles x, y, radius [px of the sensor's resolution], (N, 3).
+
+    A circle in the image is that of the rim, which lies about a² / 2R nearer to the camera than the pad at rest.
+    """
     camera = sensor.camera
     (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
     u, v, r = np.asarray(circles, dtype=float).T
-    z = np.zeros(len(u))
+    deep = 0.5 * (r * px) ** 2 / ball_radius
+    z = -deep
     x, y = z, z
-    for _ in range(5):  # the pixel's ray meets the dome
+    for _ in range(5):  # the pixel's ray meets the dome, moved by that depth
         x = camera.position[0] + (u - cx) * px * (1 + z / distance)
         y = camera.position[1] + (v - cy) * py * (1 + z / distance)
-        z = -sensor.gelpad.sag(x, y)
+        z = -sensor.gelpad.sag(x, y) - deep
     return np.stack([x, y, r * px * (1 + z / distance)], axis=1)
 
 
@@ -86,7 +90,7 @@ def pixel_geometry(
     flat_x, flat_y = (u - cx) * px, (v - cy) * py
     pressed = press >= 0
     if len(circles):
-        on_pad = circles_on_pad(sensor, circles)
+        on_pad = circles_on_pad(sensor, circles, ball_radius)
         share = on_pad[:, 2] / ball_radius
         heights, own = _heights(slopes, share), np.where(pressed, press, 0)
         at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
@@ -119,7 +123,7 @@ def press_surface(
     Raises:
         InputError: a contact circle as wide as its ball.
     """
-    on_pad = circles_on_pad(sensor, circles)
+    on_pad = circles_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius
     if (share >= 1).any():
         k = int(np.argmax(share))
