@@ -32,6 +32,8 @@ PRIOR = 30.0
 """Squared residual [levels²] that a deviation of one sigma is worth."""
 CIRCLE_PRIOR = 300.0
 """The same of a circle."""
+ACTIVE = 6
+"""Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
 REST_FACTOR = 8
@@ -288,7 +290,7 @@ class DirectFit:
         rest_by, rest_linear = slope(rest)
         return lit / total[0], lit / total[1], rest_by * (rest_linear - black) / total[2]
 
-    def step(self, state: FitState, damping: float) -> Callable[[float], FitState]:
+    def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""
         settings, count = self.settings, len(self.shots.circles)
         jac, rest_jac, circles, (image, rest) = self.jacobian(state)
@@ -311,24 +313,34 @@ class DirectFit:
             normal[b, :size] = weighted @ jac[a]
             normal[:size, b] = normal[b, :size].T
             slope[b] = weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / CIRCLE_SIGMA**2
-        bounds = self.inside_bounds(self.at(x - 1e-9 * np.sign(slope[:size]), state.circles))
-        stuck = np.abs(self.flat(bounds) - (x - 1e-9 * np.sign(slope[:size]))) > 1e-12
-        move = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])
+        pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
+        stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
+        movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])
 
         def trial(damping: float) -> FitState:
             damped = normal + np.diag(damping * np.diag(normal))
-            change = np.zeros(n)
-            change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move])
+            change, move = np.zeros(n), movable.copy()
+            # What would leave its bounds is put there, and the others are solved for once more: a cut step alone is no step downhill.
+            for _ in range(ACTIVE):
+                fixed = damped[np.ix_(move, ~move)] @ change[~move]
+                change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move] - fixed)
+                wanted = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
+                allowed = self.inside_bounds(wanted)
+                over = move[:size] & (np.abs(self.flat(allowed) - self.flat(wanted)) > 1e-12)
+                if not over.any():
+                    break
+                change[:size][over] = (self.flat(allowed) - x)[over]
+                move[:size] &= ~over
             return self.inside_bounds(self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3)))
 
         return trial
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
         """Levenberg and Marquardt's method from ``state``; ``tick`` is told every accepted state and its cost."""
-        damping, state = 1e-2, self.inside_bounds(state)
+        damping, state, slow = 1e-2, self.inside_bounds(state), 0
         cost = self.cost(state, self.residuals(state))
-        for k in range(iterations):
-            trial = self.step(state, damping)
+        for _ in range(iterations):
+            trial = self.step(state)
             while True:
                 new = trial(damping)
                 after = self.cost(new, self.residuals(new))
@@ -337,11 +349,11 @@ class DirectFit:
                 damping *= 4
             if not after < cost:
                 break
-            done = cost - after < 1e-4 * cost
+            slow = slow + 1 if cost - after < 1e-4 * cost else 0
             state, cost, damping = new, after, max(damping / 5, 1e-7)
             if tick is not None:
                 tick(state, cost)
-            if done and k > 3:
+            if slow == 4:
                 break
         return state
 
