@@ -24,7 +24,17 @@ from raytac.specs import LightsSpec, SensorSpec
 
 __all__ = ["DirectFit", "FitSettings", "FitState", "Light"]
 
-SIGMA = {"place": 4.0, "aim": 0.6, "lobe": 2.0, "power": 2.0, "glow": 0.5, "gamma": 0.5, "stray": 0.5, "vignette": 0.5, "slope": 0.15}
+SIGMA = {
+    "place": 4.0,
+    "aim": 0.6,
+    "lobe": 2.0,
+    "power": 2.0,
+    "glow": 0.5,
+    "gamma": 0.5,
+    "stray": 0.5,
+    "vignette": 0.5,
+    "slope": 0.15,
+}
 """How far a parameter is believed to be from its start: mm, rad, 1, full scales (own channel), …"""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5])
 """How far [px] a contact circle is believed to be from its label: x, y, radius."""
@@ -129,7 +139,9 @@ class DirectFit:
     def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
         """Light at what ``seen`` gives, at the same pixels at rest and over the image at rest."""
         geometries = (seen, self.flat_geometry, self.rest_geometry)
-        return Light(*(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE).light for led in p.leds]) for g in geometries))
+        return Light(
+            *(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE).light for led in p.leds]) for g in geometries)
+        )
 
     def _led_layers(self, p: LightParameters, seen: PixelGeometry, direct: list[np.ndarray]) -> np.ndarray:
         """(L, M, 3): direct light of every LED and the even glow that goes with it."""
@@ -187,13 +199,11 @@ class DirectFit:
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
         reach = 0.02 + _reach(p.template, leds)
         floor = 1e3 * self.sensor.case.floor_z
-        leds[:, :3] = np.clip(leds[:, :3], reach + [-half[0], -half[1], floor], [*half, CEILING] - reach)
+        leds[:, :3] = np.clip(leds[:, :3], reach + np.array([-half[0], -half[1], floor]), np.array([*half, CEILING]) - reach)
         response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
         a1 = np.clip(response[4], -2.0, 0.5)
         response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
-        changed = dataclasses.replace(
-            p, leds=leds, power=np.maximum(p.power, 0), glow=np.maximum(p.glow, 0), response=response
-        )
+        changed = dataclasses.replace(p, leds=leds, power=np.maximum(p.power, 0), glow=np.maximum(p.glow, 0), response=response)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)

@@ -26,16 +26,18 @@ REFERENCE_DISTANCE = 10e-3
 
 @dataclass(frozen=True)
 class LightParameters:
-    """``leds`` (L, 6): x, y, z [mm], azimuth, elevation [rad], lobe. ``power`` (L, 3): what a coat at ``REFERENCE_DISTANCE`` that faces the
-    LED reflects by the diffuse lobe, in full scales. ``glow`` (3,): even irradiance from the case over that of the LED at that distance, for the LEDs
-    of each layer in ``CHANNELS``. ``response`` (6,): gamma, stray light of each channel over that of its darkest background pixel, a₁ and a₂
-    of the vignette 1 + a₁r² + a₂r⁴. ``template``: the light file that names, layers and sizes come from."""
+    """What a fit varies of lights and camera, as arrays."""
 
     template: LightsSpec
+    """The light file that names, layers and sizes come from."""
     leds: np.ndarray
+    """(L, 6): x, y, z [mm], azimuth, elevation [rad], lobe."""
     power: np.ndarray
+    """(L, 3): what a coat at ``REFERENCE_DISTANCE`` that faces the LED reflects by its diffuse lobe, in full scales."""
     glow: np.ndarray
+    """(3,): even irradiance from the case over that of the LED at that distance, for the LEDs of each layer of ``CHANNELS``."""
     response: np.ndarray
+    """(6,): gamma, stray light of each channel over that of its darkest background pixel, a₁ and a₂ of the vignette 1 + a₁r² + a₂r⁴."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -96,9 +98,7 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
     """The sensor with fitted lights and response; ``background`` [levels] as for ``LightParameters.of``. Not checked."""
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
-    response = dataclasses.replace(
-        sensor.response, gamma=gamma, black_level=tuple(map(float, black)), vignetting=(a1, a2, 0.0)
-    )
+    response = dataclasses.replace(sensor.response, gamma=gamma, black_level=tuple(map(float, black)), vignetting=(a1, a2, 0.0))
     return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 

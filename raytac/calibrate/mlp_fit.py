@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -48,7 +49,7 @@ def fit_mlp(
     x = np.stack(inputs(np, *slopes, u, v, view_slope(sensor)), axis=1).astype(np.float32)
     target = target.astype(np.float32)
     sizes = (INPUTS, *HIDDEN, 3)
-    matrices = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+    matrices = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in itertools.pairwise(sizes)]
     matrices[-1] *= 0.1
     values = matrices + [np.zeros(b, np.float32) for b in sizes[1:]]
     count, first, second, step = len(matrices), [0 * w for w in values], [0 * w for w in values], 0

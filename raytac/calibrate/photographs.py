@@ -26,9 +26,7 @@ class Photographs:
     radius: np.ndarray
 
     def take(self, index: np.ndarray) -> Photographs:
-        return dataclasses.replace(
-            self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index]
-        )
+        return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
 
     def shrunk(self, factor: int) -> Photographs:
         """Mean of every ``factor`` × ``factor`` pixels."""

@@ -22,7 +22,8 @@ GRID_PITCH = 0.06e-3
 
 @dataclass(frozen=True)
 class PressSamples:
-    """One row a pixel that moved: press, row and column (K,), slopes of the displacement (K,), difference from the background [levels] (K, 3)."""
+    """One row a pixel that moved: press, row, column and slopes of the displacement, each (K,), and
+    the difference from the background [levels], (K, 3)."""
 
     press: np.ndarray
     row: np.ndarray

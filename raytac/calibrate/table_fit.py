@@ -11,10 +11,10 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["N_BINS", "fit_table"]
 
-N_BINS = 125
-"""Bins of the slope's magnitude, and of its direction (upstream: 125)."""
-NEIGHBOURS, RIDGE = 0.3, 1e-3
-"""As in ``BakeSettings``; the ridge is ten times that of a baked table, since photographs are few and noisy."""
+N_BINS = 60
+"""Bins of the slope's magnitude, and of its direction. Upstream has 125; with 20 presses of a Mini half as many leave out fewer places."""
+NEIGHBOURS, RIDGE = 1.0, 1e-4
+"""As in ``BakeSettings``, but the eight bins around count as much as the bin itself: photographs are few."""
 _PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
 
 

@@ -1,11 +1,12 @@
 """A small network from slope and place to colour: its inputs, its arithmetic, its file.
 
 Zhao, Qian, Duan and Luo, FOTS (RA-L 2024), map normal and position to colour by a network of three hidden layers of 32; Si et al.,
-DiffTactile (ICLR 2024), give it positions in a frequency code and the direction of view. Here its inputs are
+DiffTactile (ICLR 2024), give theirs positions in a frequency code and the direction of view. Here the inputs are
 
-    n_x, n_y, n_z of the surface −displacement, u, v and sin, cos(π u), (π v), (2 π u), (2 π v), and x, y of the unit view direction,
+    3 (n_x, n_y, 1 − n_z), 0.3 (u, v), 0.03 (sin, cos) of π u, π v, 2 π u and 2 π v, 0.3 (x, y) of the unit view direction,
 
-with u, v in [−1, 1] over the image, ReLU between layers, and its output is the difference from the image at rest over ``LEVELS``. What it
+with n the normal of the surface −displacement and u, v in [−1, 1] over the image; the factors hold a network back from learning places by
+heart where presses are few. Between layers stands ReLU, and the output is the difference from the image at rest over ``LEVELS``. What it
 says of a pixel that has not moved is taken off, so that the image at rest is the background exactly.
 """
 
@@ -53,7 +54,8 @@ def inputs(ops: Any, slope_x: Any, slope_y: Any, u: Any, v: Any, view: tuple[flo
     tx, ty = view[0] * u, view[1] * v
     wz = 1 / ops.sqrt(tx * tx + ty * ty + 1)
     codes = [f(k * np.pi * w) for k in (1, 2) for w in (u, v) for f in (ops.sin, ops.cos)]
-    return [slope_x * nz, slope_y * nz, nz, u, v, *codes, tx * wz, ty * wz]
+    normal = [3 * slope_x * nz, 3 * slope_y * nz, 3 * (1 - nz)]
+    return [*normal, *(0.3 * w for w in (u, v)), *(0.03 * c for c in codes), 0.3 * tx * wz, 0.3 * ty * wz]
 
 
 def forward(ops: Any, weights: MlpWeights, x: list[Any]) -> list[Any]:

@@ -176,7 +176,7 @@ class LedSpec:
     power: Vec3
     """Intensity on the axis per camera channel (linear R, G, B) [W/sr, relative]: point-light equivalent at n and size."""
     glow: float = 0.0
-    """Even radiance of the case's walls and floor over ``power`` [1/m²]: light of this LED that gel and housing have scattered many times."""
+    """Even radiance of the case's walls and floor over ``power`` [1/m²]: light of this LED that gel and housing scattered many times."""
 
     @property
     def edges(self) -> tuple[Vec3, Vec3]:

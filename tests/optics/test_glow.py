@@ -18,7 +18,10 @@ GLOW = np.array([3e2, 0.0, 2e3])
 
 
 def glowing(spec: SensorSpec, glow: np.ndarray = GLOW) -> SensorSpec:
-    leds = tuple(dataclasses.replace(led, glow=float(g)) for led, g in zip(spec.lights.leds, np.resize(glow, len(spec.lights.leds)), strict=True))
+    leds = tuple(
+        dataclasses.replace(led, glow=float(g))
+        for led, g in zip(spec.lights.leds, np.resize(glow, len(spec.lights.leds)), strict=True)
+    )
     return dataclasses.replace(spec, lights=dataclasses.replace(spec.lights, leds=leds))
 
 
@@ -26,7 +29,9 @@ def glowing(spec: SensorSpec, glow: np.ndarray = GLOW) -> SensorSpec:
 def test_a_flat_coat_shows_albedo_times_glow(tracer: Build, integrator: str) -> None:
     """A flat pad sees nothing but case, so E = π G and L = ρ G; LEDs look away and the case reflects nothing."""
     mini = glowing(like_a_mini())
-    leds = tuple(dataclasses.replace(led, axis=(0.0, 0.0, -1.0), position=(*led.position[:2], -15e-3)) for led in mini.lights.leds)
+    leds = tuple(
+        dataclasses.replace(led, axis=(0.0, 0.0, -1.0), position=(*led.position[:2], -15e-3)) for led in mini.lights.leds
+    )
     spec = dataclasses.replace(
         mini,
         lights=dataclasses.replace(mini.lights, leds=leds),
@@ -34,7 +39,11 @@ def test_a_flat_coat_shows_albedo_times_glow(tracer: Build, integrator: str) -> 
         case=dataclasses.replace(mini.case, reflectance=0.0),
         gelpad=dataclasses.replace(mini.gelpad, dome_radius=(np.inf, np.inf)),
     )
-    light = total(tracer(spec, integrator=integrator, spp=256 if integrator != "fast" else None, resolution=(16, 12)).render_layers(GelSurface.at_rest(grid_of(spec))))[0]
+    light = total(
+        tracer(spec, integrator=integrator, spp=256 if integrator != "fast" else None, resolution=(16, 12)).render_layers(
+            GelSurface.at_rest(grid_of(spec))
+        )
+    )[0]
     expected = np.array(spec.coat.reflectance) * sum(led.glow * np.array(led.power) for led in leds)
     # LEDs hide a little of the case, the outermost pixels see its edge; the sampled images have noise.
     np.testing.assert_allclose(light.mean((0, 1)), expected, rtol=0.02)
