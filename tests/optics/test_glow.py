@@ -25,6 +25,11 @@ def glowing(spec: SensorSpec, glow: np.ndarray = GLOW) -> SensorSpec:
     return dataclasses.replace(spec, lights=dataclasses.replace(spec.lights, leds=leds))
 
 
+def binned(image: np.ndarray) -> np.ndarray:
+    height, width, _ = image.shape
+    return image.reshape(height // 4, 4, width // 4, 4, 3).mean(axis=(1, 3))
+
+
 @pytest.mark.parametrize("integrator", ["fast", "reference", "path"])
 def test_a_flat_coat_shows_albedo_times_glow(tracer: Build, integrator: str) -> None:
     """A flat pad sees nothing but case, so E = π G and L = ρ G; LEDs look away and the case reflects nothing."""
@@ -57,5 +62,6 @@ def test_fast_agrees_with_reference_on_an_imprint(tracer: Build) -> None:
     expected, actual = total(sampled.render_layers(pressed))[0], total(tracer(spec).render_layers(pressed))[0]
     dark = total(tracer(glowing(spec, np.zeros(3))).render_layers(pressed))[0]
     assert dark.mean() < 0.9 * actual.mean(), "the glow must matter"
-    apart = np.abs(actual - expected).mean() / expected.mean()
-    assert apart < 0.02, f"{apart:.2%} of the mean radiance apart"
+    # A square of 4 × 4 pixels has a quarter of a pixel's noise.
+    apart = np.abs(binned(actual) - binned(expected)).mean() / expected.mean()
+    assert apart < 0.015, f"{apart:.2%} of the mean radiance apart"
