@@ -1,7 +1,7 @@
 """How long do markers take? 99 dots on a pressed pad, by model and by number of environments.
 
     python experiments/bench_markers.py --out runs/bench_markers
-    python experiments/bench_markers.py --device cuda --envs 1,64,1024
+    python experiments/bench_markers.py --device cuda --envs 1,64,1024 --models fots
 
 A frame is everything from a surface to displacements in metres and pixels: sampling the contact, following the object since first touch,
 the model, height and projection. The press is a ball of 4 mm radius, sheared and turned, on the pattern of 9 x 11; surfaces are given, as
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
@@ -33,6 +33,7 @@ from raytac.report.machine import machine
 from raytac.specs import MarkerMotionSpec, PunchSpec, SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
+MODELS = (*MARKER_MODELS, PUBLISHED)
 NAMES = {"surface": "surface_markers"}
 """Model to the first word of its keys, where that differs."""
 
@@ -45,6 +46,8 @@ class Args(CommonOptions):
     """Sensor with markers."""
     envs: str = "1,64"
     """Numbers of environments, joined by commas."""
+    models: str = ",".join(MODELS)
+    """Models, joined by commas."""
     frames: int = 200
     """Frames of one environment that are timed, after a tenth as many to warm up; batches time fewer."""
 
@@ -105,18 +108,22 @@ def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Ar
 
 def main(args: Args) -> int:
     begin = time.perf_counter()
-    counts = [int(e) for e in args.envs.split(",")]
-    if min(counts) < 1 or args.frames < 1:
-        print(f"--envs {args.envs} --frames {args.frames}: both must be at least 1", file=sys.stderr)
-        return 2
+    texts, models = args.envs.split(","), args.models.split(",")
+    if not all(text.strip().isdecimal() and int(text) for text in texts):
+        raise InputError("envs", value=args.envs, rule="must be whole numbers >= 1, joined by commas")
+    for model in models:
+        if model not in MODELS:
+            raise InputError("models", value=model, rule="must be known marker models, joined by commas", choices=MODELS)
+    if args.frames < 1:
+        raise InputError("frames", value=args.frames, rule="must be at least 1")
     sensor = load_sensor(args.sensor)
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
         motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
         sensor = replace(sensor, marker_motion=motion)
     metrics: dict[str, Metric] = {}
-    for envs in counts:
+    for envs in map(int, texts):
         surfaces = pressed(sensor, envs)
-        for model in (*MARKER_MODELS, PUBLISHED):
+        for model in models:
             times, device = measure(model, sensor, surfaces, args)
             key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
             metrics |= {

@@ -2,11 +2,16 @@
 
     python experiments/bench_rl.py --out runs/bench_rl
     python experiments/bench_rl.py --envs 16 --modes fots,table32 --steps 40
+    python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
 
 Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``table32`` (32 x 32 images of the Taxim table), ``raytrace64``
 (64 x 64 ray-traced images). The policy is the multilayer perceptron of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
 a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
 policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
+
+``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
+heights are on the device when the clock starts; cut, difference to rest and hand-over to PyTorch (DLPack) are in the time, and the image
+stays where it is. ``numpy_frames_per_s`` is what the same costs with arrays of the host. Modes: ``table`` and ``raytrace``.
 """
 
 from __future__ import annotations
@@ -23,11 +28,16 @@ import tyro
 from raytac.device import resolve_device
 from raytac.envs.push_cube import PushCubeVectorEnv
 from raytac.errors import RaytacError
+from raytac.gel.elastic import ElasticSurround
+from raytac.gel.object_height import object_height
+from raytac.gel.part import primitive
+from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.observe import ObservationSettings
+from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.observe import ObservationSettings, TactileObserver, as_tensors
 from raytac.report.machine import machine
+from raytac.sensor import TactileSensor
 
 MODES: dict[str, ObservationSettings | None] = {
     "none": None,
@@ -37,28 +47,45 @@ MODES: dict[str, ObservationSettings | None] = {
 }
 
 
+FRAMES = {"table": "taxim", "raytrace": "raytrace"}
+"""Optical mode of each."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Args(CommonOptions):
     """Time steps of vectors of environments."""
 
     envs: int = 16
     """Number of environments."""
-    modes: str = "fots,table32,raytrace64"
-    """What is observed, joined by commas."""
+    modes: str = ""
+    """What is observed, joined by commas; all but ``none`` if empty."""
     steps: int = 60
-    """Steps that are timed, after a third as many to press the pad on."""
+    """Steps, or calls with ``--frames``, that are timed, after a third as many to press the pad on or to record the kernels."""
+    frames: bool = False
+    """Images a second instead of environment steps."""
+    size: str = "320x240"
+    """Of these images."""
+    sensor: str = "gelsight_mini"
+    """That makes them."""
 
 
 def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
     start = time.perf_counter()
-    names = parse_names(args.modes, "modes", tuple(MODES))
-    found: dict[str, Metric] = {"device": resolve_device(args.device), "envs": args.envs, "steps": args.steps, **machine()}
+    known = tuple(FRAMES) if args.frames else tuple(MODES)
+    names = parse_names(args.modes or ",".join(name for name in known if name != "none"), "modes", known)
+    device = resolve_device(args.device)
+    parse_resolution(args.size)
+    found: dict[str, Metric] = {"device": device, "envs": args.envs, "steps": args.steps, **machine()}
     with result_folder(args.out or Path("runs/bench_rl"), ("metrics.json",)) as folder:
         for name in names:
-            found |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
-            shown = found[f"push.{name}.env_steps_per_s"]
-            print(f"{name}: {shown:.0f} environment steps/s")
+            if args.frames:
+                where = "gpu" if device == "cuda" else "cpu"
+                found |= {f"{where}.{name}.{key}": value for key, value in frames(FRAMES[name], args).items()}
+                print(f"{name}: {found[f'{where}.{name}.frames_per_s']:.0f} frames/s")
+            else:
+                found |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
+                print(f"{name}: {found[f'push.{name}.env_steps_per_s']:.0f} environment steps/s")
         found |= {
             "experiment": "bench_rl",
             "seed": args.seed,
@@ -99,6 +126,69 @@ def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
         "pressed": float(np.mean(pressed)),
         **found,
     }
+
+
+def frames(optics: str, args: Args) -> dict[str, Metric]:
+    """Keys of one optical mode with ``--frames``."""
+    from raytac.observe.device_images import DeviceImages
+
+    settings = ObservationSettings(("rgb",), resolution=args.size, optics=optics, difference=True)
+    observer = TactileObserver(args.sensor, settings, num_envs=args.envs, seed=args.seed)
+    sensor = observer.make_sensor(device=args.device)
+    images = DeviceImages(observer, sensor)
+    surfaces = [pressed_pads(sensor, args.envs, args.seed + k) for k in range(3)]
+    inputs = [images.upload(surface) for surface in surfaces]
+    pytorch = versions(["torch"]).get("versions.torch", "not installed, so not handed over")
+    hand_over = as_tensors if pytorch[0].isdigit() else dict
+    spent: dict[str, list[float]] = {"": [], "numpy_": []}
+    for step in range(args.steps // 3 + args.steps):
+        begin = time.perf_counter()
+        hand_over(images.observe(*inputs[step % 3]))
+        done = time.perf_counter()
+        if step >= args.steps // 3:
+            spent[""].append(done - begin)
+    for step in range(2 + max(args.steps // 8, 3)):
+        begin = time.perf_counter()
+        observer.observe(sensor.update(surfaces[step % 3]), sensor)
+        if step >= 2:
+            spent["numpy_"].append(time.perf_counter() - begin)
+    found: dict[str, Metric] = {
+        "pads": args.envs,
+        "size": args.size,
+        "pytorch": pytorch,
+        "touched_share": touched_share(surfaces),
+    }
+    for name, times in spent.items():
+        found[f"{name}frames_per_s"] = args.envs / float(np.median(times))
+        found[f"{name}call_ms"] = 1e3 * float(np.median(times))
+        found[f"{name}call_ms_p90"] = 1e3 * float(np.percentile(times, 90))
+    return found
+
+
+def pressed_pads(sensor: TactileSensor, count: int, seed: int) -> GelSurface:
+    """Pads into which balls of 3 to 8 mm and boxes are pressed by 0.2 to 1 mm at random places; the gel as the rigid pad shows it."""
+    rng, grid = np.random.default_rng(seed), sensor.grid
+    gel, low = ElasticSurround(grid), float(grid.rest.min())
+    height = np.full((count, *grid.shape), np.inf)
+    for b in range(count):
+        if b % 2:
+            radius = rng.uniform(3e-3, 8e-3)
+            part, reach = primitive("sphere", (radius,)), radius
+        else:
+            half = tuple(rng.uniform(1e-3, 4e-3, 3))
+            part, reach = primitive("box", half), half[2]
+        pose = np.eye(4)
+        angle = rng.uniform(-np.pi, np.pi)
+        pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose[:2, 3] = rng.uniform(-5e-3, 5e-3, 2)
+        pose[2, 3] = reach - rng.uniform(2e-4, 1e-3) + 0.2 * low  # the dome falls away from its middle
+        height[b] = object_height([part], pose[None], grid.x, grid.y)[0]
+    return gel.surface(height)
+
+
+def touched_share(surfaces: list[GelSurface]) -> float:
+    """Share of the pads that are touched at all."""
+    return float(np.mean([surface.contact.any(axis=(1, 2)).mean() for surface in surfaces]))
 
 
 class Policy:

@@ -98,7 +98,7 @@ def make_world(args: Args) -> TactileWorld:
     scene = load_task(args.scene)
     opening = float(scene.body(BEAM).params["width"]) + 2e-3 * args.gap_mm
     scene = replace(scene, robot=replace(scene.robot, opening=opening))
-    # One-way: the gripper is a positioner, and what moves it is known; docs/coupling.md says what two-way would drag at a held body.
+    # One-way: the gripper is a positioner, and what moves it is known.
     return TactileWorld(
         scene, physics="ipc", pad=args.pad, coupling="one_way", outputs=("wrench",), device=args.device, seed=args.seed
     )

@@ -12,7 +12,7 @@ from ipc.bodies import AffineBody, HalfSpace, KinematicBody, Pose, SoftBody, ver
 from ipc.errors import IpcError, OverlapError, SolverError
 from ipc.materials import Material, Stiff
 from ipc.meshes import Cut, TetMesh, TriMesh, box_mesh, box_surface, domed_pad, graded, icosphere
-from ipc.report import ContactPairs, RigidMotion, StepReport, Wrench
+from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.tetwild import tetrahedralize
 
@@ -29,6 +29,8 @@ __all__ = [
     "KinematicBody",
     "Material",
     "OverlapError",
+    "PairForces",
+    "PatchMotion",
     "Pose",
     "RigidMotion",
     "Settings",

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ipc.errors import OverlapError
 from ipc.layout import Layout, rotation_matrix
+from ipc.state import State
 
-__all__ = ["find_overlap", "world_vertices"]
+__all__ = ["check_overlap", "find_overlap", "world_vertices"]
 
 Floats = NDArray[np.float64]
 
@@ -111,3 +113,20 @@ def find_overlap(layout: Layout, y: Floats, rotation: Floats, position: Floats) 
                 if _is_closed(faces) and _contains(x, faces, x[layout.vert_start[inner]]):
                     return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}: start with the surfaces apart"
     return None
+
+
+def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None:
+    """Refuse surfaces that cross in the environments of the mask; those that look alike are checked once.
+
+    Raises:
+        OverlapError: names the environment and the surfaces.
+    """
+    seen: set[bytes] = set()
+    for env in np.flatnonzero(mask):
+        key = state.y[env].tobytes() + state.frame_rotation[env].tobytes() + state.frame_position[env].tobytes()
+        if key in seen or state.failed[env] or not np.isfinite(state.y[env]).all():
+            continue
+        seen.add(key)
+        found = find_overlap(layout, state.y[env], state.frame_rotation[env], state.frame_position[env])
+        if found is not None:
+            raise OverlapError(f"environment {env}: {found}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ContactPairs", "RigidMotion", "StepReport", "Wrench"]
+__all__ = ["ContactPairs", "PairForces", "PatchMotion", "RigidMotion", "StepReport", "Wrench"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -76,6 +76,21 @@ class ContactPairs:
 
 
 @dataclass(frozen=True)
+class PairForces:
+    """What the first of two bodies bears from the second, world frame.
+
+    Attributes:
+        normal: sum of the normal forces [N], shape (B, 3).
+        place: where they act in the mean [m], shape (B, 3); NaN where the two do not touch.
+        wrench: all forces, friction included [N], and their torque about ``place`` [N m], shape (B, 6).
+    """
+
+    normal: Floats
+    place: Floats
+    wrench: Floats
+
+
+@dataclass(frozen=True)
 class Wrench:
     """Force and torque on a body, world frame.
 
@@ -86,6 +101,25 @@ class Wrench:
 
     force: Floats
     torque: Floats
+
+
+@dataclass(frozen=True)
+class PatchMotion:
+    """A patch of a bonded body that moves as a whole, in one environment, world frame (see ``ipc/patch_motion.py``).
+
+    Attributes:
+        mass: of what moves with it [kg].
+        inertia: about ``centre`` [kg m²], shape (3, 3).
+        centre: mean of its nodes [m], shape (3,).
+        velocity: of the centre [m/s] and about it [rad/s], shape (6,).
+        stiffness: that the body holds it with, about ``centre`` [N/m], [N m/rad], shape (6, 6), symmetric.
+    """
+
+    mass: float
+    inertia: Floats
+    centre: Floats
+    velocity: Floats
+    stiffness: Floats
 
 
 @dataclass(frozen=True)

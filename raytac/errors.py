@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "AssetError",
@@ -43,6 +45,10 @@ class InputError(RaytacError, ValueError):
         self.rule = rule
         self.choices = tuple(choices)
         super().__init__(f"{name} = {short_repr(value)}: {rule}{_choices_text(value, self.choices)}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Made anew from its parts, so that it comes whole from another process."""
+        return partial(type(self), value=self.value, rule=self.rule, choices=self.choices), (self.name,)
 
 
 class OverlapError(RaytacError, ValueError):

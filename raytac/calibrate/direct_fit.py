@@ -291,7 +291,7 @@ class DirectFit:
         gamma, *stray, _, _ = p.response
         black = np.array(stray) * self.darkest**gamma
 
-        def slope(levels: np.ndarray) -> np.ndarray:
+        def slope(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             linear = np.maximum((np.maximum(levels, 0.1) / 255) ** gamma, 1e-6)
             return levels / gamma / linear, linear
 

@@ -95,7 +95,13 @@ def pixel_geometry(
         heights, own = _heights(slopes, share), np.where(pressed, press, 0)
         at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
     else:
-        heights, own, at, a, a_share = np.zeros((1, len(_TABLE))), np.zeros(len(u), int), np.zeros((len(u), 2)), 1.0, 0.0
+        heights, own, at, a, a_share = (
+            np.zeros((1, len(_TABLE))),
+            np.zeros(len(u), int),
+            np.zeros((len(u), 2)),
+            np.ones(len(u)),
+            np.zeros(len(u)),
+        )
     z = np.zeros(len(u))
     x, y, dx, dy, t = flat_x, flat_y, z, z, z
     for _ in range(6):

@@ -43,16 +43,18 @@ def fit_mlp(
     flat = round(FLAT * len(chosen))
     column = np.concatenate([samples.column[chosen], rng.integers(width, size=flat)])
     row = np.concatenate([samples.row[chosen], rng.integers(height, size=flat)])
-    slopes = [np.concatenate([s[chosen], np.zeros(flat)]) for s in (samples.slope_x, samples.slope_y)]
+    slope_x, slope_y = (np.concatenate([s[chosen], np.zeros(flat)]) for s in (samples.slope_x, samples.slope_y))
     target = np.concatenate([samples.difference[chosen], np.zeros((flat, 3))]) / LEVELS
     u, v = (column + 0.5) * (2 / width) - 1, (row + 0.5) * (2 / height) - 1
-    x = np.stack(inputs(np, *slopes, u, v, view_slope(sensor)), axis=1).astype(np.float32)
+    x = np.stack(inputs(np, slope_x, slope_y, u, v, view_slope(sensor)), axis=1).astype(np.float32)
     target = target.astype(np.float32)
     sizes = (INPUTS, *HIDDEN, 3)
-    matrices = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in itertools.pairwise(sizes)]
+    matrices: list[np.ndarray] = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in itertools.pairwise(sizes)]
     matrices[-1] *= 0.1
-    values = matrices + [np.zeros(b, np.float32) for b in sizes[1:]]
-    count, first, second, step = len(matrices), [0 * w for w in values], [0 * w for w in values], 0
+    values: list[np.ndarray] = matrices + [np.zeros(b, np.float32) for b in sizes[1:]]
+    count, step = len(matrices), 0
+    first: list[np.ndarray] = [0 * w for w in values]
+    second: list[np.ndarray] = [0 * w for w in values]
     steps = EPOCHS * -(-len(x) // BATCH)
     for epoch in range(EPOCHS):
         order = rng.permutation(len(x))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +25,12 @@ class CalibrateArgs(SolverOptions):
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
-    out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR.
+    out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
 
     With `markers`: press the simulated pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
     sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model against surface tracking on presses that
-    the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick.
-
-    An error or Ctrl-C leaves the folder as it was.
+    the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error
+    or Ctrl-C leaves these files as they were; presses that are finished stay in presses/, and the same command goes on from there.
     """
 
     what: Annotated[str, tyro.conf.Positional]
@@ -66,9 +66,16 @@ class CalibrateArgs(SolverOptions):
         self.prepare_solver("calibrate markers")
         name = sensor.name + ("-quick" if self.quick else "")
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
-        for path in run_calibrate_markers(
-            sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
-        ):
+        try:
+            written = run_calibrate_markers(
+                sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
+            )
+        except KeyboardInterrupt:
+            print(
+                f"raytac: interrupted; finished presses are kept in {out}, the same command goes on from there", file=sys.stderr
+            )
+            return 130
+        for path in written:
             print(path)
         return 0
 

@@ -17,11 +17,10 @@ class BalancePole(Task):
 
     scene: ClassVar = "balance_pole"
     body: ClassVar = "pole"
-    motion: ClassVar = Motion(
-        ("x", "y", "rx", "ry"), (4e-3, 4e-3, 0.02, 0.02), (0.35, -0.10, 0.55), (0.55, 0.10, 0.55), leash=0.02, turn=0.2
-    )
+    motion: ClassVar = Motion(("x", "y"), (2e-3, 2e-3), (0.35, -0.10, 0.55), (0.55, 0.10, 0.55), leash=0.02)
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = False
+    tactile: ClassVar = ("markers", "wrench")
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
         # It leans about an edge of its foot, which stays a hair above the pad.
@@ -54,19 +53,22 @@ class BalancePoleEnv(TactileEnv):
     `balance_pole`). Nothing but friction holds its foot, and it falls by itself once it
     leans by more than about 1°.
 
-    Action, Box(-1, 1, (4,)): what the target of the pad moves along world x and y (4 mm a step at 1) and turns about world x and y
-    (0.02 rad); the target leads the pad by at most 20 mm along an axis, stays in x 0.35 to 0.55, y ±0.10 m and turns by at most 0.2 rad.
+    Action, Box(-1, 1, (2,)): what the target of the pad moves along world x and y (2 mm a step at 1); the target leads the pad by at most
+    20 mm along an axis and stays in x 0.35 to 0.55, y ±0.10 m.
 
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 
     Observations, float32:
 
-    - `state` (13,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
-      last action (4);
+    - `state` (11,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+      last action (2);
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
     - `body` (15,): of the pole, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); only with `body_seen=True`: without it the pole is known by touch alone;
-    - `sensor_markers` (192, 2): displacements of the markers / 1 mm. `tactile=` adds or takes (docs/rl.md).
+    - `sensor_markers` (192, 2): displacements of the markers / 1 mm, which show where the pole stands. `tactile=` adds or takes
+      (docs/rl.md);
+    - `sensor_wrench` (6,): force on the pad / 10 N and torque / 0.1 N m. A thin rod that pivots on its foot pushes it aside with
+      3/4 m g θ (for small θ), less what the pad's own acceleration asks for: the last three steps tell the lean.
 
     Reward, sum of (in `info["reward_terms"]`); all but the last two are Isaac Lab's Cartpole with the tool as the cart:
 

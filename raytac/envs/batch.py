@@ -13,6 +13,7 @@ import numpy as np
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.errors import InputError
+from raytac.gel.batch import rounded_envs
 from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver
 from raytac.robots.pose import pose_error
@@ -59,7 +60,7 @@ class TaskBatch:
         num_envs: int = 1,
         physics: str | None = None,
         pad: str | None = None,
-        tactile: ObservationSettings | Sequence[str] | str | None = ("markers",),
+        tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
         action: str = "pose",
         randomization: Randomization | None = None,
@@ -75,7 +76,8 @@ class TaskBatch:
             task: what is played.
             num_envs: number of environments B.
             physics, pad, device: as of ``TactileWorld``.
-            tactile: what is observed of every sensor: settings, or modalities alone; None leaves touch out, and nothing of it is computed.
+            tactile: what is observed of every sensor: settings, or modalities alone; "task" is as the task has it; None leaves touch out,
+                and nothing of it is computed.
             body_seen: whether the body's pose and velocity are observed; None is as the task has it.
             action: one of ``ACTIONS``.
             randomization: of sensors and cameras; None is none.
@@ -94,7 +96,7 @@ class TaskBatch:
         if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
             raise InputError("max_episode_steps", value=steps, rule="must be a whole number >= 1")
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, int(steps)
-        settings = _settings(tactile)
+        settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
         probe = TactileObserver(loaded.robot.sensor, settings, num_envs=num_envs, randomization=randomization, seed=seed)
@@ -154,8 +156,10 @@ class TaskBatch:
         self._speed[envs], self._body_speed[envs] = 0.0, 0.0
         return self._observe(np.isin(np.arange(self.num_envs), envs))
 
-    def step(self, actions: np.ndarray) -> Outcome:
+    def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> Outcome:
         """One control step of every environment.
+
+        ``unseen`` (B,): environments that are reset next, so that their sensors are not asked and draw no noise.
 
         Raises:
             InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment), an environment
@@ -164,7 +168,7 @@ class TaskBatch:
         """
         actions = self._checked(actions)
         begin = time.perf_counter()
-        state = self.world.step(self.steering.controllers(actions))
+        state = self.world.step(self.steering.controller(actions))
         done = time.perf_counter()
         self.time_s["physics"] += done - begin
         failed = state.failed
@@ -189,7 +193,7 @@ class TaskBatch:
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
         judged = time.perf_counter()
         self.time_s["reward"] += judged - done
-        observation = self._observe(np.ones(self.num_envs, bool))
+        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
         self.time_s["observation"] += time.perf_counter() - judged
         return Outcome(observation, reward, terminated, truncated, terms, verdict.success & ~failed, failed)
 
@@ -205,9 +209,9 @@ class TaskBatch:
         return found
 
     def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of all; environments not in ``which`` (B,) keep theirs, and their sensors see nothing new."""
+        """Observations of all; the sensors of environments not in ``which`` (B,) are not asked and keep what they gave last."""
         tool, body, goal = self._tool, self._body, self._goal
-        at, turn = tool[:, :3, 3], np.stack([pose_error(pose, self._start_tool)[3:] for pose in tool])
+        at, turn = tool[:, :3, 3], pose_error(tool, self._start_tool)[:, 3:]
         parts = [
             (at - self._start_tool[:3, 3]) / _LENGTH,
             turn,
@@ -220,11 +224,17 @@ class TaskBatch:
             axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)
             found["body"] = np.concatenate([(body[:, :3, 3] - at) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
         found = {name: values.astype(np.float32) for name, values in found.items()}
-        if self.observers:
-            frames = self.world.observe()
-            for name, observer in self.observers.items():
-                seen = observer.observe(frames[name], self.world.sensors[name] if observer.settings.difference else None, which)
-                found |= {f"{name}_{modality}": values for modality, values in seen.items()}
+        rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
+        looked = any(observer.settings.needs_frames for observer in self.observers.values())
+        frames = self.world.observe(envs=rows) if looked and which.any() else {}
+        state = self.world.state() if self.observers and not looked else None
+        for name, observer in self.observers.items():
+            sensor = self.world.sensors[name] if observer.settings.difference else None
+            if state is not None:
+                seen = observer.observe_wrench(state.wrench[name], state.failed, which)
+            else:
+                seen = observer.observe(frames[name], sensor, rows) if frames else observer.last()
+            found |= {f"{name}_{modality}": values for modality, values in seen.items()}
         return found
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
@@ -258,4 +268,4 @@ def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> Obse
 
 def _twist(before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
     """Velocity and angular velocity (B, 6) between poses (B, 4, 4)."""
-    return np.stack([pose_error(a, b) for a, b in zip(after, before, strict=True)]) / dt
+    return pose_error(after, before) / dt

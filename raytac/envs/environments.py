@@ -12,14 +12,22 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from raytac.envs.batch import Outcome, TaskBatch
+from raytac.envs.picture import EnvironmentPicture
 from raytac.envs.task import Task
 from raytac.errors import InputError
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.observe import gymnasium_space
 
 __all__ = ["TactileEnv", "TactileVectorEnv"]
 
+_RENDER_MODES = ("rgb_array",)
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
+
+
+def _checked_render_mode(mode: str | None) -> str | None:
+    if mode is not None and mode not in _RENDER_MODES:
+        raise InputError("render_mode", value=mode, rule="must be None or a known mode", choices=_RENDER_MODES)
+    return mode
 
 
 def _action_space(size: int) -> gymnasium.spaces.Box:
@@ -34,15 +42,17 @@ class TactileEnv(gymnasium.Env):
     """
 
     task: ClassVar[type[Task]]
+    metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        """Raises as ``TaskBatch``; ``InputError`` for a render mode, of which there is none yet."""
-        if render_mode is not None:
-            raise InputError("render_mode", value=render_mode, rule="must be None: `raytac view` shows scenes")
+        """``render_mode``: None, or ``rgb_array``. Raises as ``TaskBatch``; ``InputError`` for another render mode."""
+        self.render_mode = _checked_render_mode(render_mode)
         self.batch = TaskBatch(self.task(), num_envs=1, **options)
         self.observation_space = gymnasium_space(self.batch.arrays)
         self.action_space = _action_space(self.batch.steering.size)
-        self.metadata = {"render_modes": [], "render_fps": 1.0 / self.batch.control_timestep}
+        self.metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 1.0 / self.batch.control_timestep}
+        self._seen: dict[str, np.ndarray] | None = None
+        self._picture: EnvironmentPicture | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -51,11 +61,13 @@ class TactileEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.batch.reseed([0], [seed])
-        return _row(self.batch.reset([0], [self.np_random])), {}
+        self._seen = self.batch.reset([0], [self.np_random])
+        return _row(self._seen), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite."""
         out = self.batch.step(np.asarray(action)[None])
+        self._seen = out.observation
         info = {
             "reward_terms": {name: float(term[0]) for name, term in out.terms.items()},
             "success": bool(out.success[0]),
@@ -63,24 +75,46 @@ class TactileEnv(gymnasium.Env):
         }
         return _row(out.observation), float(out.reward[0]), bool(out.terminated[0]), bool(out.truncated[0]), info
 
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """8-bit picture (H, W, 3): the scene with the goal in green, and beside it what each sensor observes; None without a render mode.
+
+        Raises:
+            InputError: before the first ``reset``.
+            BackendError: MuJoCo has no OpenGL to draw with (see ``SceneCamera``).
+        """
+        if self.render_mode is None:
+            return None
+        if self._seen is None:
+            raise InputError("environment", value=0, rule="must be reset before it is drawn")
+        if self._picture is None:
+            self._picture = EnvironmentPicture(self.batch)
+        return self._picture.draw(0, self._seen)
+
+    def close(self) -> None:
+        """Free the renderer, if there is one."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
 
 class TactileVectorEnv(gymnasium.vector.VectorEnv):
     """B environments of a task in one world: MuJoCo's states are stepped together, and each sensor sees all of them in one call.
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
     ``success``, ``failed``; where environments began anew in the same step also ``final_obs`` and ``final_info`` (arrays of objects), as
-    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does; with
-    noise in the markers only until any environment begins anew by itself, since the observation then draws new noise for all.
+    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does, noise
+    of cameras and markers included.
     """
 
     task: ClassVar[type[Task]]
+    metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
 
     def __init__(
         self,
         num_envs: int = 1,
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
-        render_mode: None = None,
+        render_mode: str | None = None,
         **options: Any,
     ) -> None:
         """Compose the world.
@@ -89,14 +123,13 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             num_envs: number of environments B.
             autoreset_mode: when an environment that has ended begins anew: in the same step, in the next one (whose action it ignores,
                 with reward 0), or only by ``reset``.
-            render_mode: must be None.
+            render_mode: None, or ``rgb_array``.
             options: of ``TaskBatch``.
 
         Raises:
             InputError: a value out of its choices.
         """
-        if render_mode is not None:
-            raise InputError("render_mode", value=render_mode, rule="must be None: `raytac view` shows scenes")
+        self.render_mode = _checked_render_mode(render_mode)
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError as error:
@@ -108,7 +141,13 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = _action_space(self.batch.steering.size)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {"autoreset_mode": self._mode, "render_modes": [], "render_fps": 1.0 / self.batch.control_timestep}
+        self.metadata = {
+            "autoreset_mode": self._mode,
+            "render_modes": list(_RENDER_MODES),
+            "render_fps": 1.0 / self.batch.control_timestep,
+        }
+        self._seen: dict[str, np.ndarray] | None = None
+        self._picture: EnvironmentPicture | None = None
         self._rngs = [seeding.np_random(None)[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
@@ -121,7 +160,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             InputError: seeds of another number than environments, or a mask of another shape.
         """
         mask = (options or {}).get("reset_mask")
-        envs = list(range(self.num_envs)) if mask is None else chosen_envs(np.asarray(mask), self.num_envs)
+        envs = chosen_envs(mask, self.num_envs)
         if seed is not None:
             seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
             if len(seeds) != self.num_envs:
@@ -131,12 +170,13 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
                 self._rngs[b] = seeding.np_random(int(seeds[b]))[0]  # type: ignore[arg-type]
             self.batch.reseed(told, [int(seeds[b]) for b in told])  # type: ignore[arg-type]
         self._ended[envs] = False
-        return self.batch.reset(envs, [self._rngs[b] for b in envs]), {}
+        self._seen = self._again(envs)
+        return self._seen, {}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment."""
         late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
-        out = self.batch.step(np.asarray(actions))
+        out = self.batch.step(np.asarray(actions), np.isin(np.arange(self.num_envs), late) if len(late) else None)
         observation, terms = out.observation, {name: term.copy() for name, term in out.terms.items()}
         reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
         success, failed = out.success.copy(), out.failed.copy()
@@ -151,10 +191,27 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             infos |= self._final(out, ended)
             observation = self._again(ended)
             self._ended[:] = False
+        self._seen = observation
         return observation, reward, terminated, truncated, infos
 
-    def _again(self, envs: np.ndarray) -> dict[str, np.ndarray]:
-        return self.batch.reset(envs.tolist(), [self._rngs[b] for b in envs])
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """One picture of each environment, as ``TactileEnv.render``; None without a render mode. Raises the same."""
+        if self.render_mode is None:
+            return None
+        if self._seen is None:
+            raise InputError("environment", value=0, rule="must be reset before it is drawn")
+        if self._picture is None:
+            self._picture = EnvironmentPicture(self.batch)
+        return tuple(self._picture.draw(b, self._seen) for b in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the renderer, if there is one."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def _again(self, envs: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
+        return self.batch.reset([int(b) for b in envs], [self._rngs[b] for b in envs])
 
     def _final(self, out: Outcome, ended: np.ndarray) -> dict[str, Any]:
         last, told = np.full(self.num_envs, None, object), np.zeros(self.num_envs, bool)

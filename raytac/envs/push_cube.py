@@ -17,7 +17,7 @@ class PushCube(Task):
 
     scene: ClassVar = "push_cube"
     body: ClassVar = "cube"
-    motion: ClassVar = Motion(("x", "y", "z"), (5e-3, 5e-3, 2e-3), (0.25, -0.25, 0.035), (0.65, 0.25, 0.10), leash=0.006)
+    motion: ClassVar = Motion(("x", "y", "z"), (3e-3, 3e-3, 1e-3), (0.25, -0.25, 0.035), (0.65, 0.25, 0.10), leash=0.006)
     max_episode_steps: ClassVar = 150
     body_seen: ClassVar = True
 
@@ -44,7 +44,7 @@ class PushCubeEnv(TactileEnv):
     A Panda carries a GelSight Mini (9 x 11 markers) pad down over a cube of 40 mm and 50 g on a table (scene `push_cube`). The pad must
     press hard enough to hold the cube by friction and softly enough to let it slide.
 
-    Action, Box(-1, 1, (3,)): what the target of the pad moves along world x, y (5 mm a step at 1) and z (2 mm); the target leads the pad
+    Action, Box(-1, 1, (3,)): what the target of the pad moves along world x, y (3 mm a step at 1) and z (1 mm); the target leads the pad
     by at most 6 mm along an axis and stays in x 0.25 to 0.65, y ±0.25, z 0.035 to 0.10 m.
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 

@@ -11,9 +11,9 @@ from raytac.envs.task import Motion, turned
 from raytac.errors import InputError
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.panda import MAX_VELOCITY
-from raytac.robots.pose import pose_error
+from raytac.robots.pose import pose_error, site_poses
 from raytac.robots.pose_servo import PoseServo
-from raytac.world.state import Controller
+from raytac.world.state import BatchController
 from raytac.world.world import TactileWorld
 
 __all__ = ["ACTIONS", "Steering"]
@@ -56,18 +56,18 @@ class Steering:
 
     def tool(self) -> np.ndarray:
         """Poses (B, 4, 4) of the tool."""
-        return np.stack([self.arm.world_from_site(data) for data in self.world.data])
+        return site_poses(self.world.data, self.arm.site)
 
     def joint_speed(self) -> np.ndarray:
         """[rad/s], (B, n)."""
-        return np.stack([data.qvel[self.arm.dof] for data in self.world.data])
+        return np.array([data.qvel for data in self.world.data])[:, self.arm.dof]
 
     def opening(self) -> np.ndarray:
         """Gap between both pads [m], (B, 1); (B, 0) without a gripper."""
         if not self._has_grip:
             return np.zeros((self.world.num_envs, 0))
-        first, second = self.world.composed.sensors
-        pads = [np.stack([m.world_from_pad(data)[:3, 3] for data in self.world.data]) for m in (first, second)]
+        sites = [self.arm.model.site(mounted.site).id for mounted in self.world.composed.sensors]
+        pads = [site_poses(self.world.data, site)[:, :3, 3] for site in sites]
         return np.linalg.norm(pads[0] - pads[1], axis=1)[:, None]
 
     def reset(self, envs: Sequence[int] | range) -> None:
@@ -80,16 +80,15 @@ class Steering:
         if opening is not None:
             self._gap[chosen] = self.world.composed.ctrl[opening]
 
-    def controllers(self, actions: np.ndarray) -> list[Controller]:
-        """One controller an environment for the next control step; ``actions`` (B, size) in [−1, 1]."""
+    def controller(self, actions: np.ndarray) -> BatchController:
+        """What drives all environments in the next control step; ``actions`` (B, size) in [−1, 1]."""
         dt = self.world.scene.control_timestep
         if self.action == "pose":
             before = self._target.copy()
             self._move_pose(actions)
-            twist = np.stack([pose_error(a, b) for a, b in zip(self._target, before, strict=True)]) / dt
-            joints, speed = self._servo.targets(self.world.data, before, twist, dt)
+            joints, speed = self._servo.targets(self.world.data, before, pose_error(self._target, before) / dt, dt)
         else:
-            now = np.stack([data.qpos[self.arm.qpos] for data in self.world.data])
+            now = np.array([data.qpos for data in self.world.data])[:, self.arm.qpos]
             wanted = self._joints + _JOINT_STEP * actions[:, : len(self.arm)]
             wanted = np.clip(wanted, now - _JOINT_LEASH, now + _JOINT_LEASH)
             wanted = np.clip(wanted, self.arm.range[:, 0], self.arm.range[:, 1])
@@ -99,18 +98,8 @@ class Steering:
             step = self.motion.step[self.motion.axes.index("grip")]
             low, high = self.motion.opening
             self._gap = np.clip(self._gap + step * actions[:, -1], low, high)
-        since = [float(data.time) for data in self.world.data]
-        return [self._controller(*row) for row in zip(joints, speed, self._gap, since, strict=True)]
-
-    def _controller(self, joints: np.ndarray, speed: np.ndarray, gap: float, since: float) -> Controller:
-        law, arm, opening = self._law, self.arm, self.world.composed.opening
-
-        def drive(data: Any, time: float) -> None:
-            arm.drive(data, law.torque(data, joints + (time - since) * speed, speed).torque)
-            if opening is not None:
-                data.ctrl[opening] = gap
-
-        return drive
+        since = np.array([data.time for data in self.world.data])
+        return _Springs(self._law, joints, speed, since, self.world.composed.opening, self._gap)
 
     def _move_pose(self, actions: np.ndarray) -> None:
         motion, at = self.motion, self.tool()[:, :3, 3]
@@ -130,3 +119,23 @@ class Steering:
             angle = float(np.linalg.norm(turn[b]))
             rotation = turned(turn[b] / angle, angle) if angle > 0.0 else np.eye(3)
             self._target[b, :3, :3] = rotation @ self._start[:3, :3]
+
+
+class _Springs(BatchController):
+    """Springs towards joint targets (B, n) that move with ``speed`` since ``since`` (B,), and the opening of a gripper."""
+
+    def __init__(
+        self, law: JointImpedance, joints: np.ndarray, speed: np.ndarray, since: np.ndarray, opening: int | None, gap: np.ndarray
+    ) -> None:
+        self._law, self._joints, self._speed, self._since = law, joints, speed, since
+        self._opening, self._gap = opening, gap
+
+    def drive(self, datas: Sequence[Any], envs: Sequence[int] | np.ndarray) -> None:
+        some, arm = [datas[b] for b in envs], self._law.arm
+        late = np.array([data.time for data in some]) - self._since[envs]
+        speed = self._speed[envs]
+        torque = self._law.torques(some, self._joints[envs] + late[:, None] * speed, speed).torque
+        for b, data, row in zip(envs, some, torque, strict=True):
+            arm.drive(data, row)
+            if self._opening is not None:
+                data.ctrl[self._opening] = self._gap[b]

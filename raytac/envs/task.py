@@ -9,6 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from raytac.physics.rotation import rotations
+
 __all__ = ["Motion", "Situation", "Start", "Task", "Verdict", "far", "near", "placed", "turned"]
 
 
@@ -89,6 +91,8 @@ class Task(ABC):
     max_episode_steps: ClassVar[int]
     body_seen: ClassVar[bool]
     """Whether the body's pose is observed unless said otherwise."""
+    tactile: ClassVar[tuple[str, ...]] = ("markers",)
+    """Modalities of every sensor unless said otherwise."""
 
     @abstractmethod
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
@@ -125,7 +129,5 @@ def placed(pose: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def turned(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation (3, 3) about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    """Rotation (3, 3) about a unit axis."""
+    return rotations((angle * axis)[None])[0]

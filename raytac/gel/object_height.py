@@ -15,27 +15,34 @@ from raytac.gel.relief import looks_down, relief_underside
 __all__ = ["object_bounds", "object_height"]
 
 
+_NODES = 32768
+"""Nodes of all environments that are worked on at once: what stays in a core's cache."""
+
+
 def object_height(
     parts: Sequence[Part], pad_from_object: np.ndarray, x: np.ndarray, y: np.ndarray, *, below: float = np.inf
 ) -> np.ndarray:
     """Lowest z [m] of the object above each node, pad frame, shape (B, Ny, Nx), float64; ``inf`` where nothing is above.
 
-    ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending. The object is the union of its
-    ``parts``: the minimum of their undersides (exact for primitives, exact linear interpolation for meshes). ``below`` [m] saves
-    work: parts and triangles that lie wholly above it may be left out (their nodes read ``inf``). Nothing is cut off at the pad:
-    a part that reaches through it still shows its underside. A pose that is not finite gives NaN in its environment alone.
-    Raises ``InputError`` for poses of another shape.
+    ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending; (B, Nx), (B, Ny) where every
+    environment has its own. The object is the union of its ``parts``: the minimum of their undersides (exact for primitives, exact linear
+    interpolation for meshes). ``below`` [m] saves work: parts and triangles that lie wholly above it may be left out (their nodes read
+    ``inf``). Nothing is cut off at the pad: a part that reaches through it still shows its underside. A pose that is not finite gives NaN
+    in its environment alone. Raises ``InputError`` for poses of another shape.
     """
     poses = np.asarray(pad_from_object, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError("pad_from_object", value=poses.shape, rule="must have shape (B, 4, 4)")
-    height = np.full((len(poses), len(y), len(x)), np.inf)
-    for pose, lowest in zip(poses, height, strict=True):
-        if not np.isfinite(pose).all():
-            lowest[...] = np.nan
-            continue
+    height = np.full((len(poses), y.shape[-1], x.shape[-1]), np.inf)
+    lost = np.logical_not(np.isfinite(poses).all(axis=(1, 2)))
+    poses = np.where(lost[:, None, None], np.eye(4), poses)
+    count = max(_NODES // (height.shape[1] * height.shape[2]), 1)
+    for start in range(0, len(poses), count):
+        some = slice(start, start + count)
+        own = (x, y) if x.ndim == 1 else (x[some], y[some])
         for part in parts:
-            _lower_onto(lowest, part, pose @ part.object_from_part, x, y, below)
+            _lower_onto(height[some], part, poses[some] @ part.object_from_part, *own, below)
+    height[lost] = np.nan
     return height
 
 
@@ -59,32 +66,50 @@ def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bounds(part.kind, part.size, pose)
 
 
-def _lower_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
-    """Take the minimum of ``lowest`` (Ny, Nx) and the part's underside, in place, within the part's bounding box."""
-    corners: np.ndarray | None = None
-    if part.kind == "mesh" or (part.kind == "relief" and not looks_down(part, pose)):
-        assert part.vertices is not None
-        placed = part.vertices @ pose[:3, :3].T + pose[:3, 3]
-        low, high = placed.min(axis=0), placed.max(axis=0)
-    else:
-        placed = None
-        low, high = _part_bounds(part, pose)
-    columns = slice(*np.searchsorted(x, (low[0], high[0]), side="left") + np.array([0, 1]))
-    rows = slice(*np.searchsorted(y, (low[1], high[1]), side="left") + np.array([0, 1]))
+def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
+    """Take the minimum of ``lowest`` (B, Ny, Nx) and the part's underside, in place."""
+    if part.kind in UNDERSIDES:
+        low, high = bounds(part.kind, part.size, poses)
+        chosen = np.flatnonzero(low[:, 2] <= below)
+        if not len(chosen):
+            return
+        rows, columns = slice(None), slice(None)
+        if x.ndim == 1:
+            near, far = low[chosen].min(axis=0), high[chosen].max(axis=0)
+            rows, columns = _span(y, near[1], far[1]), _span(x, near[0], far[0])
+            local_x, local_y = x[None, columns], y[None, rows]
+        else:
+            local_x, local_y = x[chosen], y[chosen]
+        if local_x.size and local_y.size:
+            some = slice(None) if len(chosen) == len(poses) else chosen
+            underside = UNDERSIDES[part.kind](part.size, poses[some], local_x[:, None, :], local_y[:, :, None])
+            lowest[some, rows, columns] = np.minimum(lowest[some, rows, columns], underside)
+        return
+    for b, (pose, window) in enumerate(zip(poses, lowest, strict=True)):
+        own = (x, y) if x.ndim == 1 else (x[b], y[b])
+        _lower_surface_onto(window, part, pose, *own, below)
+
+
+def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
+    """The same of a mesh or a relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
+    assert part.vertices is not None and part.faces is not None
+    as_triangles = part.kind == "mesh" or not looks_down(part, pose)
+    placed = part.vertices @ pose[:3, :3].T + pose[:3, 3] if as_triangles else None
+    low, high = _part_bounds(part, pose) if placed is None else (placed.min(axis=0), placed.max(axis=0))
+    columns, rows = _span(x, low[0], high[0]), _span(y, low[1], high[1])
     window = lowest[rows, columns]
     if low[2] > below or window.size == 0:
         return
-    if placed is not None:
-        assert part.faces is not None
-        corners = _candidates(placed, part.faces, part.closed, below)
-        np.minimum(window, lowest_of_triangles(corners, x, y)[rows, columns], out=window)
-        return
-    local_x, local_y = x[columns][None, :], y[rows][:, None]
-    if part.kind == "relief":
-        underside = relief_underside(part, pose, local_x, local_y)
+    if placed is None:
+        underside = relief_underside(part, pose, x[columns][None, :], y[rows][:, None])
     else:
-        underside = UNDERSIDES[part.kind](part.size, pose, local_x, local_y)
+        underside = lowest_of_triangles(_candidates(placed, part.faces, part.closed, below), x, y)[rows, columns]
     np.minimum(window, underside, out=window)
+
+
+def _span(line: np.ndarray, low: float, high: float) -> slice:
+    """Of the nodes from ``low`` to ``high`` and one beyond."""
+    return slice(*np.searchsorted(line, (low, high), side="left") + np.array([0, 1]))
 
 
 def _candidates(placed: np.ndarray, faces: np.ndarray, closed: bool, below: float) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes at once.
+"""Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes and environments at once.
 
-Each function takes the shape's size [m], its pose ``pad_from_part`` (4, 4) and node positions ``x`` (1, Nx), ``y`` (Ny, 1) [m],
-and returns the z [m], shape (Ny, Nx), of the solid's lowest point on each node's vertical line; ``inf`` where the line misses.
+Each function takes the shape's size [m], its poses ``pad_from_part`` (B, 4, 4) and node positions ``x`` (B or 1, 1, Nx), ``y``
+(B or 1, Ny, 1) [m], and returns the z [m], shape (B, Ny, Nx), of the solid's lowest point on each node's vertical line; ``inf`` where
+the line misses. Nothing in one environment depends on the others.
 
 A line through a node is (x, y, c_z) + t e_z with c the shape's origin; in the part frame it is o + t d. A convex solid is an
 intersection of slabs and quadrics, each of which the line crosses in one interval of t; the underside is at the start of the
@@ -22,21 +23,24 @@ _ROOT_STEPS = 100
 """Most steps to a torus; halving alone comes to the last bit in 55."""
 
 
-def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Vertical lines in the part frame: the three coordinates of o, each (Ny, Nx), and the common direction d (3,)."""
-    dx, dy = x - pose[0, 3], y - pose[1, 3]
-    return [pose[0, k] * dx + pose[1, k] * dy for k in range(3)], pose[2, :3]
+def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Vertical lines in the part frame: the three coordinates of o, each (…, Ny, Nx), and of the common direction d, each (…, 1, 1).
+
+    ``pose``: (…, 4, 4).
+    """
+    dx, dy = x - _entry(pose, 0, 3), y - _entry(pose, 1, 3)
+    return [_entry(pose, 0, k) * dx + _entry(pose, 1, k) * dy for k in range(3)], [_entry(pose, 2, k) for k in range(3)]
 
 
 def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-aligned box (lower, upper), each (3,) [m], in the pad frame, that holds the primitive."""
-    rotation, centre = pose[:3, :3], pose[:3, 3]
-    axis = rotation[:, 2]
+    """Axis-aligned box (lower, upper), each (…, 3) [m], in the pad frame, that holds the primitive at poses (…, 4, 4)."""
+    rotation, centre = pose[..., :3, :3], pose[..., :3, 3]
+    axis = rotation[..., :, 2]
     across = np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
     if kind == "plane":
-        return np.full(3, -np.inf), np.full(3, np.inf)
+        return np.full(centre.shape, -np.inf), np.full(centre.shape, np.inf)
     if kind == "sphere":
-        half = np.full(3, size[0])
+        half = np.full(centre.shape, size[0])
     elif kind == "capsule":
         half = size[0] + size[1] * np.abs(axis)
     elif kind == "ellipsoid":
@@ -56,42 +60,39 @@ def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.nda
 
 def _plane(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The half-space behind the plane has an underside only if the plane looks down (n_z < 0)."""
-    normal = pose[:3, 2]
-    if normal[2] >= 0.0:
-        return np.full(np.broadcast_shapes(x.shape, y.shape), np.inf)
-    return pose[2, 3] - (normal[0] * (x - pose[0, 3]) + normal[1] * (y - pose[1, 3])) / normal[2]
+    n_x, n_y, n_z = (_entry(pose, k, 2) for k in range(3))
+    down = n_z < 0.0
+    slope = n_x * (x - _entry(pose, 0, 3)) + n_y * (y - _entry(pose, 1, 3))
+    return np.where(down, _entry(pose, 2, 3) - slope / np.where(down, n_z, 1.0), np.inf)
 
 
 def _sphere(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return pose[2, 3] - _root(size[0] ** 2 - (x - pose[0, 3]) ** 2 - (y - pose[1, 3]) ** 2)
+    across = (x - _entry(pose, 0, 3)) ** 2, (y - _entry(pose, 1, 3)) ** 2
+    return _entry(pose, 2, 3) - _root(size[0] ** 2 - across[0] - across[1])
 
 
 def _ellipsoid(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     o, d = line_in_part(pose, x, y)
-    o, d = [o[k] / size[k] for k in range(3)], d / size
-    return (
-        pose[2, 3] + _quadric(float(d @ d), o[0] * d[0] + o[1] * d[1] + o[2] * d[2], o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - 1.0)[0]
-    )
+    o, d = ([v[k] / size[k] for k in range(3)] for v in (o, d))
+    a, b, c = (v[0] * w[0] + v[1] * w[1] + v[2] * w[2] for v, w in ((d, d), (o, d), (o, o)))
+    return _entry(pose, 2, 3) + _quadric(a, b, c - 1.0)[0]
 
 
 def _cylinder(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     o, d = line_in_part(pose, x, y)
     side = _quadric(d[0] ** 2 + d[1] ** 2, o[0] * d[0] + o[1] * d[1], o[0] ** 2 + o[1] ** 2 - size[0] ** 2)
-    return pose[2, 3] + _common(side, _slab(o[2], d[2], -size[1], size[1]))
+    return _entry(pose, 2, 3) + _common(side, _slab(pose, 2, x, y, -size[1], size[1]))
 
 
 def _capsule(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     low = _cylinder(size, pose, x, y)
     for end in (-size[1], size[1]):
-        cap = pose.copy()
-        cap[:3, 3] += end * pose[:3, 2]
-        low = np.minimum(low, _sphere(size, cap, x, y))
+        low = np.minimum(low, _sphere(size, _along_axis(pose, end), x, y))
     return low
 
 
 def _box(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    o, d = line_in_part(pose, x, y)
-    return pose[2, 3] + _common(*(_slab(o[k], d[k], -size[k], size[k]) for k in range(3)))
+    return _entry(pose, 2, 3) + _common(*(_slab(pose, k, x, y, -size[k], size[k]) for k in range(3)))
 
 
 def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -107,35 +108,38 @@ def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarra
     o, d = line_in_part(pose, x, y)
     above = o[2] - apex
     a = d[0] ** 2 + d[1] ** 2 - (rho * d[2]) ** 2
-    a = a if abs(a) > 1e-12 else 1e-12
+    a = np.where(np.abs(a) > 1e-12, a, 1e-12)
     b = o[0] * d[0] + o[1] * d[1] - rho**2 * above * d[2]
     c = o[0] ** 2 + o[1] ** 2 - (rho * above) ** 2
-    slab = _slab(o[2], d[2], tangent, height)
-    if a > 0.0:
-        frustum = _common(_quadric(a, b, c), slab)
-    else:  # The line is steeper than the flank: inside before the first root (one nappe) and after the second (the other).
-        root = np.sqrt(np.clip(b * b - a * c, 0.0, None))
-        first, last = (-b + root) / a, (-b - root) / a
-        frustum = np.minimum(
-            _common((np.full_like(first, -np.inf), first), slab), _common((last, np.full_like(last, np.inf)), slab)
-        )
-    ball = pose.copy()
-    ball[:3, 3] += tip * pose[:3, 2]
-    return np.minimum(pose[2, 3] + frustum, _sphere((tip,), ball, x, y))
+    slab = _slab(pose, 2, x, y, tangent, height)
+    flat = _common(_quadric(np.where(a > 0.0, a, 1.0), b, c), slab)
+    # Where the line is steeper than the flank it is inside before the first root (one nappe) and after the second (the other).
+    root = np.sqrt(np.clip(b * b - a * c, 0.0, None))
+    first, last = (-b + root) / a, (-b - root) / a
+    steep = np.minimum(_common((np.full_like(first, -np.inf), first), slab), _common((last, np.full_like(last, np.inf)), slab))
+    frustum = np.where(a > 0.0, flat, steep)
+    return np.minimum(_entry(pose, 2, 3) + frustum, _sphere((tip,), _along_axis(pose, tip), x, y))
+
+
+def _tori(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """One pose after the other: the search goes on only where it has not ended."""
+    lines = (np.broadcast_to(v, (len(pose), *v.shape[1:])) for v in (x, y))
+    return np.stack([_torus(size, *one) for one in zip(pose, *lines, strict=True)])
 
 
 def _torus(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Closed form if the axis is vertical; else the first root of g(t) = (|p|² + R² − r²)² − 4 R² (p_x² + p_y²), negative inside.
+    """One pose: closed form if the axis is vertical; else the first root of g.
 
-    With t counted from the point of the line nearest to the centre, in units of R, |p|² = h² + t² and g has no cubic term. g falls from
-    infinity to its first minimum, and from its maximum, if it has one, to its second: the first root lies on the first of these two
-    stretches whose minimum is not positive. Searching inside a stretch cannot jump over a thin part of the tube.
+    g(t) = (|p|² + R² − r²)² − 4 R² (p_x² + p_y²) is negative inside. With t counted from the point of the line nearest to the centre, in
+    units of R, |p|² = h² + t² and g has no cubic term. g falls from infinity to its first minimum, and from its maximum, if it has one, to
+    its second: the first root lies on the first of these two stretches whose minimum is not positive. Searching inside a stretch cannot
+    jump over a thin part of the tube.
     """
     major, minor = size
     if abs(pose[2, 2]) > 1.0 - 1e-14:
         rho = np.hypot(x - pose[0, 3], y - pose[1, 3])
         return pose[2, 3] - _root(minor**2 - (rho - major) ** 2)
-    o, d = line_in_part(pose, x, y)
+    o, d = line_in_part(pose, x, y)[0], pose[2, :3]
     minor /= major
     origin = np.stack([v.ravel() for v in o], axis=-1) / major
     middle = -origin @ d
@@ -194,31 +198,57 @@ def _root(square: np.ndarray) -> np.ndarray:
     return np.where(square >= 0.0, np.sqrt(np.maximum(square, 0.0)), -np.inf)
 
 
-def _quadric(a: float, b: np.ndarray, c: np.ndarray) -> Interval:
-    """Interval of t with a t² + 2 b t + c <= 0, a >= 0; (inf, −inf) where empty."""
-    if a < 1e-14:
-        inside = c <= 0.0
-        return np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
+def _entry(pose: np.ndarray, row: int, column: int) -> np.ndarray:
+    """One entry of poses (…, 4, 4), (…, 1, 1)."""
+    return pose[..., row, column, None, None]
+
+
+def _along_axis(pose: np.ndarray, distance: float) -> np.ndarray:
+    """Poses moved along their own z axis."""
+    moved = pose.copy()
+    moved[..., :3, 3] += distance * pose[..., :3, 2]
+    return moved
+
+
+def _quadric(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Interval:
+    """Interval of t with a t² + 2 b t + c <= 0, a (…, 1, 1) >= 0; (inf, −inf) where empty."""
+    flat = a < 1e-14
+    a = np.where(flat, 1.0, a)
     disc = b * b - a * c
     root = np.sqrt(np.maximum(disc, 0.0))
-    return np.where(disc >= 0.0, (-b - root) / a, np.inf), np.where(disc >= 0.0, (-b + root) / a, -np.inf)
+    found = np.where(disc >= 0.0, (-b - root) / a, np.inf), np.where(disc >= 0.0, (-b + root) / a, -np.inf)
+    return _where_flat(flat, c <= 0.0, found) if flat.any() else found
 
 
-def _slab(o: np.ndarray, d: float, low: float, high: float) -> Interval:
-    """Interval of t with low <= o + t d <= high."""
-    if abs(d) < 1e-14:
-        inside = (o >= low) & (o <= high)
-        return np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
-    first, last = (low - o) / d, (high - o) / d
-    return (first, last) if d > 0.0 else (last, first)
+def _slab(pose: np.ndarray, k: int, x: np.ndarray, y: np.ndarray, low: float, high: float) -> Interval:
+    """Interval of t with low <= o_k + t d_k <= high; o_k is a sum of a function of x and one of y, and so are its ends."""
+    across, along = _entry(pose, 0, k) * (x - _entry(pose, 0, 3)), _entry(pose, 1, k) * (y - _entry(pose, 1, 3))
+    d = _entry(pose, 2, k)
+    flat = np.abs(d) < 1e-14
+    inverse = 1.0 / np.where(flat, 1.0, d)
+    start = (np.where(d > 0.0, low, high) - across) * inverse - along * inverse
+    found = start, start + (high - low) * np.abs(inverse)
+    if not flat.any():
+        return found
+    o = across + along
+    return _where_flat(flat, (o >= low) & (o <= high), found)
 
 
-def _common(*intervals: Interval) -> np.ndarray:
-    """Start of the intersection of intervals; inf where it is empty."""
-    start, end = intervals[0]
-    for other_start, other_end in intervals[1:]:
-        start, end = np.maximum(start, other_start), np.minimum(end, other_end)
-    return np.where(start <= end, start, np.inf)
+def _where_flat(flat: np.ndarray, inside: np.ndarray, interval: Interval) -> Interval:
+    """``interval``, but where ``flat`` a line is ``inside`` all along or nowhere."""
+    start, end = interval
+    always = np.where(inside, -np.inf, np.inf)
+    return np.where(flat, always, start), np.where(flat, -always, end)
+
+
+def _common(first: Interval, *others: Interval) -> np.ndarray:
+    """Start of the intersection of intervals, of which the first is overwritten; inf where it is empty."""
+    start, end = first
+    for other_start, other_end in others:
+        np.maximum(start, other_start, out=start)
+        np.minimum(end, other_end, out=end)
+    np.copyto(start, np.inf, where=start > end)
+    return start
 
 
 UNDERSIDES: dict[str, Underside] = {
@@ -229,6 +259,6 @@ UNDERSIDES: dict[str, Underside] = {
     "cylinder": _cylinder,
     "box": _box,
     "cone": _cone,
-    "torus": _torus,
+    "torus": _tori,
 }
 """Function of each primitive kind."""

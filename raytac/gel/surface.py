@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class PadGrid:
     def __repr__(self) -> str:
         return summary(self)
 
-    @property
+    @cached_property
     def pitch(self) -> tuple[float, float]:
         """Node spacing along x and y [m]."""
         return float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0])
@@ -54,6 +55,11 @@ class PadGrid:
     @property
     def shape(self) -> tuple[int, int]:
         return self.rest.shape  # type: ignore[return-value]
+
+    @cached_property
+    def origin(self) -> tuple[float, float]:
+        """x and y of the first node [m]."""
+        return float(self.x[0]), float(self.y[0])
 
 
 @dataclass(frozen=True, repr=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid
 from raytac.markers.calibration_presses import LOADS, PressFrame
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
 from raytac.markers.pattern import marker_centres
 from raytac.markers.surface import SurfaceMarkers
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
@@ -50,7 +50,7 @@ class ProbeData:
     """Frames of many presses under the probes: N frames under load, P probes.
 
     ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth`` [m], (N, ny, nx), and
-    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: (active, centre, shear, twist, ellipse, depth) as in ``Contacts``, (N, K, …);
+    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: of all frames, as if they were N environments;
     ``force``: (penetration (N, P), wall (N, P, 2), way (N, P, 2)) that the force field reads.
     """
 
@@ -60,7 +60,7 @@ class ProbeData:
     loads: np.ndarray
     depth: np.ndarray
     boxes: np.ndarray
-    contacts: tuple[np.ndarray, ...]
+    contacts: Contacts
     force: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     @classmethod
@@ -87,12 +87,8 @@ class ProbeData:
                 wall = slope / np.sqrt(1 + (slope**2).sum(axis=-1, keepdims=True))
                 way = object_way(contacts, rest[..., :2])
                 rows.append((truth[0], frame.load, samples.depth[0], samples.boxes[0], contacts, penetration[0], wall[0], way[0]))
-        most = max(row[4].active.shape[1] for row in rows)
-
-        def padded(name: str) -> np.ndarray:
-            values = [getattr(row[4], name)[0] for row in rows]
-            return np.stack([np.pad(v, [(0, most - len(v))] + [(0, 0)] * (v.ndim - 1)) for v in values])
-
+        most = max(row[4].table.shape[1] for row in rows)
+        tables = [np.pad(row[4].table[0], ((0, most - row[4].table.shape[1]), (0, 0))) for row in rows]
         return cls(
             cells=cells,
             markers=xy,
@@ -100,7 +96,7 @@ class ProbeData:
             loads=np.array([row[1] for row in rows]),
             depth=np.stack([row[2] for row in rows]),
             boxes=np.stack([row[3] for row in rows]),
-            contacts=tuple(padded(name) for name in ("active", "centre", "shear", "twist", "ellipse", "depth")),
+            contacts=Contacts(np.stack(tables)),
             force=(np.stack([r[5] for r in rows]), np.stack([r[6] for r in rows]), np.stack([r[7] for r in rows])),
         )
 
@@ -141,15 +137,15 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
 
     def error(constants: FotsConstants, rows: np.ndarray) -> float:
         markers = np.broadcast_to(data.markers, (len(rows), *data.markers.shape))
-        contacts = tuple(part[rows] for part in data.contacts)
-        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], contacts, constants)
+        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], data.contacts.table[rows], constants)
         return float(np.linalg.norm(moved - data.truth[rows], axis=-1).mean())
 
     def rows_of(load: str) -> np.ndarray:
         return np.flatnonzero(data.loads == load)
 
-    shear_most = float(np.linalg.norm(data.contacts[2], axis=-1).max())
-    twist_most = float(np.abs(data.contacts[3]).max())
+    contacts = data.contacts
+    shear_most = float(np.linalg.norm(contacts.shear, axis=-1).max())
+    twist_most = float(np.abs(contacts.twist).max())
     found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6))
     starts = (found.dilate_gain, found.dilate_lambda)
 
@@ -174,10 +170,9 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
 
         x, _ = pattern_search(lambda x, rows=rows, dragged=dragged: error(dragged(x), rows), np.array([0.0, 2.0]))
         found = dragged(x)
-    active, shear, twist, ellipse, mean = (data.contacts[k] for k in (0, 2, 3, 4, 5))
-    edge = np.sqrt(np.sqrt(np.maximum(ellipse[..., 0] * ellipse[..., 2] - ellipse[..., 1] ** 2, 0)))
-    way = np.maximum(np.linalg.norm(shear, axis=-1), edge * np.abs(twist) / TWIST_SLIP)
-    slip_most = float((way[active] / (mean * edge)[active]).max())
+    edge = contacts.radius
+    way = np.maximum(np.linalg.norm(contacts.shear, axis=-1), edge * np.abs(contacts.twist) / TWIST_SLIP)
+    slip_most = float((way[contacts.active] / (contacts.depth * edge)[contacts.active]).max())
     dragged_rows = [rows for rows in (rows_of("shear"), rows_of("twist")) if len(rows)]
 
     def as_punch(x: np.ndarray) -> FotsConstants:

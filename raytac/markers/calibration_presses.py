@@ -1,30 +1,43 @@
-"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared or twisted."""
+"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared, twisted, or both at once."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from raytac.errors import RaytacError
+from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.surface import GelSurface
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FIT", "HELD_OUT", "LOADS", "QUICK_FIT", "QUICK_HELD_OUT", "Press", "PressFrame", "press_frames"]
+__all__ = [
+    "FIT",
+    "HELD_OUT",
+    "LOADS",
+    "QUICK_FIT",
+    "QUICK_HELD_OUT",
+    "Press",
+    "PressFrame",
+    "PressStates",
+    "press_frames",
+    "simulate_press",
+]
 
-LOADS = ("normal", "shear", "twist")
+LOADS = ("normal", "shear", "twist", "combined")
 """Kinds of load that errors are given for."""
 _PITCH = 0.1e-3
 _STEPS = 4
-"""States a stage."""
+"""States a stage; of a press with shear and twist, steps of either, in turn."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m] or twisted by ``twist`` [rad]."""
+    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m], twisted by ``twist`` [rad], or both:
+    a step of one, a step of the other, and so on.
+    """
 
     name: str
     kind: str
@@ -36,13 +49,19 @@ class Press:
     turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Quaternion (w, x, y, z) that turns the object before it is pressed."""
 
+    @property
+    def is_combined(self) -> bool:
+        return any(self.shear) and self.twist != 0.0
+
     def scene(self) -> PressScene:
         target = ObjectSpec(self.kind, self.params, (*self.place, 0.0), self.turned, 0.1)
         stages = [StageSpec("indent", depth=self.depth)]
-        if any(self.shear):
-            stages.append(StageSpec("shear", shear=self.shear))
-        if self.twist:
-            stages.append(StageSpec("twist", twist=self.twist))
+        steps = _STEPS if self.is_combined else 1
+        for k in range(1, steps + 1):
+            if any(self.shear):
+                stages.append(StageSpec("shear", shear=(k / steps * self.shear[0], k / steps * self.shear[1])))
+            if self.twist:
+                stages.append(StageSpec("twist", twist=k / steps * self.twist))
         return PressScene(self.name, target, tuple(stages))
 
     def __str__(self) -> str:
@@ -73,6 +92,19 @@ def _presses(
     return sheared, twisted
 
 
+def _both(
+    name: str,
+    kind: str,
+    params: dict[str, float | int | str],
+    place: tuple[float, float],
+    depth: float,
+    shear: tuple[float, float],
+    twist_deg: float,
+) -> Press:
+    """An object sheared and twisted at once."""
+    return Press(name, kind, params, place, depth, shear=shear, twist=math.radians(twist_deg))
+
+
 def _lying(angle_deg: float) -> tuple[float, float, float, float]:
     """Quaternion that lays a standing cylinder along x and turns it about z."""
     half = math.radians(angle_deg) / 2
@@ -99,8 +131,11 @@ HELD_OUT = (
         "bar", "cylinder", {"radius": 2.5e-3, "length": 8e-3}, (-0.5e-3, 0.5e-3), 0.8e-3, (0.3e-3, 0.7e-3), -20.0, _lying(30.0)
     ),
     *_presses("ball6-slides", "sphere", {"radius": 6e-3}, (1.5e-3, 1.0e-3), 0.3e-3, (-0.6e-3, -1.0e-3), -40.0),
+    _both("ball6-both", "sphere", {"radius": 6e-3}, (1.5e-3, 1.0e-3), 0.35e-3, (-0.8e-3, 0.2e-3), 35.0),
+    _both("punch2-both", "cylinder", {"radius": 2e-3, "length": 6e-3}, (2.0e-3, -1.0e-3), 0.3e-3, (0.2e-3, 0.7e-3), 45.0),
+    _both("cone-both", "cone", {"radius": 4e-3, "height": 3e-3, "tip_radius": 1.5e-3}, (-2.0e-3, 1.0e-3), 0.4e-3, (0.4e-3, -0.5e-3), -35.0),
 )  # fmt: skip
-"""Presses that no fit sees: other objects, other places, other directions; a bar that lies, and a ball that slides."""
+"""Presses that no fit sees: other objects, other places, other directions; a bar that lies, a ball that slides, and shear with twist."""
 QUICK_FIT, QUICK_HELD_OUT = FIT[:2], HELD_OUT[:2]
 """Few presses, to see that all runs."""
 
@@ -119,8 +154,20 @@ class PressFrame:
     surface: GelSurface
 
 
-def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> Iterator[PressFrame]:
-    """Run a press on the simulated pad of level ``pad`` and give its states in order.
+@dataclass(frozen=True)
+class PressStates:
+    """What the simulated pad says of one press, in N states: all that takes long to find out."""
+
+    loads: tuple[str, ...]
+    """Kind of load of each state, as in ``PressFrame``."""
+    poses: np.ndarray
+    """``pad_from_object``, shape (N, 4, 4)."""
+    coat: DeformedCoat
+    """The coat, its states in place of environments."""
+
+
+def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> PressStates:
+    """Run a press on the simulated pad of level ``pad``.
 
     Raises:
         BackendError: the solver is not installed.
@@ -130,15 +177,33 @@ def press_frames(sensor: SensorSpec, press: Press, *, pad: str, device: str = "c
     from raytac.physics.solver import check_solver
 
     check_solver("a press on the simulated pad")
-    from raytac.physics.rigid import RigidPad
     from raytac.physics.soft import SoftPad
 
-    scene = press.scene()
-    soft = SoftPad(sensor, scene, pitch=_PITCH, pad=pad, device=device)
-    rigid = RigidPad(sensor, scene, pitch=_PITCH)
-    for state in soft.run(steps_per_stage=_STEPS):
+    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=pad, device=device)
+    loads, poses, coats = [], [], []
+    names = {"indent": "normal"} | ({"shear": "combined", "twist": "combined"} if press.is_combined else {})
+    for state in soft.run(steps_per_stage=1 if press.is_combined else _STEPS):
         if state.failed.any():
             raise RaytacError(f"the press {press} did not settle")
-        load = {"indent": "normal", "start": "start"}.get(state.kind, state.kind)
-        by_geometry = rigid.surface_from_pose(np.asarray(state.pad_from_object))
-        yield PressFrame(press, load, replace(by_geometry, coat=soft.surface(state).coat))
+        coat = soft.surface(state).coat
+        assert coat is not None
+        loads.append(names.get(state.kind, state.kind))
+        poses.append(np.asarray(state.pad_from_object)[0])
+        coats.append(coat.positions[0])
+    return PressStates(tuple(loads), np.stack(poses), DeformedCoat(coat.mesh, np.stack(coats)))
+
+
+def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
+    """The states of a press, in order, with what the rigid pad makes of the object at the same poses.
+
+    Raises:
+        SpecError: the press does not fit this sensor.
+    """
+    from raytac.physics.rigid import RigidPad
+
+    rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)
+    frames = []
+    for load, pose, positions in zip(states.loads, states.poses, states.coat.positions, strict=True):
+        surface = rigid.surface_from_pose(pose[None])
+        frames.append(PressFrame(press, load, replace(surface, coat=DeformedCoat(states.coat.mesh, positions[None]))))
+    return frames

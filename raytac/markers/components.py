@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["find_runs", "join_runs"]
+__all__ = ["find_edges", "find_runs", "join_runs"]
 
 
 def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Runs of True along the rows of B masks (B, Ny, Nx): (row of all B · Ny, first column, column after the last), each (R,), in order."""
-    batch, ny, nx = mask.shape
-    padded = np.zeros((batch * ny, nx + 2), dtype=bool)
-    padded[:, 1:-1] = mask.reshape(batch * ny, nx)
-    # Along a row, edges are in turn the first column of a run and the column after its last.
-    row, column = (padded[:, 1:] != padded[:, :-1]).nonzero()
+    row, column = np.divmod(find_edges(mask), mask.shape[2] + 1)
     return row[::2], column[::2], column[1::2]
+
+
+def find_edges(mask: np.ndarray) -> np.ndarray:
+    """The runs of ``find_runs`` by where each begins and has ended, (2 R,), in order; a place is row · (Nx + 1) + column."""
+    batch, ny, nx = mask.shape
+    # One False before every row, so that edges are in turn where a run begins and where it has ended.
+    padded = np.zeros(batch * ny * (nx + 1) + 1, dtype=bool)
+    padded[:-1].reshape(batch * ny, nx + 1)[:, 1:] = mask.reshape(batch * ny, nx)
+    return np.flatnonzero(padded[1:] != padded[:-1])
 
 
 def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> list[int]:
@@ -24,21 +29,24 @@ def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> lis
     at a side or a corner.
     """
     parent = list(range(len(row)))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = i = parent[parent[i]]
-        return i
-
     above = 0
     for i, r in enumerate(row):
         if r % ny == 0:
             continue
-        while row[above] < r - 1 or (row[above] == r - 1 and stop[above] < start[i]):
+        begin, end = start[i], stop[i]
+        while row[above] < r - 1 or (row[above] == r - 1 and stop[above] < begin):
             above += 1
-        k = above
-        while row[k] == r - 1 and start[k] <= stop[i]:
-            a, b = root(i), root(k)
-            parent[max(a, b)] = min(a, b)
+        k, mine = above, i
+        while row[k] == r - 1 and start[k] <= end:
+            other = k
+            while parent[other] != other:
+                parent[other] = other = parent[parent[other]]
+            if other < mine:
+                parent[mine] = mine = other
+            else:
+                parent[other] = mine
             k += 1
-    return [root(i) for i in range(len(row))]
+    # A parent comes before its child, so one pass in order makes every parent a root.
+    for i, number in enumerate(parent):
+        parent[i] = parent[number]
+    return parent

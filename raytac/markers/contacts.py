@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import NamedTuple
 
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.components import find_runs, join_runs
+from raytac.markers.components import find_edges, join_runs
 
-__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "chosen_envs", "contact_boxes"]
+__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "contact_boxes"]
 
 CELL = 0.4e-3
 """Largest cell over which a contact is averaged [m], unless the pad's grid is coarser; narrower gaps do not part two contacts."""
@@ -40,14 +44,29 @@ class ContactCells:
         )
         return cls(grid, (nodes[0], nodes[1]), x, y)
 
+    @cached_property
+    def pitch(self) -> tuple[float, float]:
+        """Width and height of a cell [m]."""
+        (dx, dy), (kx, ky) = self.grid.pitch, self.nodes
+        return dx * kx, dy * ky
+
     @property
     def area(self) -> float:
         """Area of a cell [m²]."""
-        (dx, dy), (kx, ky) = self.grid.pitch, self.nodes
-        return dx * kx * dy * ky
+        return self.pitch[0] * self.pitch[1]
+
+    @cached_property
+    def _rest(self) -> np.ndarray:
+        """The grid's rest surface as heights are stored."""
+        return self.grid.rest.astype(np.float32)
+
+    def rest_at(self, x: float, y: float) -> float:
+        """Height of the resting gel at the node nearest to a place on the pad [m]."""
+        (x0, y0), (dx, dy), (ny, nx) = self.grid.origin, self.grid.pitch, self.grid.shape
+        return self.grid.rest.item(min(round((y - y0) / dy), ny - 1), min(round((x - x0) / dx), nx - 1))
 
     def sample(self, surface: GelSurface) -> ContactSamples:
-        """Average the indentation over the cells; an environment whose heights are not finite has no contact there.
+        """Average the indentation over the cells; an environment whose heights are not finite there has no contact.
 
         Raises:
             InputError: a surface on another grid.
@@ -59,31 +78,32 @@ class ContactCells:
         (kx, ky), batch = self.nodes, surface.batch
         depth = np.zeros((batch, len(self.y), len(self.x)), dtype=np.float32)
         contact = np.zeros(depth.shape, bool)
-        anywhere = np.asarray(surface.contact[0] if batch == 1 else surface.contact.any(axis=0))
-        rows = np.flatnonzero(anywhere.any(axis=1))
-        if len(rows) == 0:
+        mask = np.asarray(surface.contact)
+        r0, r1, c0, c1 = _box_of(mask[0] if batch == 1 else np.logical_or.reduce(mask))
+        if r0 == r1:
             return ContactSamples(self, depth, contact, (0, 0, 0, 0))
-        r0, r1 = int(rows[0]), int(rows[-1])
-        columns = np.flatnonzero(anywhere[r0 : r1 + 1].any(axis=0))
-        c0, c1 = int(columns[0]), int(columns[-1])
-        r0, r1, c0, c1 = r0 // ky, r1 // ky + 1, c0 // kx, c1 // kx + 1
+        r0, r1, c0, c1 = r0 // ky, -(-r1 // ky), c0 // kx, -(-c1 // kx)
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
-        touched = np.asarray(surface.contact)[part]
-        found = self.grid.rest[part[1:]].astype(np.float32) - surface.height[part]
+        touched = mask[part]
+        found = self._rest[part[1:]] - surface.height[part]
+        np.maximum(found, 0, out=found)
         if not math.isfinite(found.sum()):
             touched = touched & np.all(np.isfinite(found), axis=(1, 2))[:, None, None]
             found = np.where(touched, found, np.float32(0))
-        found = np.maximum(found, 0) * touched
-        ny, nx = r1 - r0, c1 - c0
-        # Whole cells, also at the pad's far edges.
-        missing = ny * ky - found.shape[1], nx * kx - found.shape[2]
-        if any(missing):
-            widths = ((0, 0), (0, missing[0]), (0, missing[1]))
-            found, touched = np.pad(found, widths), np.pad(touched, widths)
+        np.multiply(found, touched, out=found)
         cells = np.s_[:, r0:r1, c0:c1]
-        depth[cells] = found.reshape(batch, ny, ky, nx, kx).sum(axis=2).sum(axis=-1) / (kx * ky)
-        contact[cells] = touched.reshape(batch, ny, ky, nx, kx).any(axis=2).any(axis=-1)
+        depth[cells] = self._pooled(np.add, found, r1 - r0, c1 - c0) / np.float32(kx * ky)
+        contact[cells] = self._pooled(np.logical_or, touched, r1 - r0, c1 - c0)
         return ContactSamples(self, depth, contact, (r0, r1, c0, c1))
+
+    def _pooled(self, join: np.ufunc, values: np.ndarray, ny: int, nx: int) -> np.ndarray:
+        """Values (B, Ny, Nx) of nodes joined over ``ny`` × ``nx`` whole cells, of which the last may reach beyond the pad."""
+        kx, ky = self.nodes
+        missing = ny * ky - values.shape[1], nx * kx - values.shape[2]
+        if any(missing):
+            values = np.pad(values, ((0, 0), (0, missing[0]), (0, missing[1])))
+        lines = join.reduce(values.reshape(len(values), ny, ky, nx * kx), axis=2)
+        return reduce(join, [lines[..., k::kx] for k in range(kx)])
 
 
 @dataclass(frozen=True)
@@ -107,6 +127,18 @@ class ContactSamples:
         return np.array([[c0, c1, r0, r1]], dtype=np.uint32)
 
 
+def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Rows [r0, r1) and columns [c0, c1) that hold what is True in a mask (Ny, Nx); all 0 if nothing is."""
+    # Bytes are searched, from either end, several times faster than an array is reduced.
+    flat, width = mask.tobytes(), mask.shape[1]
+    first = flat.find(1)
+    if first < 0:
+        return 0, 0, 0, 0
+    r0, r1 = first // width, flat.rfind(1) // width + 1
+    line = mask[r0:r1].any(axis=0).tobytes()
+    return r0, r1, line.find(1), line.rfind(1) + 1
+
+
 def contact_boxes(contact: np.ndarray) -> np.ndarray:
     """As ``ContactSamples.boxes``, of masks (B, ny, nx)."""
     columns, rows = np.any(contact, axis=1), np.any(contact, axis=2)
@@ -119,36 +151,75 @@ def contact_boxes(contact: np.ndarray) -> np.ndarray:
 class Contacts:
     """Up to K contacts of each of B pads; rows that are not ``active`` hold zeros.
 
-    ``active`` (B, K); ``centre`` [m], (B, K, 2): indentation-weighted; ``shear`` [m], (B, K, 2): tangential way of the object at the
-    contact since first touch; ``twist`` [rad], (B, K): its turn about +z since then; ``radius`` [m], (B, K): of a disc with the area of all
-    cells that the contact touches. That is more than the contact's own: for a disc of radius R by cells whose nodes span a × b, on
-    average π radius² = π R² + 2 R (a + b) + a b (Steiner), about R + (a + b)/π, so 0.2 mm for cells of 0.4 mm.
-    ``ellipse`` [m²], (B, K, 3): T_xx, T_xy, T_yy of xᵀ T⁻¹ x = 1, the ellipse of that area whose axes have the directions and the ratio
-    of the cells' second moments; a disc of that radius has T = radius² 1. ``depth`` [m], (B, K): mean indentation over those cells.
+    ``table`` (B, K, 12) holds them as columns: ``active``, ``centre`` (2), ``shear`` (2), ``twist``, ``ellipse`` (3), ``depth``,
+    ``radius`` and the height z of the pressed gel.
     """
 
-    active: np.ndarray
-    centre: np.ndarray
-    shear: np.ndarray
-    twist: np.ndarray
-    radius: np.ndarray
-    ellipse: np.ndarray
-    depth: np.ndarray
+    table: np.ndarray
+
+    @property
+    def active(self) -> np.ndarray:
+        """Which rows are contacts, (B, K), bool."""
+        return self.table[..., 0] > 0
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Indentation-weighted centre [m], (B, K, 2)."""
+        return self.table[..., 1:3]
+
+    @property
+    def shear(self) -> np.ndarray:
+        """Tangential way of the object at the contact since first touch [m], (B, K, 2)."""
+        return self.table[..., 3:5]
+
+    @property
+    def twist(self) -> np.ndarray:
+        """Turn of the object about +z since first touch [rad], (B, K)."""
+        return self.table[..., 5]
+
+    @property
+    def ellipse(self) -> np.ndarray:
+        """T_xx, T_xy, T_yy of xᵀ T⁻¹ x = 1 [m²], (B, K, 3).
+
+        The ellipse of the contact's area whose axes have the directions and the ratio of the cells' second moments; a disc has
+        T = radius² 1.
+        """
+        return self.table[..., 6:9]
+
+    @property
+    def depth(self) -> np.ndarray:
+        """Mean indentation over the cells that the contact touches [m], (B, K)."""
+        return self.table[..., 9]
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Of a disc with the area of all cells that the contact touches [m], (B, K).
+
+        That is more than the contact's own: for a disc of radius R by cells whose nodes span a × b, on average
+        π radius² = π R² + 2 R (a + b) + a b (Steiner), about R + (a + b)/π, so 0.2 mm for cells of 0.4 mm.
+        """
+        return self.table[..., 10]
 
 
-@dataclass(frozen=True)
-class _Contact:
-    """One contact, as in ``Contacts``: centre, radius, ellipse and depth, height z of the pressed gel, then what the object did to it."""
+class _Contact(NamedTuple):
+    """One contact, as a row of ``Contacts.table`` after its first column."""
 
     x: float
     y: float
-    radius: float
-    ellipse: tuple[float, float, float]
+    shear_x: float
+    shear_y: float
+    twist: float
+    xx: float
+    xy: float
+    yy: float
     depth: float
+    radius: float
     z: float
-    shear_x: float = 0.0
-    shear_y: float = 0.0
-    twist: float = 0.0
+
+
+_Pose = list[list[float]]
+"""Rows of ``pad_from_object``."""
+_NO_CONTACT = (0.0,) * 12
 
 
 class ContactTracker:
@@ -163,7 +234,8 @@ class ContactTracker:
 
     def __init__(self, batch: int) -> None:
         self.batch = batch
-        self.reset()
+        self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
+        self._pose: list[_Pose | None] = [None] * batch
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Forget the history of environments: a mask (B,), a list, or None for all.
@@ -171,138 +243,111 @@ class ContactTracker:
         Raises:
             InputError: an environment that does not exist, or a mask of the wrong length.
         """
-        if envs is None:
-            self._contacts: list[list[_Contact]] = [[] for _ in range(self.batch)]
-            self._pose = np.full((self.batch, 4, 4), np.nan)
-            return
         for b in chosen_envs(envs, self.batch):
             self._contacts[b] = []
-            self._pose[b] = np.nan
+            self._pose[b] = None
 
-    def update(self, surface: GelSurface, samples: ContactSamples) -> Contacts:
+    def update(self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None) -> Contacts:
         """Contacts of ``surface``, whose ``samples`` are given; call once for every surface, in order.
+
+        ``envs``: which environment each of its rows is of; None is all.
 
         Raises:
             InputError: a surface of another number of environments.
         """
-        if surface.batch != self.batch:
-            raise InputError("surface", value=surface.batch, rule=f"must have {self.batch} environments, as this tracker")
-        motion = self._motion(surface.pad_from_object)
-        found = _find(samples)
-        self._contacts = [
-            [_followed(one, before, move) for one in now] for now, before, move in zip(found, self._contacts, motion, strict=True)
+        chosen = range(self.batch) if envs is None else envs
+        if surface.batch != len(chosen):
+            raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")
+        pose = surface.pad_from_object
+        now: list[_Pose | None] = [None] * len(chosen) if pose is None else np.asarray(pose).tolist()
+        history = [(self._contacts[b], self._pose[b]) for b in chosen]
+        contacts = [
+            _followed(found, before, _motion(last, at)) if found and before else found
+            for found, (before, last), at in zip(_find(samples), history, now, strict=True)
         ]
-        count = max(1, max(len(one) for one in self._contacts))
-        table = np.zeros((self.batch, count, 11))
-        for b, contacts in enumerate(self._contacts):
-            for k, c in enumerate(contacts):
-                table[b, k] = 1, c.x, c.y, c.shear_x, c.shear_y, c.twist, c.radius, *c.ellipse, c.depth
-        return Contacts(
-            table[..., 0] > 0, table[..., 1:3], table[..., 3:5], table[..., 5], table[..., 6], table[..., 7:10], table[..., 10]
-        )
-
-    def _motion(self, pose: np.ndarray | None) -> list[tuple[float, ...] | None]:
-        """D's rows of x and y in every environment, (xx, xy, xz, x, yx, yy, yz, y), and its turn about z.
-
-        None where this or the last pose is not known.
-        """
-        before, self._pose = self._pose, np.full_like(self._pose, np.nan) if pose is None else np.array(pose, dtype=float)
-        if pose is None or all(not contacts for contacts in self._contacts):
-            return [None] * self.batch
-        turn = self._pose[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
-        shift = self._pose[:, :3, 3] - (turn @ before[:, :3, 3:])[..., 0]
-        rows = np.concatenate([turn.reshape(-1, 9), shift], axis=1).tolist()
-        return [
-            (*r[:3], r[9], *r[3:6], r[10], math.atan2(r[3] - r[1], r[0] + r[4])) if math.isfinite(sum(r)) else None
-            for r in rows
-        ]  # fmt: skip
+        for b, found, at in zip(chosen, contacts, now, strict=True):
+            self._contacts[b], self._pose[b] = found, at
+        count = max(1, max(map(len, contacts)))
+        return Contacts(np.array([[(1.0, *c) for c in found] + [_NO_CONTACT] * (count - len(found)) for found in contacts]))
 
 
-def chosen_envs(envs: np.ndarray | list[int], batch: int) -> list[int]:
-    """Numbers of the environments that a mask (B,) or a list names.
-
-    Raises:
-        InputError: an environment that does not exist, or a mask of the wrong length.
-    """
-    chosen = np.asarray(envs)
-    if chosen.dtype == bool:
-        if chosen.shape != (batch,):
-            raise InputError("envs", value=chosen.shape, rule=f"a mask must have shape ({batch},)")
-        return np.flatnonzero(chosen).tolist()
-    if chosen.size and (chosen.min() < 0 or chosen.max() >= batch):
-        raise InputError("envs", value=chosen.tolist(), rule=f"must name environments 0 to {batch - 1}")
-    return chosen.astype(int).ravel().tolist()
+def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:
+    """D = T_now T_before⁻¹: its rows of x and y, (xx, xy, xz, x, yx, yy, yz, y), and its turn about z; no motion if a pose is not known."""
+    if before is not None and now is not None:
+        xx, xy, xz = (_dot(now[0], row) for row in before[:3])
+        yx, yy, yz = (_dot(now[1], row) for row in before[:3])
+        at = [row[3] for row in before[:3]]
+        x, y = now[0][3] - _dot((xx, xy, xz), at), now[1][3] - _dot((yx, yy, yz), at)
+        motion = xx, xy, xz, x, yx, yy, yz, y, math.atan2(yx - xy, xx + yy)
+        if math.isfinite(sum(motion)):
+            return motion
+    return 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
 
 
-def _followed(now: _Contact, before: list[_Contact], motion: tuple[float, ...] | None) -> _Contact:
-    """``now`` with the history of the contact before that the motion carries to it, if there is one."""
-    xx, xy, xz, x, yx, yy, yz, y, turn = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0) if motion is None else motion
-    nearest, least = None, math.inf
-    for c in before:
-        carried = xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y
-        apart = math.hypot(now.x - carried[0], now.y - carried[1])
-        if apart < least:
-            nearest, least = (c, carried), apart
-    if nearest is None or least > max(now.radius, nearest[0].radius) + _REACH:
-        return now
-    c, carried = nearest
-    shear_x, shear_y = c.shear_x + carried[0] - c.x, c.shear_y + carried[1] - c.y
-    return _Contact(now.x, now.y, now.radius, now.ellipse, now.depth, now.z, shear_x, shear_y, c.twist + turn)
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float, ...]) -> list[_Contact]:
+    """``found`` with the histories of those contacts before that the motion carries to them."""
+    xx, xy, xz, x, yx, yy, yz, y, turn = motion
+    carried = [(c, xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y) for c in before]
+    followed = []
+    for now in found:
+        at = now.x, now.y
+        c, cx, cy = min(carried, key=lambda one: math.dist(at, one[1:]))
+        if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + _REACH:
+            followed.append(_Contact(*at, c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + turn, *now[5:]))
+        else:
+            followed.append(now)
+    return followed
 
 
 def _find(samples: ContactSamples) -> list[list[_Contact]]:
     """The contacts of every environment, in order of their first row, without history."""
     cells, (r0, r1, c0, c1) = samples.cells, samples.box
-    found: list[list[_Contact]] = [[] for _ in samples.contact]
+    found: list[list[_Contact]] = [[] for _ in range(len(samples.contact))]
     if r1 == r0:
         return found
-    row, start, stop = find_runs(samples.contact[:, r0:r1, c0:c1])
-    if len(row) == 0:
+    edges = find_edges(samples.contact[:, r0:r1, c0:c1])
+    if len(edges) == 0:
         return found
     ny, nx = r1 - r0, c1 - c0
-    # A touch of no depth still has a place: the floor keeps its weights from all being zero.
-    weight = np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9)
-    sums = np.zeros((2, len(weight), nx + 1))
-    sums[0, :, 1:] = weight
-    np.multiply(sums[0, :, 1:], cells.x[c0:c1], out=sums[1, :, 1:])
-    sums = sums.cumsum(axis=2).reshape(2, -1)
-    line = row * (nx + 1)
-    total, along = (sums.take(line + stop, axis=1) - sums.take(line + start, axis=1)).tolist()
-    rows, starts, stops, y = row.tolist(), start.tolist(), stop.tolist(), cells.y[r0:r1].tolist()
+    # Indentation and its moment along x, each run's by one sum. A touch of no depth still has a place: the floor keeps its weights from
+    # all being zero.
+    weights = np.zeros((2, len(found) * ny, nx + 1))
+    np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9, out=weights[0, :, :nx])
+    np.multiply(weights[0, :, :nx], cells.x[c0:c1], out=weights[1, :, :nx])
+    total, along = np.add.reduceat(weights.reshape(2, -1), edges, axis=1)[:, ::2].tolist()
+    rows, columns = (part.tolist() for part in np.divmod(edges, nx + 1))
+    rows, starts, stops, y = rows[::2], columns[::2], columns[1::2], cells.y[r0:r1].tolist()
     # Second moments are taken about the box's corner, in cells: whole numbers, so that nothing cancels.
     pieces: dict[int, list[float]] = {}
-    for i, number in enumerate(join_runs(rows, starts, stops, ny)):
+    for number, row, start, stop, w, wx in zip(
+        join_runs(rows, starts, stops, ny), rows, starts, stops, total, along, strict=True
+    ):
         piece = pieces.get(number)
         if piece is None:
             piece = pieces[number] = [0.0] * 9
-        line, length = rows[i] % ny, stops[i] - starts[i]
-        middle = 0.5 * (starts[i] + stops[i])
-        piece[0] += total[i]
-        piece[1] += along[i]
-        piece[2] += total[i] * y[line]
+        line, length, middle = row % ny, stop - start, 0.5 * (start + stop)
+        piece[0] += w
+        piece[1] += wx
+        piece[2] += w * y[line]
         piece[3] += length
         piece[4] += length * middle
         piece[5] += length * line
         piece[6] += length * (middle * middle + length * length / 12.0)
         piece[7] += length * middle * line
         piece[8] += length * line * line
-    dx, dy = (pitch * nodes for pitch, nodes in zip(cells.grid.pitch, cells.nodes, strict=True))
+    dx, dy = cells.pitch
     for number, (w, wx, wy, count, mx, my, mxx, mxy, myy) in pieces.items():
         area = count * dx * dy / math.pi
         mx, my = mx / count, my / count
         xx, xy, yy = mxx / count - mx * mx, mxy / count - mx * my, myy / count - my * my + 1.0 / 12.0
         xx, xy, yy = xx * dx * dx, xy * dx * dy, yy * dy * dy
         scale = area / math.sqrt(xx * yy - xy * xy)
-        ellipse = scale * xx, scale * xy, scale * yy
-        at = wx / w, wy / w
-        z = _rest_at(cells.grid, *at) - w / count
-        found[rows[number] // ny].append(_Contact(*at, math.sqrt(area), ellipse, w / count, z))
+        at, depth = (wx / w, wy / w), w / count
+        z = cells.rest_at(*at) - depth
+        one = _Contact(*at, 0.0, 0.0, 0.0, scale * xx, scale * xy, scale * yy, depth, math.sqrt(area), z)
+        found[rows[number] // ny].append(one)
     return found
-
-
-def _rest_at(grid: PadGrid, x: float, y: float) -> float:
-    """Height of the resting gel at the node nearest to a place [m]."""
-    column, row = (
-        round((at - float(line[0])) / pitch) for at, line, pitch in zip((x, y), (grid.x, grid.y), grid.pitch, strict=True)
-    )
-    return float(grid.rest[min(row, len(grid.y) - 1), min(column, len(grid.x) - 1)])

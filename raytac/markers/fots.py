@@ -71,7 +71,6 @@ class FotsMarkers:
     ) -> np.ndarray:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert samples is not None and contacts is not None
-        motion = contacts.active, contacts.centre, contacts.shear, contacts.twist, contacts.ellipse, contacts.depth
         if self._xy is None or rest is not self._rest:
             self._rest, self._xy = rest, rest[..., :2]  # one view for every frame: the kernel knows it again
-        return self._kernel.displacement(self._xy, samples.depth, samples.boxes, motion, self.constants)
+        return self._kernel.displacement(self._xy, samples.depth, samples.boxes, contacts.table, self.constants)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -55,14 +56,20 @@ class Perturber:
         draw = self._streams[env].uniform(-1.0, 1.0, 3)
         return self.settings.shift * draw[:2], float(self.settings.turn * draw[2])
 
-    def noise(self, count: int) -> np.ndarray | None:
-        """Errors of the found centres [px], (B, M, 2); None without noise."""
+    def noise(self, count: int, envs: Sequence[int] | None = None) -> np.ndarray | None:
+        """Errors of the found centres [px], (n, M, 2), of environments, all if None; None without noise."""
         if self.settings.noise_px == 0:
             return None
-        return self.settings.noise_px * np.stack([stream.standard_normal((count, 2)) for stream in self._streams])
+        return self.settings.noise_px * self._drawn(lambda stream: stream.standard_normal((count, 2)), envs)
 
-    def visible(self, count: int) -> np.ndarray:
-        """Which markers are found, (B, M), bool."""
+    def visible(self, count: int, envs: Sequence[int] | None = None) -> np.ndarray | None:
+        """Which markers are found, (n, M), bool; None where none is lost."""
         if self.settings.dropout == 0:
-            return np.ones((len(self._streams), count), bool)
-        return np.stack([stream.random(count) >= self.settings.dropout for stream in self._streams])
+            return None
+        return self._drawn(lambda stream: stream.random(count) >= self.settings.dropout, envs)
+
+    def _drawn(self, draw: Callable[[np.random.Generator], np.ndarray], envs: Sequence[int] | None) -> np.ndarray:
+        """One draw of each environment, also of one that is named twice."""
+        chosen = range(len(self._streams)) if envs is None else envs
+        found = {b: draw(self._streams[b]) for b in dict.fromkeys(chosen)}
+        return np.stack([found[b] for b in chosen])

@@ -9,8 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.surface import GelSurface, PadGrid, summary
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker, chosen_envs
+from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.sampling import height_at
@@ -132,6 +133,7 @@ class MarkerTracker:
         self.pattern = pattern
         self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models know it again
         self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
+        self._all = np.broadcast_to(True, self._rest.shape[:2])
         self._grid_rest = self._height_at_rest()
 
     def _height_at_rest(self) -> np.ndarray:
@@ -145,7 +147,7 @@ class MarkerTracker:
         Raises:
             InputError: an environment that does not exist.
         """
-        which = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        which = chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
 
@@ -154,9 +156,9 @@ class MarkerTracker:
         for b, seed in zip(envs, seeds, strict=True):
             self._perturber.reseed(b, seed)
 
-    def at_rest(self) -> MarkerFrame:
-        """Markers of one untouched pad (B = 1), placed as in environment 0; changes no history and draws nothing."""
-        rest, pixel = self.pattern.rest[:1], self.pattern.pixel[:1]
+    def at_rest(self, envs: Sequence[int] = (0,)) -> MarkerFrame:
+        """Markers of untouched pads, placed as in the environments named; changes no history and draws nothing."""
+        rest, pixel = self._rest[list(envs)], self._pixel[list(envs)]
         nothing = np.zeros(pixel.shape)
         return MarkerFrame(nothing, nothing, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
 
@@ -165,45 +167,52 @@ class MarkerTracker:
         if self._cells is not None:
             self._contacts.update(surface, self._cells.sample(surface))
 
-    def update(self, surface: GelSurface) -> MarkerFrame:
+    def update(self, surface: GelSurface, envs: Sequence[int] | None = None) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
+
+        ``envs``: which environment each row of the surface is of; None is all of them. Others keep their history and draw nothing, and one
+        that is named twice goes on and draws once.
 
         Raises:
             InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
         """
-        if surface.batch != self.num_envs:
-            raise InputError("surface", value=surface.batch, rule=f"must have {self.num_envs} environments, as this tracker")
-        # One NaN makes the sum one; the sum is several times cheaper than asking every node, and half as dear by einsum as by sum. First
-        # of all, since it brings the heights into the cache for those who pick some.
-        failed = ~np.isfinite(np.einsum("bij->b", surface.height))
+        count = self.num_envs if envs is None else len(envs)
+        if surface.batch != count:
+            raise InputError("surface", value=surface.batch, rule=f"must have {count} environments, as this tracker")
+        # One NaN makes the sum of squares one, and no height is so large that infinity does not: many times cheaper than asking every
+        # node. First of all, since it brings the heights into the cache for those who pick some.
+        heights = surface.height.reshape(count, -1)
+        failed = ~np.isfinite(np.vecdot(heights, heights))
         samples, contacts = None, None
         if self._cells is not None:
             samples = self._cells.sample(surface)
-            contacts = self._contacts.update(surface, samples)
-        rest = self._rest
+            contacts = self._contacts.update(surface, samples, envs)
+        rest = self._rest if envs is None else self._rest[envs]
         moved = self.model.displacement(rest, surface, samples, contacts)
         if moved.shape[-1] == 3:
             position = rest + moved
         else:
+            position = np.empty(rest.shape)
+            xy = np.add(rest[..., :2], moved, out=position[..., :2])
             # Differences of heights first, so that a marker at rest has moved by exactly nothing.
-            xy = rest[..., :2] + moved
-            z = rest[..., 2] + height_at(surface, xy) - self._grid_rest
-            position = np.concatenate([xy, z[..., None]], axis=-1)
-        return self._frame(rest, position, failed)
+            at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
+            np.subtract(height_at(surface, xy), at_rest, out=position[..., 2])
+            position[..., 2] += rest[..., 2]
+        return self._frame(rest, position, failed, envs)
 
-    def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray) -> MarkerFrame:
-        pixel = self._pixel
+    def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray, envs: Sequence[int] | None) -> MarkerFrame:
+        pixel, everything = (values if envs is None else values[envs] for values in (self._pixel, self._all))
         displacement = position[..., :2] - rest[..., :2]
-        displacement_px = self.pattern.camera.project(position) - pixel
-        noise = self._perturber.noise(self.pattern.count)
+        displacement_px = self.pattern.camera.project(position)
+        displacement_px -= pixel
+        noise = self._perturber.noise(self.pattern.count, envs)
         if noise is not None:
-            displacement_px = displacement_px + noise
-            displacement = displacement + noise * np.asarray(self.sensor.camera.pitch_at(self.pattern.camera.resolution))
-        visible = self._perturber.visible(self.pattern.count)
-        kept = visible & ~failed[:, None]
-        if not kept.all():
-            displacement, displacement_px = (np.where(kept[..., None], d, np.nan) for d in (displacement, displacement_px))
-        return MarkerFrame(displacement, displacement_px, rest, pixel, position, visible)
+            displacement_px += noise
+            displacement += noise * np.asarray(self.sensor.camera.pitch_at(self.pattern.camera.resolution))
+        visible = self._perturber.visible(self.pattern.count, envs)
+        for lost in ([] if visible is None else [~visible]) + ([failed] if failed.any() else []):
+            displacement[lost] = displacement_px[lost] = np.nan
+        return MarkerFrame(displacement, displacement_px, rest, pixel, position, everything if visible is None else visible)
 
 
 def make_model(name: str, sensor: SensorSpec, grid: PadGrid, device: str = "auto") -> MarkerModel:

@@ -10,7 +10,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs, rounded_envs
 from raytac.observe.cells import CellMeans
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout
@@ -76,6 +76,10 @@ class TactileObserver:
         self._drift = CameraDrift(self.sensor, self.randomization, num_envs, seed) if drifts else None
         self._rest: np.ndarray | None = None
         self._rest_rgb: np.ndarray | None = None
+        self._moves_dots = (
+            "rgb" in self.settings.modalities and self.settings.needs_markers and self.randomization.markers.moves_pattern
+        )
+        self._unrested = np.ones(num_envs, bool)
         self._cells: CellMeans | None = None
         self._last: dict[str, np.ndarray] = {}
         self._fresh = np.ones(num_envs, bool)
@@ -115,21 +119,22 @@ class TactileObserver:
         Raises:
             InputError: an environment that does not exist.
         """
-        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)  # type: ignore[arg-type]
+        chosen = chosen_envs(envs, self.num_envs)
         self._fresh[chosen] = True
+        self._unrested[chosen] = True
         if self._drift is not None:
             self._drift.reset(chosen)
-            self._rest = None
 
     def observe(
-        self, frame: TactileFrame, sensor: TactileSensor | None = None, envs: np.ndarray | None = None
+        self, frame: TactileFrame, sensor: TactileSensor | None = None, envs: np.ndarray | Sequence[int] | None = None
     ) -> dict[str, np.ndarray]:
         """Arrays (B, …) by modality, as ``arrays`` say; each its own memory.
 
         Args:
             frame: of a sensor that was made with ``sensor_options``.
             sensor: that sensor; needed for the image at rest, with ``difference``.
-            envs: mask (B,) of environments whose frame is new; the others keep what they observed last. None is all.
+            envs: the environments that the frame's rows are of, a mask (B,) or a list; the others keep what they observed last, and draw
+                nothing. None is all.
 
         An environment that failed keeps what it observed last, or zeros if that was nothing: its frame holds nothing of use.
 
@@ -137,37 +142,81 @@ class TactileObserver:
             InputError: a frame of another number of environments or without what is observed, or a number in it that is not finite
                 where the environment has not failed; the message names the environment.
         """
-        batch = frame.surface.batch
-        if batch != self.num_envs:
-            raise InputError("frame", value=batch, rule=f"must have {self.num_envs} environments, as this observer")
+        batch, rows = frame.surface.batch, np.asarray(chosen_envs(envs, self.num_envs), int)
+        if batch != len(rows):
+            raise InputError("frame", value=batch, rule=f"must have {len(rows)} environments, as this observer")
         failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
-        kept = failed if envs is None else failed | ~envs
-        found = {name: getattr(self, f"_{name}")(frame, sensor) for name in self.settings.modalities}
+        found = {
+            name: self._rgb(frame, sensor, rows) if name == "rgb" else getattr(self, f"_{name}")(frame)
+            for name in self.settings.modalities
+        }
+        return self._finished(found, failed, rows)
+
+    def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
+        """As ``observe``, where nothing but the ``wrench`` is observed, from the world's own: no sensor need look at the pad.
+
+        Args:
+            wrench: of all environments (B, 6).
+            failed: which of them have failed, (B,), bool.
+            envs: mask (B,) of those that are new; the others keep what they observed last.
+
+        Raises:
+            InputError: more is observed, a wrench that is not (B, 6), or that is not finite where the environment has not failed.
+        """
+        if self.settings.needs_frames:
+            rule = "must be the wrench alone; otherwise give a frame"
+            raise InputError("modalities", value=self.settings.modalities, rule=rule)
+        if wrench.shape != (self.num_envs, 6):
+            raise InputError("wrench", value=wrench.shape, rule=f"must have the shape {(self.num_envs, 6)}")
+        rows = np.flatnonzero(envs)
+        return self._finished({"wrench": self._scaled("wrench", wrench[rows])}, failed[rows], rows)
+
+    def _finished(self, found: dict[str, np.ndarray], failed: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
         for name, values in found.items():
-            self._check_finite(name, values, failed)
-        made = {name: self._stacked(name, values, kept) for name, values in found.items()}
-        self._fresh &= kept
-        return made
+            self._check_finite(name, values, failed, rows)
+        if failed.any():
+            rows, found = rows[~failed], {name: values[~failed] for name, values in found.items()}
+        for name, values in found.items():
+            self._stack(name, values, rows)
+        self._fresh[rows] = False
+        return self.last()
+
+    def last(self) -> dict[str, np.ndarray]:
+        """What was observed last, arrays (B, …) as of ``observe``; zeros where that was nothing."""
+        return {name: self._kept(name).copy() for name in self.settings.modalities}
 
     # --- modalities ------------------------------------------------------------------------------------------------------------
 
-    def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
         images = self._cut(_given(frame.rgb, "rgb"))
         if self._drift is not None:
-            images = self._drift.apply(images)
+            images = self._drift.apply(images, envs=rows.tolist())
         if not self.settings.difference:
             return images
-        return ((255 + images.astype(np.int16) - self._at_rest(sensor)) // 2).astype(np.uint8)
+        self._take_rest(sensor, rows)
+        assert self._rest is not None
+        return ((255 + images.astype(np.int16) - self._rest[rows]) // 2).astype(np.uint8)
 
-    def _at_rest(self, sensor: TactileSensor | None) -> np.ndarray:
-        if self._rest_rgb is None:
-            if sensor is None:
-                raise InputError("sensor", value=None, rule="must be given for a difference: it renders the image at rest")
-            self._rest_rgb = self._cut(_given(sensor.rest().rgb, "rgb"))
+    def _take_rest(self, sensor: TactileSensor | None, rows: np.ndarray) -> None:
+        """Render the pads of ``rows`` at rest as their cameras see them, where they have begun anew since."""
+        late = np.unique(rows[self._unrested[rows]])
+        if not len(late):
+            return
+        if sensor is None:
+            raise InputError("sensor", value=None, rule="must be given for a difference: it renders the image at rest")
+        if self._moves_dots:
+            envs = rounded_envs(late.tolist(), self.num_envs)
+            images = self._cut(_given(sensor.rest(envs).rgb, "rgb"))[: len(late)]
+        else:
+            if self._rest_rgb is None:
+                self._rest_rgb = self._cut(_given(sensor.rest().rgb, "rgb"))
+            images = np.repeat(self._rest_rgb, len(late), axis=0)
+        if self._drift is not None:
+            images = self._drift.apply(images, noise=False, envs=late.tolist())
         if self._rest is None:
-            rest = np.broadcast_to(self._rest_rgb, (self.num_envs, *self._rest_rgb.shape[1:]))
-            self._rest = rest if self._drift is None else self._drift.apply(rest, noise=False)
-        return self._rest
+            self._rest = np.zeros((self.num_envs, *images.shape[1:]), np.uint8)
+        self._rest[late] = images
+        self._unrested[late] = False
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
         layout, (width, height) = self.layout, self.layout.observed
@@ -182,24 +231,24 @@ class TactileObserver:
             images = (blocks.sum(axis=(2, 4), dtype=np.uint32) + k * k // 2) // (k * k)
         return images.astype(np.uint8, copy=False)
 
-    def _markers(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _markers(self, frame: TactileFrame) -> np.ndarray:
         markers = _given(frame.markers, "markers")
         moved = np.where(markers.visible[..., None], markers.displacement, 0.0)
         return self._scaled("markers", moved)
 
-    def _marker_visible(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _marker_visible(self, frame: TactileFrame) -> np.ndarray:
         return _given(frame.markers, "marker_visible").visible.astype(np.int8)
 
-    def _height(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _height(self, frame: TactileFrame) -> np.ndarray:
         return self._scaled("height", self._map(frame, frame.surface.height))
 
-    def _indentation(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _indentation(self, frame: TactileFrame) -> np.ndarray:
         return self._scaled("indentation", self._map(frame, frame.surface.indentation))
 
-    def _contact(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _contact(self, frame: TactileFrame) -> np.ndarray:
         return self._map(frame, frame.surface.contact).astype(np.float32)
 
-    def _wrench(self, frame: TactileFrame, sensor: TactileSensor | None) -> np.ndarray:
+    def _wrench(self, frame: TactileFrame) -> np.ndarray:
         return self._scaled("wrench", _given(frame.wrench, "wrench"))
 
     def _map(self, frame: TactileFrame, values: np.ndarray) -> np.ndarray:
@@ -212,33 +261,34 @@ class TactileObserver:
 
     # --- last frames -----------------------------------------------------------------------------------------------------------
 
-    def _check_finite(self, name: str, values: np.ndarray, failed: np.ndarray) -> None:
+    def _check_finite(self, name: str, values: np.ndarray, failed: np.ndarray, rows: np.ndarray) -> None:
         if values.dtype.kind != "f":
             return
         bad = ~np.isfinite(values.reshape(len(values), -1).sum(axis=1)) & ~failed
         if bad.any():
-            env = int(np.flatnonzero(bad)[0])
-            rule = f"holds a number that is not finite, in environment {env}, which has not failed"
-            raise InputError(
-                f"frame ({name})", value=values[env].reshape(-1)[~np.isfinite(values[env].reshape(-1))][:3], rule=rule
-            )
+            first = int(np.flatnonzero(bad)[0])
+            rule = f"holds a number that is not finite, in environment {rows[first]}, which has not failed"
+            numbers = values[first].reshape(-1)
+            raise InputError(f"frame ({name})", value=numbers[~np.isfinite(numbers)][:3], rule=rule)
 
-    def _stacked(self, name: str, now: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        spec, count = self.arrays[name], self.settings.stack
+    def _kept(self, name: str) -> np.ndarray:
         if name not in self._last:
+            spec = self.arrays[name]
             self._last[name] = np.zeros((self.num_envs, *spec.shape), spec.dtype)
-        last = self._last[name]
-        new, begun = ~kept, self._fresh & ~kept
+        return self._last[name]
+
+    def _stack(self, name: str, now: np.ndarray, rows: np.ndarray) -> None:
+        """Put what ``rows`` observe ``now`` upon what they did before."""
+        count, last, begun = self.settings.stack, self._kept(name), self._fresh[rows]
         if count == 1:
-            last[new] = now[new]
+            last[rows] = now
         elif name == "rgb":
             # Channels are images of three, oldest first.
-            last[new] = np.concatenate([last[new][..., 3:], now[new]], axis=-1)
-            last[begun] = np.tile(now[begun], (1, 1, 1, count))
+            last[rows] = np.concatenate([last[rows][..., 3:], now], axis=-1)
+            last[rows[begun]] = np.tile(now[begun], (1, 1, 1, count))
         else:
-            last[new] = np.concatenate([last[new][:, 1:], now[new][:, None]], axis=1)
-            last[begun] = now[begun][:, None]
-        return last.copy()
+            last[rows] = np.concatenate([last[rows][:, 1:], now[:, None]], axis=1)
+            last[rows[begun]] = now[begun][:, None]
 
 
 def _given(value: Any, name: str) -> Any:

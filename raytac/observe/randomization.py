@@ -120,11 +120,15 @@ class CameraDrift:
             exponent = self._gamma * (1.0 + r.gamma * draw[4])
             self._curves[b] = 255.0 * (gain[:, None] * level**self._gamma) ** (1.0 / exponent)
 
-    def apply(self, images: np.ndarray, *, noise: bool = True) -> np.ndarray:
-        """8-bit images (B, H, W, 3) as these cameras give them; ``noise``: with that of a frame."""
-        batch, channel = np.arange(len(images))[:, None, None, None], np.arange(3)
-        values = self._curves[batch, channel, images]
+    def apply(self, images: np.ndarray, *, noise: bool = True, envs: Sequence[int] | None = None) -> np.ndarray:
+        """8-bit images (n, H, W, 3) as these cameras give them; ``noise``: with that of a frame.
+
+        ``envs``: whose camera took each; None is all in order. Others draw no noise, and one that is named twice draws once.
+        """
+        chosen = list(range(len(self._streams))) if envs is None else list(envs)
+        values = self._curves[np.asarray(chosen)[:, None, None, None], np.arange(3), images]
         if noise and self._settings.noise:
             shape = images.shape[1:]
-            values = values + self._settings.noise * np.stack([s.standard_normal(shape, np.float32) for s in self._streams])
+            drawn = {b: self._streams[b].standard_normal(shape, np.float32) for b in dict.fromkeys(chosen)}
+            values = values + self._settings.noise * np.stack([drawn[b] for b in chosen])
         return np.clip(values + 0.5, 0.0, 255.0).astype(np.uint8)

@@ -110,6 +110,11 @@ class ObservationSettings:
         return "markers" in self.modalities or "marker_visible" in self.modalities
 
     @property
+    def needs_frames(self) -> bool:
+        """Whether anything but the force is observed, for which a sensor must look at the pad's surface."""
+        return self.modalities != ("wrench",)
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """What must be asked of a ``TactileSensor``; the surface itself, which maps are made from, it always gives."""
         return tuple(name for name in ("rgb", "wrench") if name in self.modalities)

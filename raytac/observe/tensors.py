@@ -1,11 +1,9 @@
-"""Observations as PyTorch tensors that share the arrays' memory."""
+"""Observations as PyTorch tensors that share the arrays' memory, on the host or on a device."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from raytac.errors import BackendError
 
@@ -23,6 +21,5 @@ def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
     except ImportError as error:
         raise BackendError(f"tensors need PyTorch ({error}): `pip install raytac[rl]`") from error
     return {
-        name: torch.from_dlpack(value) if isinstance(value, np.ndarray) else as_tensors(value)
-        for name, value in observation.items()
+        name: as_tensors(value) if isinstance(value, Mapping) else torch.from_dlpack(value) for name, value in observation.items()
     }

@@ -20,8 +20,14 @@ distance from G_c (``_outside`` has both for an ellipse), t = A / r and g(t) = t
     twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
 
 On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
-of mean indentation h̄ sticks up to |Δs| = c h̄ A and |Δθ| A = ``TWIST_SLIP`` c h̄ A, and slips beyond: by Coulomb, where 8 G A Δs / (2 − ν)
-reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G).
+of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄: by Coulomb, where 8 G A Δs / (2 − ν) reaches
+μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G). Force F and couple M together stay on or within
+an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for sliding manipulation, IJRR 15(6),
+1996); beyond it the contact slips along the ellipsoid's normal. So what is left of Δs and Δθ, in which F and M are linear, is
+
+    Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
+
+(closest point, in elastic energy, as of ideal plasticity; b is the ratio of F_max Δs_max to M_max Δθ_max on incompressible rubber).
 """
 
 from __future__ import annotations
@@ -43,10 +49,15 @@ __all__ = ["TWIST_SLIP", "FotsConstants", "FotsKernel"]
 _NEGLIGIBLE = 16.0
 """A Gaussian's exponent beyond which it is left out: e⁻¹⁶ is what float32 cannot add to 1."""
 _ROW = 12
-"""Floats a contact: active, G, Δs, Δθ, T_xx, T_xy, T_yy, h̄ and two unused, so that three packet gathers bring one."""
+"""Floats a contact, which three packet gathers bring: active, G, Δs, Δθ, T_xx, T_xy, T_yy, h̄ and two that nobody reads here."""
+_PACKET = 4
+"""Samples that one gather brings."""
 TWIST_SLIP = 3 * math.pi / 16
 """Way at the edge of a contact when it spins over the shear when it slides, both as far as it would stick: of a ball on incompressible
 rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so 9π/32 / (2 − ν)."""
+
+_LIMIT_STEPS = 3
+"""Newton steps of ``_limited``: to float32's rounding at any shear and twist (a test compares with bisection)."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,7 @@ class FotsKernel:
         """
         self.mi, self.device = load_mitsuba(device)
         self.nx, self.ny = len(x), len(y)
+        self._packets = -(-self.nx // _PACKET)
         self._origin = float(x[0]), float(y[0])
         self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
         self._frozen: dict[tuple[int, int, bool], Any] = {}
@@ -85,7 +97,7 @@ class FotsKernel:
         markers: np.ndarray,
         depth: np.ndarray,
         boxes: np.ndarray,
-        contacts: tuple[np.ndarray, ...],
+        contacts: np.ndarray,
         constants: FotsConstants,
     ) -> np.ndarray:
         """Displacement [m] of markers at rest, shape (B, M, 2), float32.
@@ -94,31 +106,30 @@ class FotsKernel:
             markers: x, y at rest [m], (B, M, 2).
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
             boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
-            contacts: (active (B, K), centre (B, K, 2) [m], shear (B, K, 2) [m], twist (B, K) [rad], ellipse (B, K, 3) [m²], mean
-                indentation (B, K) [m]).
+            contacts: (B, K, 12): active or not, centre [m] (2), shear [m] (2), twist [rad], ellipse [m²] (3), mean indentation [m],
+                and two columns more that do not matter here, as ``raytac.markers.contacts.Contacts.table`` has them.
             constants: of the pad.
         """
         mi = self.mi
         batch, count = markers.shape[:2]
-        k = 1 << (contacts[0].shape[1] - 1).bit_length()
-        # Contacts, boxes and depths in one array: one upload. Whole numbers as small as a grid's are exact in float32.
-        box, sample = batch * k * _ROW, batch * (k * _ROW + 4)
-        end = sample + batch * self.nx * self.ny
-        frame = np.zeros(end + -end % 4, dtype=np.float32)  # packet gathers want whole packets of four
-        active, centre, shear, twist, ellipse, mean = contacts
-        filled = frame[:box].reshape(batch, k, _ROW)[:, : active.shape[1]]
-        filled[..., 0], filled[..., 1:3], filled[..., 3:5], filled[..., 5] = active, centre, shear, twist
-        filled[..., 6:9], filled[..., 9] = ellipse, mean
-        frame[box:sample].reshape(batch, 4)[:] = boxes
-        frame[sample:end].reshape(batch, self.ny, self.nx)[:] = depth
+        given = contacts.shape[1]
+        k = 1 << (given - 1).bit_length()
+        # Contacts, boxes and depths in one array: one upload, all of it whole packets. Whole numbers as small as a grid's are exact in
+        # float32.
+        box, sample = batch * k * _ROW, batch * (k * _ROW + _PACKET)
+        frame = np.zeros(sample + batch * self.ny * self._packets * _PACKET, dtype=np.float32)
+        frame[:box].reshape(batch, k, _ROW)[:, :given] = contacts
+        frame[box:sample].reshape(batch, _PACKET)[:] = boxes
+        frame[sample:].reshape(batch, self.ny, -1)[..., : self.nx] = depth
         inputs = self._on_device(markers), mi.Float(frame), self._constants(constants)
         is_punch = constants.punch is not None
         key = batch, k, is_punch
         if key not in self._frozen:
-            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays))
+            # All inputs are arrays in memory: there is nothing to make opaque.
+            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays), auto_opaque=False)
         with no_collection():
             moved = self._frozen[key](*inputs)
-        return np.array(moved).reshape(batch, count, 2)
+        return moved.numpy().reshape(batch, count, 2).copy()
 
     def _on_device(self, markers: np.ndarray) -> Any:
         """Places at rest hardly ever change, so the upload is kept; a view that nobody may write is known again without a look."""
@@ -141,22 +152,23 @@ class FotsKernel:
         return self._numbers[1]
 
     def _sums(self, batch: int, count: int, k: int, is_punch: bool, xy: Any, frame: Any, constants: Any) -> Any:
-        """``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, nx), one after the other."""
+        """``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, packets, 4), one after the other."""
         mi = self.mi
         i = dr.arange(mi.UInt32, batch * count)
         env = i // count
         place = dr.gather(mi.Point2f, xy, i)
         gain, ld, *others = (dr.gather(mi.Float, constants, n) for n in range(dr.width(constants)))
         drag = _drag(mi, env, place, frame, k, others, _stuck if is_punch else _gaussian)
-        box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // 4 + env)
-        first = mi.Int32(env) * (self.nx * self.ny) + batch * (k * _ROW + 4)
+        box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // _PACKET + env)
+        first = mi.Int32(env) * (self.ny * self._packets) + batch * (k * _ROW // _PACKET + 1)
         dilate = self._dilate(place + drag, frame, box, first, ld) * (gain * self._pitch[0] * self._pitch[1])
         return dr.ravel(dilate + drag)
 
     def _dilate(self, place: Any, frame: Any, box: Any, first: Any, ld: Any) -> Any:
         """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker.
 
-        ``first``: where the samples of the marker's pad begin in ``frame``.
+        ``first``: the packet of ``frame`` with which the samples of the marker's pad begin. Beyond the box samples are 0, so whole packets
+        do no harm.
         """
         mi, (x0, y0), (dx, dy) = self.mi, self._origin, self._pitch
         reach = dr.sqrt(_NEGLIGIBLE / ld)
@@ -169,18 +181,23 @@ class FotsKernel:
             dr.maximum(r0, mi.Int32(dr.ceil((place.y - reach - y0) / dy))),
             dr.minimum(r1, mi.Int32((place.y + reach - y0) / dy) + 1),
         )
+        r1 = dr.select(c0 < c1, r1, r0)
+        p0, p1 = c0 // _PACKET, (c1 - 1) // _PACKET
 
-        def inside(c: Any, r: Any, sx: Any, sy: Any) -> Any:
-            return (r < r1) & (c0 < c1)
+        def inside(p: Any, r: Any, sx: Any, sy: Any) -> Any:
+            return r < r1
 
-        def add(c: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
-            h = dr.gather(mi.Float, frame, first + r * self.nx + c)
-            ex, ey = place.x - (x0 + mi.Float(c) * dx), place.y - (y0 + mi.Float(r) * dy)
-            w = h * dr.exp(-ld * (ex * ex + ey * ey))
-            wrap = c + 1 >= c1
-            return dr.select(wrap, c0, c + 1), dr.select(wrap, r + 1, r), sx + w * ex, sy + w * ey
+        def add(p: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
+            depths = dr.gather(mi.Vector4f, frame, first + r * self._packets + p)
+            ex, ey = place.x - (x0 + mi.Float(p * _PACKET) * dx), place.y - (y0 + mi.Float(r) * dy)
+            total, along = mi.Float(0), mi.Float(0)
+            for h in depths:
+                w = h * dr.exp(-ld * (ex * ex + ey * ey))
+                total, along, ex = total + w, along + w * ex, ex - dx
+            wrap = p >= p1
+            return dr.select(wrap, p0, p + 1), dr.select(wrap, r + 1, r), sx + along, sy + total * ey
 
-        start = (mi.Int32(c0), mi.Int32(r0), mi.Float(0), mi.Float(0))
+        start = (mi.Int32(p0), mi.Int32(r0), mi.Float(0), mi.Float(0))
         _, _, sx, sy = dr.while_loop(start, inside, add, label="dilate")
         return mi.Vector2f(sx, sy)
 
@@ -216,7 +233,7 @@ def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: An
     a, b, c = row
     radius = dr.sqrt(dr.sqrt(dr.maximum(b.z * c.x - b.w * b.w, 1e-24)))
     most = slip * c.y * radius
-    way = _at_most(mi.Vector2f(a.w, b.x), most)
+    way, turn = _limited(mi.Vector2f(a.w, b.x), b.y, most, TWIST_SLIP * slip * c.y)
     out = place - (mi.Point2f(a.y, a.z) - way)
     beyond = _outside(out, b.z, b.w, c.x)
     r2 = radius * radius + beyond
@@ -226,9 +243,24 @@ def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: An
     fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
     along = dr.dot(out, way) / dr.maximum(dr.squared_norm(out), 1e-18) * out
     sheared = share * fade * ((asin - kappa * g) * way + 2 * kappa * g * along)
-    widest = TWIST_SLIP * most / radius
     wt = share * (asin - g)
-    return share * fade * asin, sheared, wt, wt * _turned(mi, out, dr.clip(b.y, -widest, widest))
+    return share * fade * asin, sheared, wt, wt * _turned(mi, out, turn)
+
+
+def _limited(way: Any, turn: Any, most: Any, widest: Any) -> tuple[Any, Any]:
+    """The shear and the twist that are left where the contact slips, of those that the object has made.
+
+    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be.
+    """
+    ratio = 1 / TWIST_SLIP**2
+    x0, y0 = dr.norm(way) / dr.maximum(most, 1e-12), dr.abs(turn) / dr.maximum(widest, 1e-12)
+    gamma = dr.maximum(dr.maximum(x0 - 1, (y0 - 1) / ratio), 0)
+    for _ in range(_LIMIT_STEPS):
+        p, q = 1 + gamma, 1 + ratio * gamma
+        x2, y2 = dr.square(x0 / p), dr.square(y0 / q)
+        n = dr.sqrt(x2 + y2)
+        gamma += n * n * dr.maximum(n - 1, 0) / dr.maximum(x2 / p + ratio * y2 / q, 1e-12)
+    return way / (1 + gamma), turn / (1 + ratio * gamma)
 
 
 def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> Any:

@@ -149,7 +149,9 @@ def trace(
 
     def shine(si: Any, beta: Any, radiance: list[Any], active: Any) -> list[Any]:
         """The case's even glow where the path meets it."""
-        radiance, met = list(radiance), active & scene.on_case(si) if glow else None
+        if not glow:
+            return radiance
+        radiance, met = list(radiance), active & scene.on_case(si)
         for group, even in glow:
             for c in range(3):
                 radiance[3 * group + c] = radiance[3 * group + c] + dr.select(met, beta[c] * even[c], 0)

@@ -1,4 +1,4 @@
-"""Checks of what a batch is given: poses with or without the axis of environments, and choices of environments."""
+"""Checks of what a batch is given: poses with or without the axis of environments."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from raytac.errors import InputError
 
-__all__ = ["batch_of", "env_mask", "rigid_poses"]
+__all__ = ["batch_of", "rigid_poses"]
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
@@ -29,17 +29,3 @@ def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = No
     if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
         raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
     return np.broadcast_to(array, (batch, *shape)).copy()
-
-
-def env_mask(envs: ArrayLike | None, batch: int) -> np.ndarray:
-    """A mask (B,) of environments from a mask, numbers, or None for all; raises ``InputError``."""
-    if envs is None:
-        return np.ones(batch, bool)
-    chosen = np.asarray(envs)
-    if chosen.dtype == bool and chosen.shape == (batch,):
-        return chosen.copy()
-    if chosen.dtype == bool or (chosen.size and not (chosen.min() >= 0 and chosen.max() < batch)):
-        raise InputError("envs", value=envs, rule=f"must be a mask ({batch},) or numbers below {batch}")
-    mask = np.zeros(batch, bool)
-    mask[chosen.astype(int)] = True
-    return mask

@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.part import Part, hfield_part, mesh_part, primitive
+from raytac.physics.rotation import rotation_of
 
 __all__ = ["GEOM_TYPES", "body_parts", "geom_part", "load_mjcf"]
 
@@ -103,7 +104,6 @@ def _mesh(model: mujoco.MjModel, data: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    pose, rotation = np.eye(4), np.empty(9)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_of(quaternion), position
     return pose

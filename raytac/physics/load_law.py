@@ -36,7 +36,9 @@ def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
         -8.0 / np.pi**3 * (α**3 + 4.0 * np.pi**2 / 15.0 * β),
         16.0 * α / np.pi**4 * (α**3 + 3.0 * np.pi**2 / 5.0 * β),
     )
-    stiffening = sum(c * (1.0 + n / 3.0) * ratio**n for n, c in enumerate(series))
+    stiffening = np.zeros_like(ratio)
+    for n in range(len(series) - 1, -1, -1):  # Horner's scheme: powers are dear
+        stiffening = stiffening * ratio + series[n] * (1.0 + n / 3.0)
     confined = gelpad.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
     return np.minimum(stiffening, 1.0 + 0.5 * np.pi * confined / reduced_modulus(gelpad) * ratio)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,24 @@ class PadReading:
     """Environments whose physics broke down, shape (B,), bool."""
     traction: Callable[[], np.ndarray]
     """Computes the traction on the pad [Pa], shape (B, Ny, Nx, 3), as ``TactileFrame.traction``; called only if it is asked for."""
+
+    def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
+        """The same of the environments named, one row each."""
+        whole, rows = self.surface, np.asarray(envs)
+        coat = None if whole.coat is None else replace(whole.coat, positions=whole.coat.positions[rows])
+        others = {
+            name: None if values is None else values[rows]
+            for name, values in (("pad_from_object", whole.pad_from_object), ("ink", whole.ink))
+        }
+        surface = replace(
+            whole,
+            height=whole.height[rows],
+            contact=whole.contact[rows],
+            contact_centre=whole.contact_centre[rows],
+            coat=coat,
+            **others,
+        )
+        return PadReading(surface, self.wrench[rows], self.failed[rows], lambda: self.traction()[rows])
 
     @property
     def force(self) -> np.ndarray:

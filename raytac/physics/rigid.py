@@ -21,10 +21,9 @@ from raytac.physics.press_plan import (
     about_z,
     check_trajectory,
     peak_state,
-    per_environment,
-    rotation_matrix,
     scene_parts,
 )
+from raytac.physics.press_targets import PressTargets
 from raytac.physics.rig import PressRig
 from raytac.specs.press import DYNAMICS, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -70,6 +69,9 @@ class RigidPad:
         seed: int = 0,
         offsets: np.ndarray | None = None,
         depths: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+        shears: np.ndarray | None = None,
+        twists: np.ndarray | None = None,
     ) -> None:
         """Build the grid, the object and, with an object, one rig for every environment.
 
@@ -79,16 +81,17 @@ class RigidPad:
             pitch: spacing of the pad's grid [m].
             num_envs: number of environments B.
             seed: accepted for symmetry with sampled physics; nothing here is random.
-            offsets: added to the object's x, y per environment [m], shape (B, 2). Not finite: that environment fails.
-            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+            offsets, depths, rotations, shears, twists: what environments do each in their own way, see ``PressTargets``; not finite:
+                that environment fails.
 
         Raises:
             InputError: arguments of the wrong shape, ``depths`` deeper than the pad.
             SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
         """
         self.sensor, self.scene, self.seed, self.num_envs = sensor, scene, seed, num_envs
-        if num_envs < 1:
-            raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
+        self._targets = PressTargets(
+            scene, num_envs, offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists
+        )
         if scene.object.dynamics == "soft":
             rule = "is for the simulated pad, physics='ipc': the rigid pad's object does not give way"
             choices = tuple(name for name in DYNAMICS if name != "soft")
@@ -96,13 +99,11 @@ class RigidPad:
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
         self._surround = ElasticSurround(self.grid)
-        self._offsets = per_environment("offsets", offsets, (num_envs, 2))
-        self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
-        self._rotation = rotation_matrix(scene.object.quaternion)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
         self._environments: list[_Environment] = []
         """Where the last state left the object; empty before the first, and without an object."""
-        check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
+        self._last: tuple[ContactState, GelSurface] | None = None
+        check_trajectory(scene, sensor.gelpad, self.parts, self._targets.depths)
 
     def run(self, steps_per_stage: int = 1) -> Iterator[ContactState]:
         """States along the trajectory: one before it (lifted by ``CLEARANCE``), then ``steps_per_stage`` through each stage.
@@ -145,8 +146,10 @@ class RigidPad:
         return peak_state(self.scene, states)
 
     def surface(self, state: ContactState) -> GelSurface:
-        """Gel surface at a state."""
-        return self.surface_from_pose(state.pad_from_object)
+        """Gel surface at a state; that of the last state asked for is kept, since wrench and traction need it again."""
+        if self._last is None or self._last[0] is not state:
+            self._last = state, self.surface_from_pose(state.pad_from_object)
+        return self._last[1]
 
     def wrench(self, state: ContactState) -> np.ndarray:
         """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6).
@@ -193,11 +196,11 @@ class RigidPad:
             yield self._state(index, stage.kind, step / steps)
 
     def _start(self, b: int) -> _Environment:
-        x, y = np.asarray(self.scene.object.position[:2]) + self._offsets[b]
-        if not np.isfinite([x, y]).all() or (self._depths is not None and not np.isfinite(self._depths[b])):
+        x, y = np.asarray(self.scene.object.position[:2]) + self._targets.offsets[b]
+        if self._targets.lost[b]:
             return _Environment(np.full(3, np.nan), self._rig(1.0), failed=True)
         try:
-            touch, law = self._touch(x, y, 0.0)
+            touch, law = self._touch(b, x, y, 0.0)
         except InputError as error:
             place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
             raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
@@ -223,10 +226,10 @@ class RigidPad:
         kept = f"the force kept here, {error.value:.4g} N, " if error.name == "force" and stage.kind != "indent" else ""
         return SpecError(kept + error.rule, file=self.scene.source, key=f"trajectory[{index}].{name}", value=value)
 
-    def _touch(self, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
+    def _touch(self, b: int, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
         """First-touch height of the object's origin and load law at a place and angle; kept, since environments share them."""
         pose = np.eye(4)
-        pose[:3, :3] = about_z(twist) @ self._rotation
+        pose[:3, :3] = about_z(twist) @ self._targets.rotations[b]
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
@@ -241,6 +244,7 @@ class RigidPad:
     ) -> None:
         """Bring one environment from where it was before a stage to ``fraction`` of it."""
         assert old.shear is not None
+        stage = self._targets.stage(stage, b)
         previous_force = e.force
         assert e.shear is not None
         shear, twist = e.shear, e.twist
@@ -249,7 +253,7 @@ class RigidPad:
         elif stage.kind == "twist":
             twist = old.twist + fraction * (stage.twist - old.twist)
         try:
-            touch, law = self._touch(e.origin[0] + shear[0], e.origin[1] + shear[1], twist)
+            touch, law = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], twist)
         except InputError as error:
             raise self._stage_error(index, stage, error) from error
         e.shear, e.twist = shear, twist
@@ -261,8 +265,7 @@ class RigidPad:
             e.by_force = False
             e.depth = old.depth + fraction * (lift - CLEARANCE - old.depth)
         elif stage.kind == "indent" and stage.depth is not None:
-            target = stage.depth if self._depths is None else float(self._depths[b])
-            e.depth = max(old.depth, 0.0) + fraction * (target - max(old.depth, 0.0))
+            e.depth = max(old.depth, 0.0) + fraction * (stage.depth - max(old.depth, 0.0))
         if e.by_force:
             target = old.force + fraction * ((stage.force or old.force) - old.force)
             try:
@@ -276,9 +279,9 @@ class RigidPad:
         if not e.failed:
             e.force = e.rig.hold(np.array([*e.shear, -e.depth, e.twist]), law.secant_stiffness)
             e.failed = not np.isfinite(e.force)
-        self._stick(e)
+        self._stick(b, e)
 
-    def _stick(self, e: _Environment) -> None:
+    def _stick(self, b: int, e: _Environment) -> None:
         """Let the contact slip where the gel's elastic shear or twist would exceed Coulomb's limit."""
         assert e.shear is not None
         if e.force <= 0.0 or e.failed:
@@ -286,7 +289,7 @@ class RigidPad:
             return
         if e.stuck_shear is None:
             e.stuck_shear, e.stuck_twist = e.shear.copy(), e.twist
-        _, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
+        _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
         stretch, angle = e.shear - e.stuck_shear, e.twist - e.stuck_twist
         limit = self.sensor.gelpad.friction * e.force
         longest = limit / law.shear_stiffness(e.rig.depth)
@@ -303,13 +306,13 @@ class RigidPad:
         depth, force, torque, area = np.zeros((4, batch))
         shear = np.zeros((batch, 2))
         failed = np.zeros(batch, bool)
-        turn = np.eye(4)
-        turn[:3, :3] = self._rotation
+        turns = np.tile(np.eye(4), (batch, 1, 1))
+        turns[:, :3, :3] = self._targets.rotations
         for b, e in enumerate(environments):
-            pose[b], case[b] = e.rig.pad_from_object @ turn, e.rig.world_from_pad
+            pose[b], case[b] = e.rig.pad_from_object @ turns[b], e.rig.world_from_pad
             depth[b], force[b] = e.depth, e.force
             if e.stuck_shear is not None and e.shear is not None:
-                _, law = self._touch(e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
+                _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
                 shear[b] = law.shear_stiffness(e.rig.depth) * (e.shear - e.stuck_shear)
                 area[b] = np.pi * law.contact_radius(e.rig.depth) ** 2
                 torque[b] = law.twist_stiffness(e.rig.depth) * (e.twist - e.stuck_twist)

@@ -7,20 +7,70 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
-__all__ = ["between", "inverse", "nearest_rotation", "quaternion", "quaternions", "rotations", "turn_angle"]
+__all__ = [
+    "between",
+    "inverse",
+    "nearest_rotation",
+    "quaternion",
+    "quaternions",
+    "rotation_of",
+    "rotation_vector",
+    "rotations",
+    "turn_angle",
+]
 
 
-def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit quaternion wxyz of a rotation matrix (3, 3)."""
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion w, x, y, z (4,) of a rotation matrix (3, 3)."""
     found = np.empty(4)
     mujoco.mju_mat2Quat(found, np.ascontiguousarray(rotation, float).ravel())
-    return tuple((found / np.linalg.norm(found)).tolist())
+    return found
+
+
+def rotation_of(quaternion: ArrayLike) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion w, x, y, z."""
+    found = np.empty(9)
+    mujoco.mju_quat2Mat(found, np.asarray(quaternion, float))
+    return found.reshape(3, 3)
 
 
 def quaternions(poses: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz of poses (B, 4, 4), shape (B, 4)."""
-    return np.array([quaternion(pose[:3, :3]) for pose in poses])
+    return _quaternions(poses[:, :3, :3])
+
+
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """log R (…, 3) [rad] of rotation matrices (…, 3, 3), at most π long."""
+    q = _quaternions(rotation)
+    q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
+    sine = np.sqrt(np.square(q[..., 1:]).sum(axis=-1, keepdims=True))
+    # θ / sin(θ/2), 2 where there is no turn
+    factor = np.where(sine > 0.0, 2.0 * np.arctan2(sine, q[..., :1]) / np.where(sine > 0.0, sine, 1.0), 2.0)
+    return factor * q[..., 1:]
+
+
+def _quaternions(r: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz (…, 4) of rotation matrices (…, 3, 3).
+
+    The component is rooted that is greatest (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so that
+    they are as accurate at no turn as at half a turn.
+    """
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    x, y, z = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    xy, yz, zx = r[..., 0, 1] + r[..., 1, 0], r[..., 1, 2] + r[..., 2, 1], r[..., 2, 0] + r[..., 0, 2]
+    # Row k is the quaternion (w, x, y, z) times four times its k-th component.
+    rows = (
+        (1.0 + xx + yy + zz, x, y, z),
+        (x, 1.0 + xx - yy - zz, xy, zx),
+        (y, xy, 1.0 - xx + yy - zz, yz),
+        (z, zx, yz, 1.0 - xx - yy + zz),
+    )
+    products = np.stack([entry for row in rows for entry in row], axis=-1).reshape(*x.shape, 4, 4)
+    greatest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    q = np.take_along_axis(products, greatest[..., None, None], axis=-2)[..., 0, :]
+    return q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
 
 
 def inverse(poses: np.ndarray) -> np.ndarray:
@@ -53,9 +103,7 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
     found = np.tile(np.eye(4), (len(start), 1, 1))
     for pose, one in zip(found, q / np.linalg.norm(q, axis=1, keepdims=True), strict=True):
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, one)
-        pose[:3, :3] = matrix.reshape(3, 3)
+        pose[:3, :3] = rotation_of(one)
     found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
     return found
 

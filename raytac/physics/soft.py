@@ -19,9 +19,9 @@ from raytac.physics.press_plan import (
     CLEARANCE,
     check_trajectory,
     peak_state,
-    per_environment,
     scene_parts,
 )
+from raytac.physics.press_targets import PressTargets
 from raytac.physics.soft_bodies import object_body
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_drive import SoftDrive
@@ -70,6 +70,9 @@ class SoftPad:
         seed: int = 0,
         offsets: np.ndarray | None = None,
         depths: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+        shears: np.ndarray | None = None,
+        twists: np.ndarray | None = None,
         device: str = "cpu",
     ) -> None:
         """Cut the pad, make the object's surface and put both into the solver.
@@ -81,8 +84,8 @@ class SoftPad:
             pad: a level of ``PAD_LEVELS``, or a mesh of one's own.
             num_envs: number of environments B.
             seed: accepted for symmetry with sampled physics; nothing here is random.
-            offsets: added to the object's x, y per environment [m], shape (B, 2). Not finite: that environment fails.
-            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+            offsets, depths, rotations, shears, twists: what environments do each in their own way, see ``PressTargets``; not finite:
+                that environment fails.
             device: where the solver runs, ``cpu`` or ``cuda``.
 
         Raises:
@@ -90,31 +93,27 @@ class SoftPad:
             SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
             RaytacError: the object overlaps the pad where it starts.
         """
-        if num_envs < 1:
-            raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
+        targets = self._targets = PressTargets(
+            scene, num_envs, offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists
+        )
         self.sensor, self.scene, self.seed, self.num_envs = sensor, scene, seed, num_envs
         self.mesh = pad if isinstance(pad, PadMesh) else pad_mesh(sensor.gelpad, pad)
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
-        self._offsets = per_environment("offsets", offsets, (num_envs, 2))
-        self._depths = None if depths is None else per_environment("depths", depths, (num_envs,))
-        check_trajectory(scene, sensor.gelpad, self.parts, self._depths)
+        check_trajectory(scene, sensor.gelpad, self.parts, targets.depths)
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
         self.solver: SoftContact | None = None
         """Pad and object in the contact solver; None without an object."""
-        lost = np.asarray(~np.isfinite(self._offsets).all(axis=1))
-        if self._depths is not None:
-            lost = lost | ~np.isfinite(self._depths)
         self._drive: SoftDrive | None = None
         if self.parts:
-            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, self._offsets, lost)
+            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, targets)
             above = self._places.poses(
                 np.full(num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((num_envs, 2)), np.zeros(num_envs)
             )
             self.solver = SoftContact(sensor, self.mesh, self._body(), above, device)
-            self._drive = SoftDrive(scene, self.solver, self._reader, self._places, self._depths, lost)
+            self._drive = SoftDrive(scene, self.solver, self._reader, self._places, targets)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
@@ -258,7 +257,8 @@ class SoftPad:
     def _deepest(self) -> float:
         """Depth that the object's surface was made for [m]; a force may go as deep as the pad."""
         deepest = max((stage.depth or self.sensor.gelpad.thickness for stage in self.scene.trajectory), default=0.0)
-        return deepest if self._depths is None else max(deepest, float(np.nanmax(self._depths, initial=0.0)))
+        depths = self._targets.depths
+        return deepest if depths is None else max(deepest, float(np.nanmax(depths, initial=0.0)))
 
     def _body(self):
         settings = {
@@ -268,7 +268,7 @@ class SoftPad:
             "sag": _SAG * self.mesh.d_hat,
         }
         try:
-            return object_body(self.parts, self.scene.object, self._places.rotation, **settings)
+            return object_body(self.parts, self.scene.object, self._targets.rotations, **settings)
         except InputError as error:
             raise SpecError(
                 error.rule, file=self.scene.source, key=error.name, value=error.value, choices=error.choices

@@ -141,7 +141,7 @@ def _soft(
 def object_body(
     parts: Sequence[Part],
     spec: ObjectSpec,
-    rotation: np.ndarray,
+    rotations: np.ndarray,
     *,
     weight: float = 0.0,
     edge_length: float = 1e-3,
@@ -157,7 +157,8 @@ def object_body(
     Args:
         parts: of the object.
         spec: says which kind of body, and a soft one's material.
-        rotation: ``pad_from_object``, (3, 3): tells which side is down.
+        rotations: ``pad_from_object`` of every environment, (B, 3, 3): tells which side is down. One body serves all, so a rigid one
+            keeps what any of them brings near the pad, and a soft one must be turned the same in all.
         weight: [N], of an affine body.
         edge_length: of a soft body's tetrahedra [m].
         sag: how far facets may lie inside a curved part [m].
@@ -167,10 +168,10 @@ def object_body(
         InputError: an unknown kind of body, or a surface that it cannot be made from.
     """
     surface = object_surface(parts, sag)
-    height = surface.vertices @ rotation[2]
     if spec.dynamics == "kinematic":
         if lowest > 0.0:
-            near = (height[surface.faces].min(axis=1) - height.min()) <= lowest
+            heights = (surface.vertices @ row for row in rotations[:, 2])
+            near = np.any([height[surface.faces].min(axis=1) - height.min() <= lowest for height in heights], axis=0)
             used, faces = np.unique(surface.faces[near], return_inverse=True)
             surface = ipc.TriMesh(surface.vertices[used], faces.reshape(-1, 3))
         return SceneBody(ipc.KinematicBody(OBJECT, surface), tuple(parts))
@@ -180,7 +181,10 @@ def object_body(
             return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
             tets = ipc.tetrahedralize(surface, edge_length)
-            height = tets.vertices @ rotation[2]
+            if not np.allclose(rotations[:, 2], rotations[0, 2], atol=1e-9):
+                rule = "held at its top, so a soft object must be tilted the same in all environments"
+                raise InputError("rotations", value=rotations[:, 2].tolist(), rule=rule)
+            height = tets.vertices @ rotations[0, 2]
             held = np.flatnonzero(height >= height.max() - _HELD * np.ptp(height))
             material = ipc.Material(young=spec.youngs_modulus, poisson=spec.poisson_ratio)
             return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=held))

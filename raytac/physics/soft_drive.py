@@ -8,6 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from raytac.physics.press_plan import CLEARANCE
+from raytac.physics.press_targets import PressTargets
 from raytac.physics.soft_approach import STEP, TURN
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_places import SoftPlaces
@@ -56,12 +57,10 @@ class SoftDrive:
         solver: SoftContact,
         reader: SoftReader,
         places: SoftPlaces,
-        depths: np.ndarray | None,
-        lost: np.ndarray,
+        targets: PressTargets,
     ) -> None:
-        """``depths`` [m], (B,): of every stage to a depth, in place of the scene's; ``lost``, (B,): environments that never were."""
         self._scene, self._solver, self._reader, self._places = scene, solver, reader, places
-        self._depths, self._lost, self.num_envs = depths, lost, len(lost)
+        self._targets, self.num_envs = targets, len(targets.lost)
         self._d_hat = reader.mesh.d_hat
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
@@ -98,9 +97,9 @@ class SoftDrive:
         if stage.kind in ("shear", "twist"):
             to_shear, to_twist = self._shear, self._twist
             if stage.kind == "shear":
-                to_shear = shear + fraction * (np.asarray(stage.shear) - shear)
+                to_shear = shear + fraction * (self._targets.shear(stage) - shear)
             else:
-                to_twist = twist + fraction * (stage.twist - twist)
+                to_twist = twist + fraction * (self._targets.twist(stage) - twist)
             self._go(self._depth, to_shear, to_twist, follow=True)
             self._settle()  # a shear unloads what lies behind the object
         elif stage.kind == "release":
@@ -114,10 +113,8 @@ class SoftDrive:
                 self._settle()
         else:
             self._force[:] = np.nan
-            target = np.full(self.num_envs, stage.depth) if self._depths is None else self._depths
             start = np.maximum(depth, 0.0)
-            end = np.where(np.isfinite(target), target, 0.0)
-            self._indent(start + fraction * (end - start), is_last=fraction == 1.0)
+            self._indent(start + fraction * (self._targets.depth(stage) - start), is_last=fraction == 1.0)
 
     def _forget(self) -> None:
         batch = self.num_envs
@@ -130,7 +127,7 @@ class SoftDrive:
         self._seen = np.full(batch, np.nan)
         """Clearance in the state that was read last [m]; NaN out of contact."""
         self._stiffness = np.full(batch, np.nan)
-        self.failed: np.ndarray = self._lost.copy()
+        self.failed: np.ndarray = self._targets.lost.copy()
 
     def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
         """Drive the coat to a depth, without passing it on the way; exactly there at the stage's end."""

@@ -11,7 +11,8 @@ from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw
-from raytac.physics.press_plan import about_z, rotation_matrix
+from raytac.physics.press_plan import about_z
+from raytac.physics.press_targets import PressTargets
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec
 
@@ -22,26 +23,26 @@ class SoftPlaces:
     """Places of one scene's object over one pad, for B environments with their own offsets."""
 
     def __init__(
-        self, scene: PressScene, parts: Sequence[Part], gelpad: GelpadSpec, grid: PadGrid, offsets: np.ndarray, lost: np.ndarray
+        self, scene: PressScene, parts: Sequence[Part], gelpad: GelpadSpec, grid: PadGrid, targets: PressTargets
     ) -> None:
-        """``offsets`` [m], shape (B, 2); environments that are ``lost``, shape (B,), are put at the pad's middle.
+        """Environments that are lost are put at the pad's middle.
 
         Raises:
             SpecError: an object that does not start over the pad; names the scene's file and key.
         """
         self._scene, self._parts, self._gelpad, self._grid = scene, parts, gelpad, grid
-        self.rotation = rotation_matrix(scene.object.quaternion)
-        """``pad_from_object`` at zero twist, (3, 3)."""
-        self._touches: dict[tuple[float, float, float], float] = {}
+        self._rotations = targets.rotations
+        self._touches: dict[bytes, float] = {}
         start = np.asarray(scene.object.position[:2])
-        self.origin = np.array([self._first(*(np.zeros(2) if lost[b] else start + offsets[b])) for b in range(len(offsets))])
+        places = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
+        self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(places.tolist())])
         """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
         """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
         poses = np.tile(np.eye(4), (len(height), 1, 1))
         for b, angle in enumerate(twist):
-            poses[b, :3, :3] = about_z(angle) @ self.rotation
+            poses[b, :3, :3] = about_z(angle) @ self._rotations[b]
         poses[:, :3, 3] = self.origin
         poses[:, :2, 3] += shear
         poses[:, 2, 3] += height
@@ -60,31 +61,31 @@ class SoftPlaces:
         """How much lower than at the start the pad is first touched after a shear and twist [m], shape (B,)."""
         return np.array(
             [
-                at[2] - self._touch(at[0] + way[0], at[1] + way[1], angle)
-                for at, way, angle in zip(self.origin, shear, twist, strict=True)
+                at[2] - self._touch(b, at[0] + way[0], at[1] + way[1], angle)
+                for b, (at, way, angle) in enumerate(zip(self.origin, shear, twist, strict=True))
             ]
         )
 
     def stiffness(self, b: int, twist: float, force: float) -> float:
         """Force over depth [N/m] that the bonded layer's law expects at ``force`` [N]: a start for a search."""
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = about_z(twist) @ self.rotation, self.origin[b]
+        pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
         law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
         return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
 
-    def _first(self, x: float, y: float) -> np.ndarray:
+    def _first(self, b: int, x: float, y: float) -> np.ndarray:
         try:
-            return np.array([x, y, self._touch(x, y, 0.0)])
+            return np.array([x, y, self._touch(b, x, y, 0.0)])
         except InputError as error:
             place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
             raise SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place) from error
 
-    def _touch(self, x: float, y: float, twist: float) -> float:
+    def _touch(self, b: int, x: float, y: float, twist: float) -> float:
         """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
-        key = float(x), float(y), float(twist)
+        pose = np.eye(4)
+        pose[:3, :3] = about_z(twist) @ self._rotations[b]
+        pose[:2, 3] = x, y
+        key = pose.tobytes()
         if key not in self._touches:
-            pose = np.eye(4)
-            pose[:3, :3] = about_z(twist) @ self.rotation
-            pose[:2, 3] = x, y
             self._touches[key] = first_touch_z(self._parts, pose, self._gelpad, self._grid)
         return self._touches[key]

@@ -11,17 +11,17 @@ from numpy.typing import ArrayLike
 
 import ipc
 from raytac.errors import InputError, OverlapError
+from raytac.gel.batch import chosen_envs
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import PadGrid
-from raytac.physics.batch_check import batch_of, env_mask, rigid_poses
+from raytac.physics.batch_check import batch_of, rigid_poses
 from raytac.physics.rotation import inverse, nearest_rotation, quaternion, quaternions
 from raytac.physics.soft_bodies import SceneBody, pad_body
-from raytac.physics.soft_mesh import PadMesh
+from raytac.physics.soft_cast import Cast, ScenePad
 from raytac.physics.soft_reading import SeenObject, SeenPad, SoftReader, SoftReading
 from raytac.physics.soft_report import SceneReport
 from raytac.physics.soft_stiffness import pad_stiffness
 from raytac.physics.soft_travel import MOST_SUBSTEPS, Poses, Travel
-from raytac.specs.sensor import SensorSpec
 
 __all__ = ["CREEP", "MOST_SUBSTEPS", "ScenePad", "SceneReport", "SceneState", "SoftScene"]
 
@@ -34,17 +34,6 @@ _LINEAR = 1e-6
 
 
 _GRAVITY = 0.0, 0.0, -9.81
-
-
-@dataclass(frozen=True)
-class ScenePad:
-    """One pad of a scene; its case goes where ``world_from_pad`` says."""
-
-    name: str
-    sensor: SensorSpec
-    mesh: PadMesh
-    pitch: float = 0.1e-3
-    """Spacing of the grid that its surface is read on [m]."""
 
 
 @dataclass(frozen=True)
@@ -105,15 +94,14 @@ class SoftScene:
             InputError: no pads, names that repeat or are unknown, poses of a wrong shape or that are not rigid, or gravity and settings.
             OverlapError: bodies overlap where they start; the message names the surfaces.
         """
-        self.pads = {pad.name: pad for pad in pads}
-        self.bodies = {body.name: body for body in bodies}
-        self._check_names(pads, bodies)
         if gravity is not None and settings is not None:
             raise InputError("gravity", value=gravity, rule="must be left out where settings are given, which have their own")
         given = (settings.gravity if settings is not None else _GRAVITY) if gravity is None else gravity
         self.gravity = np.asarray(given, float)
         self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
-        self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._of_bodies(world_from_body)
+        self._cast = Cast(pads, bodies, self.num_envs)
+        self.pads, self.bodies = self._cast.pads, self._cast.bodies
+        self._start = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(pads)), self._cast.starts(world_from_body)
         d_hat = min(pad.mesh.d_hat for pad in pads)
         self.settings = settings or ipc.Settings(
             dt=dt,
@@ -127,7 +115,7 @@ class SoftScene:
         gels = [
             self._at_start(pad_body(pad.mesh, pad.sensor.gelpad, pad.name), self._start[0][0, k]) for k, pad in enumerate(pads)
         ]
-        mu = self._coefficients() | dict(friction or {})
+        mu = self._cast.friction() | dict(friction or {})
         try:
             self.world = ipc.World([*gels, *placed], self.settings, self.num_envs, device, mu, ignored)
             if settings is None:
@@ -139,7 +127,7 @@ class SoftScene:
         except ipc.IpcError as error:
             raise InputError("scene", value=[*self.pads, *self.bodies], rule=f"cannot be solved: {error}") from error
         self._begin = self.world.save()
-        self._now = Poses(self._start[0], self._driven(self._start[1])).copy()
+        self._now = Poses(self._start[0], self._cast.driven(self._start[1])).copy()
         self._travel = Travel(self)
         self._readers: dict[str, SoftReader] = {}
         self._on_surface = {name: self._coat_on_surface(pad) for name, pad in self.pads.items()}
@@ -224,20 +212,20 @@ class SoftScene:
         All of the gel's surface counts, its sides too. At rest it is what the pad does to the link that carries it (``bond_wrench``);
         the gel's weight and inertia are not in it, since the link's model has the gel's mass.
         """
-        return self._contact_wrench(self._pad(pad).name)
+        return self._contact_wrench(self._cast.pad(pad).name)
 
     def bond_wrench(self, pad: str) -> np.ndarray:
         """Force [N] and torque about the pad frame's origin [N m] of a pad on its case, world axes, shape (B, 6): with its weight."""
-        found = self.world.wrench(self._pad(pad).name)
+        found = self.world.wrench(self._cast.pad(pad).name)
         return np.concatenate([found.force, found.torque], axis=1)
 
     def body_wrench(self, name: str) -> np.ndarray:
         """Force [N] of what touches a body and its torque [N m] about the body's origin, world axes, shape (B, 6)."""
-        return self._contact_wrench(self._body(name).name)
+        return self._contact_wrench(self._cast.body(name).name)
 
     def stiffness(self, pad: str) -> np.ndarray:
         """Bound of the stiffness of what touches a pad, (B, 6, 6), world axes, about the place where it presses: see ``pad_stiffness``."""
-        mine = self._pad(pad)
+        mine = self._cast.pad(pad)
         bodies = self.world.layout.names.index(pad)
         first, last = self.world.layout.vert_start[bodies : bodies + 2]
         loaded = np.linalg.norm(self.world.contact_forces(pad), axis=2) > 0.0
@@ -250,7 +238,7 @@ class SoftScene:
     def pose(self, name: str) -> np.ndarray:
         """``world_from_body`` or ``world_from_pad`` (B, 4, 4) as it is; of a free soft body, the rigid motion that fits it best."""
         found = np.tile(np.eye(4), (self.num_envs, 1, 1))
-        body = None if name in self.pads else self._body(name)
+        body = None if name in self.pads else self._cast.body(name)
         if body is None or body.is_driven:
             found[:, :3, :3], found[:, :3, 3] = self.world.frame(name)
         elif isinstance(body.solid, ipc.SoftBody):
@@ -266,19 +254,19 @@ class SoftScene:
 
     def velocity(self, name: str) -> np.ndarray:
         """Mean velocity of a free body's nodes [m/s], world frame, (B, 3)."""
-        return self.world.velocities(self._body(name).name).mean(axis=1)
+        return self.world.velocities(self._cast.body(name).name).mean(axis=1)
 
     def mesh(self, name: str, seen_from: str | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Surface of a body or pad as it is: vertices (B, n, 3) [m], world frame or that of the pad ``seen_from``, and faces (F, 3)."""
         vertices, faces = self.world.surface(name)
         at = self.world.positions(name)
-        if name in self.pads or self._body(name).is_soft:
+        if name in self.pads or self._cast.body(name).is_soft:
             at = at[:, vertices]
         return (at if seen_from is None else self._into(seen_from, at)), faces
 
     def coat(self, pad: str) -> np.ndarray:
         """Vertices of a pad's coat [m], pad frame, shape (B, V, 3): as the solver has them, with the barrier's clearance."""
-        return self.world.positions(pad, frame="body")[:, self._pad(pad).mesh.coat_vertices]
+        return self.world.positions(pad, frame="body")[:, self._cast.pad(pad).mesh.coat_vertices]
 
     def coat_forces(self, pad: str) -> np.ndarray:
         """What touches does to each vertex of a coat [N], pad frame, shape (B, V, 3)."""
@@ -286,14 +274,14 @@ class SoftScene:
 
     def grid(self, pad: str) -> PadGrid:
         """Grid that a pad's surface is read on."""
-        return make_grid(self._pad(pad).sensor.gelpad, self._pad(pad).pitch)
+        return make_grid(self._cast.pad(pad).sensor.gelpad, self._cast.pad(pad).pitch)
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
         """What a pad shows, on its own grid or another: surface, contact, forces on its coat; NaN in environments that failed.
 
         ``failed``: further environments (B,) that are lost, if not by this scene.
         """
-        mine = self._pad(pad)
+        mine = self._cast.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(mine.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
@@ -301,7 +289,7 @@ class SoftScene:
 
     def seen(self, pad: str) -> SeenPad:
         """What the reader needs: a pad's coat and forces, and what it touches."""
-        frame = inverse(self.pose(self._pad(pad).name))
+        frame = inverse(self.pose(self._cast.pad(pad).name))
         objects = []
         for name, near in self.world.touching(pad).items():
             body = self.bodies.get(name)
@@ -319,7 +307,7 @@ class SoftScene:
 
     def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
         """Put environments, a mask (B,) or a list, None for all, back to a saved state; there are no contact forces until the next step."""
-        mask = env_mask(envs, self.num_envs)
+        mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         self.world.restore(state.world, mask)
         self._now.pads[mask] = state.poses.pads[mask]
         for name, pose in state.poses.bodies.items():
@@ -337,16 +325,16 @@ class SoftScene:
         Raises:
             OverlapError: bodies overlap at these poses; nothing has changed then.
         """
-        mask = env_mask(envs, self.num_envs)
+        mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         if world_from_pad is None and world_from_body is None:
-            self.restore(SceneState(self._begin, Poses(self._start[0], self._driven(self._start[1]))), mask)
+            self.restore(SceneState(self._begin, Poses(self._start[0], self._cast.driven(self._start[1]))), mask)
             return
         cases = (
             self._start[0]
             if world_from_pad is None
             else rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         )
-        places = self._start[1] | self._named(world_from_body or {}, free=True)
+        places = self._start[1] | self._cast.named(world_from_body or {}, free=True)
         before = self.save()
         try:
             self.world.restore(self._begin, mask)
@@ -354,7 +342,7 @@ class SoftScene:
         except ipc.OverlapError as error:
             self.world.restore(before.world, mask)
             raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
-        self.restore(SceneState(self.world.save(), Poses(cases, self._driven(places))), mask)
+        self.restore(SceneState(self.world.save(), Poses(cases, self._cast.driven(places))), mask)
 
     # --- inner -----------------------------------------------------------------------------------------------------------------
 
@@ -384,23 +372,9 @@ class SoftScene:
         rotation, position = self.world.frame(pad)
         return (points - position[:, None]) @ rotation
 
-    def _coefficients(self) -> dict[tuple[str, str], float]:
-        found = {}
-        for pad in self.pads.values():
-            for other in self.pads.values():
-                if other.name > pad.name:
-                    found[pad.name, other.name] = max(pad.sensor.gelpad.friction, other.sensor.gelpad.friction)
-            for body in self.bodies.values():
-                found[pad.name, body.name] = pad.sensor.gelpad.friction if body.friction is None else body.friction
-        names = list(self.bodies.values())
-        for k, one in enumerate(names):
-            for two in names[k + 1 :]:
-                found[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
-        return found
-
     def _goal(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None) -> Poses:
         pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
-        return Poses(pads, self._now.bodies | self._named(driven or {}))
+        return Poses(pads, self._now.bodies | self._cast.named(driven or {}))
 
     def _spread(self, cases: np.ndarray, places: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
         """Put environments of the mask at poses of their own, undeformed and at rest."""
@@ -421,41 +395,4 @@ class SoftScene:
 
     @staticmethod
     def _at_start(solid, pose: np.ndarray):
-        return replace(solid, pose=ipc.Pose(tuple(pose[:3, 3].tolist()), quaternion(pose[:3, :3])))
-
-    def _driven(self, poses: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: poses[name].copy() for name, body in self.bodies.items() if body.is_driven}
-
-    # --- checks ----------------------------------------------------------------------------------------------------------------
-
-    def _check_names(self, pads: Sequence[ScenePad], bodies: Sequence[SceneBody]) -> None:
-        names = [thing.name for thing in (*pads, *bodies)]
-        if not pads:
-            raise InputError("pads", value=(), rule="must hold one pad or more")
-        if len(set(names)) < len(names):
-            raise InputError("names", value=names, rule="must be unique among pads and bodies")
-
-    def _pad(self, name: str) -> ScenePad:
-        if name not in self.pads:
-            raise InputError("pad", value=name, rule="must be the name of a pad of this scene", choices=self.pads)
-        return self.pads[name]
-
-    def _body(self, name: str) -> SceneBody:
-        if name not in self.bodies:
-            raise InputError("name", value=name, rule="must be the name of a body of this scene", choices=self.bodies)
-        return self.bodies[name]
-
-    def _named(self, poses: Mapping[str, ArrayLike], free: bool = False) -> dict[str, np.ndarray]:
-        for name in poses:
-            if not (self._body(name).is_driven or free):
-                driven = [n for n, body in self.bodies.items() if body.is_driven]
-                raise InputError("driven", value=name, rule="moves freely and takes no pose", choices=driven)
-        return {name: rigid_poses(name, pose, self.num_envs) for name, pose in poses.items()}
-
-    def _of_bodies(self, poses: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-        for name in poses:
-            self._body(name)
-        for name in self.bodies:
-            if name not in poses:
-                raise InputError("world_from_body", value=list(poses), rule=f"must say where {name!r} starts")
-        return {name: rigid_poses(name, poses[name], self.num_envs) for name in self.bodies}
+        return replace(solid, pose=ipc.Pose(tuple(pose[:3, 3].tolist()), tuple(quaternion(pose[:3, :3]).tolist())))

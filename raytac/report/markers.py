@@ -6,9 +6,11 @@ import datetime
 import math
 import time
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from raytac.device import resolve_device
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.markers.calibration import PUBLISHED
@@ -19,6 +21,7 @@ from raytac.specs.sensor import SensorSpec
 if TYPE_CHECKING:
     from raytac.markers.calibration import ModelError
     from raytac.markers.calibration_presses import Press, PressFrame
+    from raytac.report.press_store import PressStore
 
 __all__ = [
     "FILES",
@@ -47,6 +50,8 @@ class MotionReport:
     """On held-out presses."""
     fit_errors: list[ModelError]
     """Of FOTS, and of FOTS as published, on the presses that both were fitted to."""
+    by_press: list[tuple[str, ModelError]]
+    """Of FOTS on every press, in words, under its last kind of load; those of the fit first."""
     times_ms: dict[str, float]
     """Median time of a frame of every model, at the probes."""
     probes: int
@@ -58,17 +63,27 @@ def run_calibrate_markers(
 ) -> list[Path]:
     """Press the simulated pad, fit, test on held-out presses, and write ``FILES`` to ``out``; returns the files written.
 
+    Finished presses are kept in ``presses`` of ``out``, also where an error or an interrupt ends the run; a later one does not press them
+    again.
+
     Raises:
-        RaytacError: a press did not settle, or fits nowhere on this sensor.
+        RaytacError: a press did not settle.
+        SpecError: a press fits nowhere on this sensor.
+        InputError: ``out`` cannot be written.
         BackendError: the solver or Dr.Jit cannot run.
     """
+    from tqdm import tqdm
+
     from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
     from raytac.report.markers_figure import write_arrows, write_errors
+    from raytac.report.press_store import PressStore, press_code
 
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
-        pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress)
+        solver = resolve_device(device, ray_tracing=False)
+        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=tqdm.write)
+        pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress, store=store)
         press_s = time.perf_counter() - began
         names = {press.name for press in fit}
         report = calibrate_markers(
@@ -84,28 +99,41 @@ def run_calibrate_markers(
         write_errors(folder / "errors.png", report)
         write_arrows(folder / "arrows.png", replace(sensor, marker_motion=report.motion), report.held_out, device=device)
         metrics = motion_metrics(report) | {"sensor": sensor.name, "pad": pad, "seed": seed, "press_s": press_s}
+        metrics |= {"presses": len(names) + len(held_out), "presses_reused": store.reused}
         metrics |= {"device": device, **versions((*VERSIONED, "warp-lang")), **machine()}
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         found = sorted(path.name for path in folder.iterdir())
     return [Path(out) / name for name in found]
 
 
-def press_all(sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, *, progress: bool) -> list[PressFrame]:
-    """States of all presses on the simulated pad of level ``pad``, in order; ``progress``: show a bar.
+def press_all(
+    sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, *, progress: bool, store: PressStore | None = None
+) -> list[PressFrame]:
+    """States of all presses on the simulated pad of level ``pad``, in order.
+
+    ``progress``: show a bar. ``store``: finished presses, which are not pressed again; None keeps none.
 
     Raises:
-        RaytacError: a press did not settle, or fits nowhere on this sensor.
+        SpecError: a press fits nowhere on this sensor; said before any is pressed.
+        RaytacError: a press did not settle.
         BackendError: the solver cannot run on ``device``.
     """
     from tqdm import tqdm
 
-    from raytac.device import resolve_device
-    from raytac.markers.calibration_presses import press_frames
+    from raytac.markers.calibration_presses import press_frames, simulate_press
+    from raytac.specs import validate_press
 
+    for press in presses:
+        validate_press(sensor, press.scene())
     solver = resolve_device(device, ray_tracing=False)
     frames: list[PressFrame] = []
     for press in tqdm(presses, desc=f"press {sensor.name}", unit="press", disable=None if progress else True):
-        frames += press_frames(sensor, press, pad=pad, device=solver)
+        states = None if store is None else store.read(press)
+        if states is None:
+            states = simulate_press(sensor, press, pad=pad, device=solver)
+            if store is not None:
+                store.write(press, states)
+        frames += press_frames(sensor, press, states)
     return frames
 
 
@@ -121,12 +149,18 @@ def calibrate_markers(
     grid = fit[0].surface.grid
     errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
     fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", PUBLISHED), device=device)
+    by_press = []
+    for name, group in groupby([*fit, *held_out], key=lambda frame: str(frame.press)):
+        rows, _ = model_errors(fitted, list(group), grid, models=("fots",), device=device)
+        by_press.append((name, rows[-1]))
     markers = probe_sensor(sensor).markers
-    report = MotionReport(motion, errors, fit_errors, times, markers.rows * markers.columns, held_out)
-    return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad)))
+    report = MotionReport(motion, errors, fit_errors, by_press, times, markers.rows * markers.columns, held_out)
+    return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad, device)))
 
 
-def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame], held_out: list[PressFrame], pad: str) -> str:
+def _provenance(
+    sensor: SensorSpec, report: MotionReport, fit: list[PressFrame], held_out: list[PressFrame], pad: str, device: str
+) -> str:
     def listed(frames: list[PressFrame]) -> list[str]:
         return [f"  {press}" for press in dict.fromkeys(str(frame.press) for frame in frames)]
 
@@ -139,6 +173,7 @@ def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame],
             f"Fitted {datetime.date.today().isoformat()} to surface tracking on the simulated pad, level {pad}, of {sensor.name}:",
             f"E {1e-3 * gelpad.youngs_modulus:g} kPa, nu {gelpad.poisson_ratio:g}, friction {gelpad.friction:g}, held at "
             f"{gelpad.bonded}.",
+            f"By {', '.join(_made_by(device))}.",
             "Presses of the fit:",
             *listed(fit),
             "Presses held out:",
@@ -149,6 +184,13 @@ def _provenance(sensor: SensorSpec, report: MotionReport, fit: list[PressFrame],
             f"held out: {errors(report.errors, PUBLISHED)}.",
         ]
     )
+
+
+def _made_by(device: str) -> list[str]:
+    """Versions of what the fit depends on, and where the pad was simulated."""
+    found = versions(("raytac", "warp-lang", "drjit", "numpy"))
+    names = [f"{key.split('.', 1)[1]} {value}" for key, value in found.items() if key != "versions.python"]
+    return [*names, f"simulated on {resolve_device(device, ray_tracing=False)}"]
 
 
 def motion_metrics(report: MotionReport) -> dict[str, Metric]:
@@ -180,7 +222,7 @@ def error_metrics(key: str, row: ModelError) -> dict[str, Metric]:
 
 
 def error_table(report: MotionReport) -> str:
-    """Errors of every model as a Markdown table."""
+    """Errors of every model, and those of FOTS on every press, as Markdown tables."""
     lines = [
         "# Marker models against surface tracking on held-out presses",
         "",
@@ -196,4 +238,9 @@ def error_table(report: MotionReport) -> str:
             f"| {row.model} | {row.load} | {row.frames} | {1e6 * row.mean:.1f} | {1e6 * row.p95:.1f} | {moved} | {row.mean_px:.2f} | "
             f"{1e6 * row.size:.1f} | {report.times_ms[row.model]:.2f} |"
         )
+    held_out = {str(frame.press) for frame in report.held_out}
+    lines += ["", "## FOTS by press", "", "| press | | load | mean [µm] | p95 [µm] | truth [µm] |", "|---|---|---|---|---|---|"]
+    for press, row in report.by_press:
+        part = "held out" if press in held_out else "fit"
+        lines.append(f"| {press} | {part} | {row.load} | {1e6 * row.mean:.1f} | {1e6 * row.p95:.1f} | {1e6 * row.size:.1f} |")
     return "\n".join(lines) + "\n"

@@ -109,12 +109,13 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
     import matplotlib.pyplot as plt
 
     from raytac.markers.calibration import probe_sensor
+    from raytac.markers.calibration_presses import LOADS
 
     probed = probe_sensor(sensor)
     order = ("surface", *(name for name in MARKER_MODELS if name != "surface"))
     presses = [list(group) for _, group in groupby(frames, key=lambda frame: frame.press.name)]
     rows = []
-    for load in ("normal", "shear", "twist"):
+    for load in LOADS:
         chosen = next((press for press in presses if press[-1].load == load or load == "normal"), None)
         if chosen is not None:
             last = max(k for k, frame in enumerate(chosen) if frame.load == load)

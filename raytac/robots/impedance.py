@@ -9,6 +9,7 @@ Both add C(q, q̇) q̇ + g(q), so that the arm floats without a target. Read the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -26,12 +27,12 @@ _SINGULAR = 1e-3
 
 @dataclass(frozen=True)
 class JointTorque:
-    """What a controller asks of the joints."""
+    """What a controller asks of the joints; of a batch, one row an environment."""
 
     torque: np.ndarray
-    """Torques (n,) [N·m], as the law gives them."""
+    """Torques (…, n) [N·m], as the law gives them."""
     saturated: np.ndarray
-    """Which of them (n,) the motors cannot give: MuJoCo then applies the limit, and the law does not hold. False without motors."""
+    """Which of them (…, n) the motors cannot give: MuJoCo then applies the limit, and the law does not hold. False without motors."""
 
 
 class CartesianImpedance:
@@ -140,17 +141,27 @@ class JointImpedance:
 
         Raises ``InputError`` for a wrong shape or a number that is not finite.
         """
+        rows = [None if value is None else np.asarray(value)[None] for value in (joints, velocity)]
+        found = self.torques([data], rows[0], rows[1])  # type: ignore[arg-type]
+        return JointTorque(found.torque[0], found.saturated[0])
+
+    def torques(self, datas: Sequence[mujoco.MjData], joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
+        """The same of many states, each array (B, n)."""
         arm = self.arm
-        velocity = np.zeros(len(arm)) if velocity is None else velocity
+        q, speed = (
+            np.array(values)[:, at] for values, at in (([d.qpos for d in datas], arm.qpos), ([d.qvel for d in datas], arm.dof))
+        )
+        velocity = np.zeros_like(q) if velocity is None else velocity
         for name, value in (("joints", joints), ("velocity", velocity)):
-            if np.shape(value) != (len(arm),) or not np.isfinite(value).all():
-                raise InputError(name, value=np.asarray(value).tolist(), rule=f"must be {len(arm)} finite numbers")
-        away, late = joints - data.qpos[arm.qpos], velocity - data.qvel[arm.dof]
-        pull = self._frequency**2 * away + 2.0 * self._ratio * self._frequency * late
-        return _joint_torque(arm, arm.inertial(data, pull) + arm.bias(data))
+            if np.shape(value) != q.shape or not np.isfinite(value).all():
+                rule = f"must be {len(arm)} finite numbers, of every state"
+                raise InputError(name, value=np.asarray(value).tolist(), rule=rule)
+        pull = self._frequency**2 * (joints - q) + 2.0 * self._ratio * self._frequency * (velocity - speed)
+        inertial = np.array([arm.inertial(data, row) for data, row in zip(datas, pull, strict=True)])
+        return _joint_torque(arm, inertial + np.array([data.qfrc_bias for data in datas])[:, arm.dof])
 
 
 def _joint_torque(arm: Arm, torque: np.ndarray) -> JointTorque:
     limit = arm.torque_limit
-    beyond = np.zeros(len(arm), bool) if limit is None else (torque < limit[:, 0]) | (torque > limit[:, 1])
+    beyond = np.zeros(torque.shape, bool) if limit is None else (torque < limit[:, 0]) | (torque > limit[:, 1])
     return JointTorque(torque, beyond)

@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.physics.rotation import rotation_vector
 
-__all__ = ["check_pose", "pose", "pose_error", "quaternion", "world_from_site"]
+__all__ = ["body_poses", "check_pose", "pose", "pose_error", "site_poses", "world_from_site"]
 
 _ORTHONORMAL = 1e-6
 """How far RᵀR of a rotation may be from 1."""
@@ -41,20 +44,33 @@ def check_pose(name: str, value: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion w, x, y, z (4,) of a rotation matrix (3, 3)."""
-    result = np.zeros(4)
-    mujoco.mju_mat2Quat(result, np.ascontiguousarray(rotation, float).ravel())
-    return result
-
-
 def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
     """Pose (4, 4) of a site by its index, as the last ``mj_kinematics`` (or step) left it."""
     return pose(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
 
 
+def site_poses(datas: Sequence[mujoco.MjData], site: int) -> np.ndarray:
+    """Poses (B, 4, 4) of a site in many states, as the last ``mj_kinematics`` (or step) left them."""
+    return _poses([data.site_xmat[site] for data in datas], [data.site_xpos[site] for data in datas])
+
+
+def body_poses(datas: Sequence[mujoco.MjData], body: int) -> np.ndarray:
+    """The same of a body."""
+    return _poses([data.xmat[body] for data in datas], [data.xpos[body] for data in datas])
+
+
+def _poses(rotations: Sequence[np.ndarray], positions: Sequence[np.ndarray]) -> np.ndarray:
+    found = np.zeros((len(rotations), 4, 4))
+    found[:, :3, :3] = np.reshape(rotations, (-1, 3, 3))
+    found[:, :3, 3] = np.reshape(positions, (-1, 3))
+    found[:, 3, 3] = 1.0
+    return found
+
+
 def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
-    """What leads from b to a (6,), in world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long."""
-    turn = np.zeros(3)
-    mujoco.mju_quat2Vel(turn, quaternion(world_from_a[:3, :3] @ world_from_b[:3, :3].T), 1.0)
-    return np.concatenate([world_from_a[:3, 3] - world_from_b[:3, 3], turn])
+    """What leads from b to a (…, 6), in world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long.
+
+    Poses (…, 4, 4) that broadcast.
+    """
+    turn = rotation_vector(world_from_a[..., :3, :3] @ np.swapaxes(world_from_b[..., :3, :3], -1, -2))
+    return np.concatenate([world_from_a[..., :3, 3] - world_from_b[..., :3, 3], turn], axis=-1)

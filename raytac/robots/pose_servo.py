@@ -21,7 +21,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.robots.arm import Arm
-from raytac.robots.pose import pose_error
+from raytac.robots.pose import pose_error, site_poses
 
 __all__ = ["PoseServo"]
 
@@ -78,7 +78,7 @@ class PoseServo:
         arm = self.arm
         q = np.stack([data.qpos[arm.qpos] for data in datas])
         jacobian = np.stack([arm.jacobian(data) for data in datas])
-        error = np.stack([pose_error(t, arm.world_from_site(d)) for t, d in zip(world_from_target, datas, strict=True)])
+        error = pose_error(world_from_target, site_poses(datas, arm.site))
         transposed = np.swapaxes(jacobian, -1, -2)
         gram = jacobian @ transposed + self._damping**2 * np.eye(6)
         lean = np.zeros_like(q) if self._posture is None else self._gain * (self._posture - q)

@@ -34,7 +34,7 @@ def load_pad(
         physics: ``rigid`` or ``ipc``.
         level: how finely a simulated pad is cut, or a mesh of one's own.
         device: of the solver, which traces no rays and needs no OptiX.
-        settings: ``pitch``, ``num_envs``, ``seed``, ``offsets`` and ``depths`` of both pads.
+        settings: ``pitch``, ``num_envs``, ``seed`` and what ``PressTargets`` takes, of both pads.
 
     Raises:
         BackendError: the solver cannot run here.

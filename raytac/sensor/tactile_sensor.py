@@ -190,23 +190,22 @@ class TactileSensor:
         self,
         scene: str | Path | PressScene,
         *,
-        offsets: np.ndarray | None = None,
-        depths: np.ndarray | None = None,
         progress: bool = False,
+        **own: Any,
     ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
 
-        ``offsets`` and ``depths`` are as for ``load``. ``progress``: a simulated pad, which takes seconds to minutes, shows its stages and
-        the solver's steps in a bar on standard error, if that is a terminal.
+        ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a simulated pad, which takes seconds to
+        minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
 
         Raises:
-            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
+            InputError: an argument of ``load`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
         press = press_scene(scene)
         validate_press(self.spec, press)
         start = time.perf_counter()
-        pad = self.load(press, offsets=offsets, depths=depths)
+        pad = self.load(press, **own)
         states = pad.run(progress=progress) if self.physics == "ipc" else pad.run()  # type: ignore[call-arg]
         state = pad.peak(self._followed(states))  # type: ignore[arg-type]
         physics_ms = 1e3 * (time.perf_counter() - start)
@@ -214,17 +213,30 @@ class TactileSensor:
         return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
 
     def load(
-        self, scene: str | Path | PressScene, *, offsets: np.ndarray | None = None, depths: np.ndarray | None = None
+        self,
+        scene: str | Path | PressScene,
+        *,
+        offsets: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+        shears: np.ndarray | None = None,
+        twists: np.ndarray | None = None,
+        seeds: Sequence[int] | None = None,
     ) -> RigidPad | SoftPad:
         """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
 
         Args:
             scene: name of a shipped press scene, path of a scene file, or a scene.
             offsets: added to the object's x, y per environment [m], pad frame, shape (B, 2) with B = ``num_envs``; None is none.
-            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's.
+            depths: depth of every depth-driven indent per environment [m], shape (B,), in place of the scene's; as for the next three,
+                None leaves the scene's, and what is not finite makes its environment fail.
+            rotations: turn of the object about its origin, before the press, axes of the pad frame, wxyz, shape (B, 4).
+            shears: target of every ``shear`` stage along x, y [m], shape (B, 2).
+            twists: target of every ``twist`` stage [rad], shape (B,).
+            seeds: of the markers' perturbations, one an environment; None goes on with the streams that there are.
 
         Raises:
-            InputError: ``offsets`` or ``depths`` of the wrong shape or out of range.
+            InputError: an argument of the wrong shape or out of range.
             SpecError: the scene breaks a rule.
             BackendError: a simulated pad is asked for, and its solver cannot run here.
             RaytacError: the object overlaps a simulated pad where it starts.
@@ -243,16 +255,23 @@ class TactileSensor:
             seed=self.seed,
             offsets=offsets,
             depths=depths,
+            rotations=rotations,
+            shears=shears,
+            twists=twists,
         )
         self._is_narrow = False
+        if seeds is not None and self.markers is not None:
+            self.marker_tracker.reseed(range(self.num_envs), seeds)
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
 
-    def update(self, state: ContactState | GelSurface | PadReading) -> TactileFrame:
+    def update(self, state: ContactState | GelSurface | PadReading, envs: Sequence[int] | None = None) -> TactileFrame:
         """Frame of a gel surface, of a state of the physics that ``load`` or ``press`` set up, or of what a world's pad reads.
 
         With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
+
+        ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
 
         Raises:
             InputError: a state, and no scene was loaded, or another one than the state is of.
@@ -275,7 +294,7 @@ class TactileSensor:
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None
         if self.markers is not None:
-            markers = self.marker_tracker.update(surface)
+            markers = self.marker_tracker.update(surface, envs)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
         return self._frame(surface, markers, done, time_ms, force=force, force_law_area=area, failed=failed, **forces)
@@ -316,11 +335,16 @@ class TactileSensor:
             **fields,
         )
 
-    def rest(self) -> TactileFrame:
-        """Frame of one untouched pad (B = 1), what every difference image is taken from; markers keep their history."""
-        start, surface, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+    def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
+        """Frame of untouched pads, what every difference image is taken from; markers keep their history.
+
+        ``envs``: as in which environments the markers are placed, one row each; all are alike but for a pattern that is shifted or turned.
+        """
+        start, one, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+        height, contact, centre = (np.repeat(v, len(envs), axis=0) for v in (one.height, one.contact, one.contact_centre))
+        surface = GelSurface(self.grid, height, contact, centre)
         if self.markers is not None:
-            markers = self.marker_tracker.at_rest()
+            markers = self.marker_tracker.at_rest(envs)
             surface = self._dotted(surface, markers)
         done = time.perf_counter()
         return self._frame(surface, markers, done, {"surface": 1e3 * (done - start)})

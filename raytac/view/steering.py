@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import BackendError
+from raytac.physics.rotation import rotations
 from raytac.robots.ik import DifferentialIk
 from raytac.robots.impedance import JointImpedance
 from raytac.view.session import Control
@@ -84,7 +85,7 @@ class Steering:
             arm = self._world.arm
             assert arm is not None
             target = np.eye(4)
-            target[:3, :3] = _turn(*(np.radians(self._now[name]) for name in ("roll", "pitch", "yaw"))) @ self._start[:3, :3]
+            target[:3, :3] = _turn(np.radians([self._now[name] for name in ("roll", "pitch", "yaw")])) @ self._start[:3, :3]
             target[:3, 3] = self._start[:3, 3] + [1e-3 * self._now[name] for name in ("x", "y", "z")]
             self._from = self._qpos[arm.qpos].copy()
             self._velocity = self._ik.velocity(self._qpos, target, self._dt)
@@ -118,10 +119,7 @@ class Steering:
         return tuple(controls)
 
 
-def _turn(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Rotation (3, 3) about x, then y, then z of the world."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
+def _turn(angles: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) by three angles [rad] about x, then y, then z of the world."""
+    about_x, about_y, about_z = rotations(np.diag(angles))
     return about_z @ about_y @ about_x

@@ -14,6 +14,7 @@ import numpy as np
 from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.part import Part
 from raytac.physics.objects import object_parts
+from raytac.physics.rotation import quaternion, rotation_of
 from raytac.robots.arm import Arm
 from raytac.robots.gripper import floating_gripper
 from raytac.robots.mount import MountedSensor, mount_sensor
@@ -136,9 +137,7 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
 
 def pose_of(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
     """Pose (4, 4) from a position [m] and a quaternion wxyz."""
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(quaternion, float))
-    return pose(rotation.reshape(3, 3), np.asarray(position, float))
+    return pose(rotation_of(quaternion), np.asarray(position, float))
 
 
 @dataclass(frozen=True)
@@ -222,9 +221,7 @@ def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timest
 
 
 def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, name: str) -> mujoco.MjsGeom:
-    turn = np.empty(4)
-    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(part.object_from_part[:3, :3]).ravel())
-    place = {"name": name, "pos": part.object_from_part[:3, 3], "quat": turn}
+    place = {"name": name, "pos": part.object_from_part[:3, 3], "quat": quaternion(part.object_from_part[:3, :3])}
     if part.kind in _GEOMS:
         size = _PLANE if part.kind == "plane" else (*part.size, 0.0, 0.0)[:3]
         return body.add_geom(type=_GEOMS[part.kind], size=size, **place)

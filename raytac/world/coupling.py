@@ -36,6 +36,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.physics.rotation import rotation_vector, rotations
 
 __all__ = ["Coupling", "FreePartner", "Touching"]
 
@@ -69,8 +70,17 @@ class Touching:
     other: int | str | None = None
     """The other side: likewise, or None for what stands still."""
     push: np.ndarray | None = None
-    """Normal force on ``body`` that w₀ has [N], world frame, (3,): where K would turn it into a pull, the contact opens and both are gone.
-    What else w₀ has of this contact, friction and torque, stays until the solver's next answer. None: a contact that never opens."""
+    """Normal force on ``body`` that w₀ has [N], world frame, (3,): where K would make it pull, the contact opens. None: it never does."""
+    wrench: np.ndarray | None = None
+    """All that w₀ has of this contact, normal force and friction [N] on ``body`` and their torque about ``point`` [N m], (6,): what an open
+    contact takes with it. None: ``push`` alone."""
+
+    @property
+    def released(self) -> np.ndarray:
+        """What an open contact takes off w₀, (6,)."""
+        if self.wrench is not None:
+            return -self.wrench
+        return np.concatenate([np.zeros(3) if self.push is None else -self.push, np.zeros(3)])
 
 
 @dataclass
@@ -221,7 +231,7 @@ class Coupling:
         if side is None:
             return np.eye(3), np.zeros(3)
         moved = interval.moved.get(side, np.zeros(6))
-        return _rotation(moved[3:]), interval.partners[side].centre + moved[:3]
+        return rotations(moved[None, 3:])[0], interval.partners[side].centre + moved[:3]
 
     def _point(self, data: mujoco.MjData, interval: _Interval, k: int) -> np.ndarray:
         turn, origin = self._frame(data, interval, interval.contacts[k].body)
@@ -233,7 +243,7 @@ class Coupling:
         turn, _ = self._frame(data, interval, contact.body)
         turn2, origin2 = self._frame(data, interval, contact.other)
         way = self._point(data, interval, k) - (origin2 + turn2 @ interval.anchors[k][1])
-        return np.concatenate([way, turn2 @ _rotation_vector(turn2.T @ turn @ interval.turns[k].T)])
+        return np.concatenate([way, turn2 @ rotation_vector(turn2.T @ turn @ interval.turns[k].T)])
 
     def _jacobian(self, data: mujoco.MjData, body: int, point: np.ndarray) -> np.ndarray:
         found = np.zeros((6, self.model.nv))
@@ -248,7 +258,7 @@ class Coupling:
 def _solve(
     contacts: Sequence[Touching], stiffness: np.ndarray, mobility: np.ndarray, away: np.ndarray, relative: np.ndarray, h: float
 ) -> np.ndarray:
-    """c of all contacts, (6 n,): those that would pull open, and lose w₀'s push too."""
+    """c of all contacts, (6 n,): those that would pull open, and lose what w₀ has of them too."""
     closed, fixed = np.ones(len(contacts), bool), np.zeros(6 * len(contacts))
     while True:
         shut = np.repeat(closed, 6)
@@ -262,24 +272,13 @@ def _solve(
             return c
         for k in np.flatnonzero(pulls).tolist():
             closed[k] = False
-            push = contacts[k].push
-            assert push is not None
-            fixed[6 * k : 6 * k + 3] = -push
+            fixed[6 * k : 6 * k + 6] = contacts[k].released
 
 
 def _inertia(partner: FreePartner) -> np.ndarray:
     found = np.zeros((6, 6))
     found[:3, :3], found[3:, 3:] = partner.mass * np.eye(3), partner.inertia
     return found
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector [rad]."""
-    quaternion, matrix = np.empty(4), np.empty(9)
-    angle = float(np.linalg.norm(vector))
-    mujoco.mju_axisAngle2Quat(quaternion, vector / angle if angle > 0.0 else np.array([1.0, 0.0, 0.0]), angle)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
 
 
 def _lever(arm: np.ndarray) -> np.ndarray:
@@ -293,10 +292,3 @@ def _lever(arm: np.ndarray) -> np.ndarray:
 def _moved_to(wrench: np.ndarray, point: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """A wrench (6,) about ``point``, about ``origin``."""
     return np.concatenate([wrench[:3], wrench[3:] + np.cross(point - origin, wrench[:3])])
-
-
-def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    quaternion, found = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
-    mujoco.mju_quat2Vel(found, quaternion, 1.0)
-    return found

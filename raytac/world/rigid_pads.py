@@ -13,6 +13,9 @@ elastic foundation, one contact is made and put among MuJoCo's own:
   1961) with α the share of energy that the gel loses.
 
 MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad carries a tangential force without shearing first.
+
+All environments go in lock-step: in every step of MuJoCo the contacts of all of them are found at once, and MuJoCo is called for one after
+the other, since its own share of the time is small (docs/rl.md, Speed).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -20,8 +23,8 @@ MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -33,11 +36,11 @@ from raytac.gel.traction import foundation_traction
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.pad_reading import PadReading
 from raytac.robots.mount import MountedSensor
-from raytac.robots.pose import pose, world_from_site
+from raytac.robots.pose import body_poses, site_poses
 from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedBody, ComposedScene
-from raytac.world.pad_overlap import PadOverlap, Touch
-from raytac.world.state import Controller, is_lost
+from raytac.world.pad_overlap import PadOverlap, Touches
+from raytac.world.state import Drive, lost
 
 __all__ = ["RigidPads"]
 
@@ -62,6 +65,15 @@ class _Pad:
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
 
 
+@dataclass(frozen=True)
+class _Contact:
+    """A pad's contact among MuJoCo's."""
+
+    env: int
+    sensor: str
+    index: int
+
+
 class RigidPads:
     """All pads of a world, B environments; MuJoCo moves every body."""
 
@@ -80,8 +92,7 @@ class RigidPads:
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
         self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
         """Body that each pad showed deepest last; −1: none."""
-        self._contact = mujoco.MjContact()
-        self._force = np.empty(6)
+        self._forms = {(name, i): self._form(name, i) for name in self.pads for i in range(len(self.bodies))}
         self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
         self.report: dict[str, np.ndarray] = {}
 
@@ -92,39 +103,33 @@ class RigidPads:
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
                 wrench[b], pressed[b] = 0.0, -1
 
-    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
-        scene = self.composed.scene
-        for b, (data, controller) in enumerate(zip(datas, controllers, strict=True)):
-            if failed[b]:
-                continue
+        scene, model = self.composed.scene, self.model
+        sound, touching = np.flatnonzero(~failed), []
+        for b in sound.tolist():
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
-            for _ in range(round(scene.control_timestep / scene.timestep)):
-                touching = self._step(data, b, controller)
-                if touching is None:
-                    failed[b] = True
-                    break
-            else:
-                assert touching is not None
-                self._read_forces(data, b, touching)
-                mujoco.mj_kinematics(self.model, data)  # so that poses are those of the end of the step
-
-    def _step(self, data: mujoco.MjData, b: int, control: Controller) -> list[tuple[str, int]] | None:
-        """One step of MuJoCo with the pads' contacts, which are returned: sensor and index of the contact; None where it breaks down."""
-        model = self.model
-        mujoco.mj_step1(model, data)
-        touching = self._add_contacts(data, b)
-        if touching is None:
-            return None
-        if touching:
-            # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
-            mujoco.mj_makeConstraint(model, data)
-            mujoco.mj_island(model, data)
-            mujoco.mj_projectConstraint(model, data)
-            mujoco.mj_referenceConstraint(model, data)
-        control(data, float(data.time))
-        mujoco.mj_step2(model, data)
-        return None if is_lost(data) else touching
+        for _ in range(round(scene.control_timestep / scene.timestep)):
+            for b in sound.tolist():
+                mujoco.mj_step1(model, datas[b])
+            touching = self._add_contacts(datas, sound, failed)
+            sound = sound[~failed[sound]]
+            if not len(sound):
+                break
+            for b in sorted({contact.env for contact in touching if not failed[contact.env]}):
+                # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
+                mujoco.mj_makeConstraint(model, datas[b])
+                mujoco.mj_island(model, datas[b])
+                mujoco.mj_projectConstraint(model, datas[b])
+                mujoco.mj_referenceConstraint(model, datas[b])
+            drive(sound)
+            for b in sound.tolist():
+                mujoco.mj_step2(model, datas[b])
+            failed[sound] = lost([datas[b] for b in sound.tolist()])
+            sound = sound[~failed[sound]]
+        self._read_forces(datas, sound, [contact for contact in touching if not failed[contact.env]])
+        for b in sound.tolist():
+            mujoco.mj_kinematics(model, datas[b])  # so that poses are those of the end of the step
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
@@ -134,118 +139,138 @@ class RigidPads:
         """Sensor, body and depth [m] of every overlap at the present poses."""
         found = []
         for name, pad in self.pads.items():
+            world_from_pad = site_poses([data], pad.site)
             for i, body in enumerate(self.bodies):
-                touch = self._touch(data, pad, i)
-                if touch is not None:
-                    found.append((name, body.spec.name, touch.depth))
+                touches = self._touches(pad, i, world_from_pad, body_poses([data], body.index))
+                found += [(name, body.spec.name, float(depth)) for depth in touches.depth]
         return found
 
-    def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
-        """Surface and forces of one sensor on the nodes of ``grid``, for all environments."""
-        pad = self.pads[name]
+    def reading(
+        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
+    ) -> PadReading:
+        """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
+        pad, rows = self.pads[name], np.arange(len(datas)) if envs is None else np.asarray(envs)
+        datas, failed = [datas[b] for b in rows.tolist()], failed[rows]
         if name not in self._shown or self._shown[name][0] is not grid:
             self._shown[name] = grid, ElasticSurround(grid)
         height = np.full((len(datas), *grid.shape), np.inf)
         poses = np.full((len(datas), 4, 4), np.nan)
+        deepest, pressed = np.zeros(len(datas)), np.full(len(datas), -1)
         highest = float(grid.rest.max())
-        for b, data in enumerate(datas):
-            if failed[b]:
-                height[b] = np.nan
+        world_from_pad = site_poses(datas, pad.site)
+        for i, body in enumerate(self.bodies):
+            pad_from_body = _relative(world_from_pad, body_poses(datas, body.index))
+            near = np.flatnonzero(self._is_near(pad, pad_from_body, i) & ~failed)
+            if not len(near):
                 continue
-            world_from_pad = world_from_site(data, pad.site)
-            deepest, pressed = 0.0, -1
-            for i, body in enumerate(self.bodies):
-                pad_from_body = _relative(world_from_pad, data, body.index)
-                if not self._is_near(pad, pad_from_body, i):
-                    continue
-                under = object_height(body.parts, pad_from_body[None], grid.x, grid.y, below=highest)[0]
-                depth = float((grid.rest - under).max())
-                if depth > deepest:
-                    deepest, pressed, poses[b] = depth, i, pad_from_body
-                np.minimum(height[b], under, out=height[b])
-            # From one body to another is no motion of either.
-            if pressed != self._pressed[name][b] and self._pressed[name][b] >= 0:
-                poses[b] = np.nan
-            self._pressed[name][b] = pressed
+            under = object_height(body.parts, pad_from_body[near], grid.x, grid.y, below=highest)
+            depth = (grid.rest - under).max(axis=(1, 2))
+            deeper = depth > deepest[near]
+            at = near[deeper]
+            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at]
+            height[near] = np.minimum(height[near], under)
+        height[failed] = np.nan
+        # From one body to another is no motion of either.
+        before = self._pressed[name][rows]
+        poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
+        self._pressed[name][rows] = np.where(failed, before, pressed)
         surface = self._shown[name][1].surface(height, poses)
-        wrench = np.where(failed[:, None], np.nan, self._wrench[name])
-        return PadReading(surface, wrench, failed.copy(), lambda: _traction(surface, wrench))
+        wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
+        return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
 
-    def _is_near(self, pad: _Pad, pad_from_body: np.ndarray, i: int) -> bool:
-        radius, at = self._radius[i], pad_from_body[:3, 3]
+    def _is_near(self, pad: _Pad, pad_from_body: np.ndarray, i: int) -> np.ndarray:
+        """Whether a body at poses (B, 4, 4) may reach the pad's box, (B,)."""
+        radius, at = self._radius[i], pad_from_body[:, :3, 3]
         if self.bodies[i].spec.kind == "plane":
             # The plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
-            normal = pad_from_body[:3, 2]
-            return bool(normal[2] * pad.highest - np.abs(normal[:2]) @ pad.reach < normal @ at)
-        return bool(at[2] - radius < pad.highest and (np.abs(at[:2]) - radius < pad.reach).all())
+            normal = pad_from_body[:, :3, 2]
+            return normal[:, 2] * pad.highest - np.abs(normal[:, :2]) @ pad.reach < (normal * at).sum(axis=1)
+        return (at[:, 2] - radius < pad.highest) & (np.abs(at[:, :2]) - radius < pad.reach).all(axis=1)
 
-    def _touch(self, data: mujoco.MjData, pad: _Pad, i: int) -> Touch | None:
-        pad_from_body = _relative(world_from_site(data, pad.site), data, self.bodies[i].index)
-        near = self._is_near(pad, pad_from_body, i)
-        return pad.overlap.touch(self.bodies[i].parts, pad_from_body, self._radius[i]) if near else None
+    def _touches(self, pad: _Pad, i: int, world_from_pad: np.ndarray, world_from_body: np.ndarray) -> Touches:
+        """Where a body touches a pad; ``env`` counts the poses (n, 4, 4) given."""
+        pad_from_body = _relative(world_from_pad, world_from_body)
+        near = np.flatnonzero(self._is_near(pad, pad_from_body, i))
+        if not len(near):
+            return pad.overlap.none
+        touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[near], self._radius[i])
+        return replace(touches, env=near[touches.env])
 
-    def _add_contacts(self, data: mujoco.MjData, b: int) -> list[tuple[str, int]] | None:
-        """Put the pads' contacts among MuJoCo's; returns (sensor, index of the contact), None if its memory for contacts is full."""
+    def _add_contacts(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> list[_Contact]:
+        """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
         found, model = [], self.model
+        some = [datas[b] for b in envs.tolist()]
+        world_from_body = [body_poses(some, body.index) for body in self.bodies]
         for name, pad in self.pads.items():
+            world_from_pad = site_poses(some, pad.site)
             for i, body in enumerate(self.bodies):
                 compliance = float(model.body_invweight0[pad.body, 0] + model.body_invweight0[body.index, 0])
                 if compliance <= 0.0:
                     continue  # neither moves
-                touch = self._touch(data, pad, i)
-                if touch is None:
+                touches = self._touches(pad, i, world_from_pad, world_from_body[i])
+                if not len(touches.env):
                     continue
-                law = self._laws[b].get((name, i))
-                if law is None:
-                    law = self._laws[b][name, i] = pad.overlap.law(touch)
-                self._fill(data, pad, i, touch, law, compliance)
-                if mujoco.mj_addContact(model, data, self._contact) != 0:
-                    return None
-                found.append((name, int(data.ncon) - 1))
+                rotation, origin = world_from_pad[touches.env, :3, :3], world_from_pad[touches.env, :3, 3]
+                frames = _frames((rotation @ touches.normal[..., None])[..., 0], rotation[..., 0])
+                places = (rotation @ touches.centre[..., None])[..., 0] + origin
+                for k, b in enumerate(envs[touches.env].tolist()):
+                    law = self._laws[b].get((name, i))
+                    if law is None:
+                        law = self._laws[b][name, i] = pad.overlap.law(touches, k)
+                    contact = self._forms[name, i]
+                    contact.frame[:], contact.pos[:] = frames[k], places[k]
+                    self._load(contact, pad, i, float(touches.depth[k]), law, compliance)
+                    if mujoco.mj_addContact(model, datas[b], contact) != 0:
+                        failed[b] = True
+                    else:
+                        found.append(_Contact(b, name, int(datas[b].ncon) - 1))
         return found
 
-    def _fill(self, data: mujoco.MjData, pad: _Pad, i: int, touch: Touch, law: LoadLaw, compliance: float) -> None:
-        """The contact between a pad and a body, from gel to body.
+    def _form(self, name: str, i: int) -> mujoco.MjContact:
+        """What all contacts between a pad and a body have in common."""
+        contact, gel = mujoco.MjContact(), self.pads[name].gel
+        contact.includemargin, contact.dim, contact.exclude = 0.0, 6, 0
+        contact.solreffriction[:] = 0.0, -_SLIP_RATE / float(self.model.opt.timestep)
+        contact.geom1, contact.geom2 = gel, self._geom[i]
+        contact.geom[:] = gel, self._geom[i]
+        contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
+        return contact
+
+    def _load(self, contact: mujoco.MjContact, pad: _Pad, i: int, depth: float, law: LoadLaw, compliance: float) -> None:
+        """Stiffness and friction of a contact, from gel to body.
 
         A contact of the direct form, stiffness s, impedance d, on a compliance A (MuJoCo's estimate of J M⁻¹ Jᵀ) is at rest a spring of
         K = s / ((1 − d) A): see ``contact_solref``.
         """
-        contact, step = self._contact, float(self.model.opt.timestep)
-        rotation = data.site_xmat[pad.site].reshape(3, 3)
-        normal = rotation @ touch.normal
-        contact.frame[:] = _frame(normal, rotation[:, 0])
-        contact.pos[:] = rotation @ touch.centre + data.site_xpos[pad.site]
-        contact.dist, contact.includemargin, contact.dim, contact.exclude = -touch.depth, 0.0, 6, 0
-        natural = law.secant_stiffness(touch.depth) * compliance
-        loss = min(max((_RATE / step) ** 2 / natural, 1e-3), 0.5)  # 1 − d
+        contact.dist = -depth
+        natural = law.secant_stiffness(depth) * compliance
+        loss = min(max((_RATE / float(self.model.opt.timestep)) ** 2 / natural, 1e-3), 0.5)  # 1 − d
         stiffness = natural * loss
         contact.solimp[:] = 1.0 - loss, 1.0 - loss, 1e-3, 0.5, 2.0
         contact.solref[:] = -stiffness, -2.0 * stiffness**0.5
-        contact.solreffriction[:] = 0.0, -_SLIP_RATE / step
-        friction, radius = self._friction[i], law.contact_radius(touch.depth)
+        friction, radius = self._friction[i], law.contact_radius(depth)
         friction = pad.spec.gelpad.friction if friction is None else friction
         least = 1e-6  # MuJoCo wants them positive
         rolling = max(3.0 / 16.0 * _HYSTERESIS * radius, least)
         spin = max(3.0 * np.pi / 16.0 * friction * radius, least)
         contact.friction[:] = max(friction, least), max(friction, least), spin, rolling, rolling
-        contact.geom1, contact.geom2 = pad.gel, self._geom[i]
-        contact.geom[:] = pad.gel, self._geom[i]
-        contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
 
-    def _read_forces(self, data: mujoco.MjData, b: int, touching: list[tuple[str, int]]) -> None:
+    def _read_forces(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, touching: Sequence[_Contact]) -> None:
         for wrench in self._wrench.values():
-            wrench[b] = 0.0
-        for name, index in touching:
-            mujoco.mj_contactForce(self.model, data, index, self._force)
-            contact = data.contact[index]
+            wrench[envs] = 0.0
+        local = np.empty(6)
+        for one in touching:
+            data = datas[one.env]
+            mujoco.mj_contactForce(self.model, data, one.index, local)
+            contact = data.contact[one.index]
             to_world = contact.frame.reshape(3, 3).T
             # MuJoCo's force is on the second body; the pad gets the opposite.
-            force, torque = -to_world @ self._force[:3], -to_world @ self._force[3:]
-            site = self.pads[name].site
+            force, torque = -to_world @ local[:3], -to_world @ local[3:]
+            site = self.pads[one.sensor].site
             # Place and force are of the start of this step, the site's too until the next step's kinematics.
             rotation, origin = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
             torque = torque + _cross(contact.pos - origin, force)
-            self._wrench[name][b] += np.concatenate([force @ rotation, torque @ rotation])
+            self._wrench[one.sensor][one.env] += np.concatenate([force @ rotation, torque @ rotation])
 
 
 def _radius(body: ComposedBody) -> float:
@@ -254,17 +279,21 @@ def _radius(body: ComposedBody) -> float:
     return float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
 
 
-def _relative(world_from_pad: np.ndarray, data: mujoco.MjData, body: int) -> np.ndarray:
-    """``pad_from_body`` (4, 4)."""
-    back = world_from_pad[:3, :3].T
-    return pose(back @ data.xmat[body].reshape(3, 3), back @ (data.xpos[body] - world_from_pad[:3, 3]))
+def _relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
+    """``pad_from_body`` (n, 4, 4)."""
+    back = np.swapaxes(world_from_pad[:, :3, :3], 1, 2)
+    found = np.zeros_like(world_from_pad)
+    found[:, :3, :3] = back @ world_from_body[:, :3, :3]
+    found[:, :3, 3] = (back @ (world_from_body[:, :3, 3] - world_from_pad[:, :3, 3])[..., None])[..., 0]
+    found[:, 3, 3] = 1.0
+    return found
 
 
-def _frame(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Rows of a right-handed frame whose first is ``normal`` and whose second is near ``along``, (9,)."""
-    second = along - (along @ normal) * normal
-    second = second / math.sqrt(second @ second)
-    return np.concatenate([normal, second, _cross(normal, second)])
+def _frames(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Rows of right-handed frames whose first is ``normal`` (n, 3) and whose second is near ``along``, (n, 9)."""
+    second = along - (along * normal).sum(axis=1, keepdims=True) * normal
+    second /= np.sqrt(np.square(second).sum(axis=1, keepdims=True))
+    return np.concatenate([normal, second, np.cross(normal, second)], axis=1)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

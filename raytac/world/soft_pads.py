@@ -9,20 +9,23 @@ where MuJoCo has them, what belongs to the solver moves by itself and is mirrore
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import mujoco
 import numpy as np
 
 import ipc
-from raytac.errors import InputError, SpecError
+from raytac.errors import InputError, OverlapError, SpecError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
 from raytac.physics.objects import object_parts
 from raytac.physics.pad_reading import PadReading
 from raytac.physics.part_surface import enclosed_volume, object_surface
+from raytac.physics.point_depth import SOLIDS, point_depth
+from raytac.physics.rotation import quaternion
 from raytac.physics.soft_bodies import SceneBody, scene_body
 from raytac.physics.soft_mesh import pad_mesh
 from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
@@ -30,8 +33,9 @@ from raytac.robots.pose import pose, world_from_site
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
 from raytac.world.coupling import Coupling
+from raytac.world.robot_overlap import Inside, RobotOverlap
 from raytac.world.soft_answers import soft_answers
-from raytac.world.state import Controller, is_lost
+from raytac.world.state import Drive, lost
 
 __all__ = ["SoftPads"]
 
@@ -40,7 +44,18 @@ _TOUCH = 1e-5
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
-_AT_REST = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "newton": 0, "substeps": 0}
+_INSIDE = 1e-4
+"""How far a body may lie inside a case or a link unsaid [m]: rounding of a scene's lengths."""
+
+_AT_REST = {
+    "min_gap": np.inf,
+    "min_det": 1.0,
+    "blocked": 0.0,
+    "converged": True,
+    "newton": 0,
+    "substeps": 0,
+    "inside_robot": 0.0,
+}
 """What the report says after a reset, before any step."""
 
 
@@ -66,7 +81,7 @@ class SoftPads:
 
         Raises:
             SpecError: a body that the solver cannot hold.
-            OverlapError: bodies overlap at the start.
+            OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model = composed, composed.model
         scene = composed.scene
@@ -94,6 +109,9 @@ class SoftPads:
             num_envs=len(datas),
             device=device,
         )
+        self._robot = RobotOverlap(composed)
+        self._told: set[tuple[str, str]] = set()
+        self._refuse_inside(datas, range(len(datas)))
         self._coupling = None
         if coupling == "two_way":
             felt = self._links + [b.index for b in self._led]
@@ -112,7 +130,7 @@ class SoftPads:
         MuJoCo has them.
 
         Raises:
-            OverlapError: bodies overlap there; the solver has not changed then.
+            OverlapError: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
         cases, chosen = self._pad_poses(datas), list(envs)
         begin = {b.name: pose_of(b.position, b.quaternion) for b in self.composed.scene.bodies}
@@ -123,6 +141,8 @@ class SoftPads:
         if bodies is None:
             self.soft.reset(chosen)
         else:
+            self._show(datas, chosen, starts)
+            self._refuse_inside(datas, chosen, only_rigid=True)  # soft ones are where they were, not where they will be
             self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
         for b in envs:
             self._last_cases[b] = cases[b]
@@ -136,7 +156,7 @@ class SoftPads:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
 
-    def advance(self, datas: Sequence[mujoco.MjData], controllers: Sequence[Controller], failed: np.ndarray) -> None:
+    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
         So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
@@ -150,7 +170,7 @@ class SoftPads:
         for step in range(1, steps + 1):
             for b, data in enumerate(datas):
                 if not failed[b]:
-                    failed[b] = not self._ahead(data, b, controllers[b])
+                    failed[b] = not self._ahead(data, b, drive)
             since += 1
             cases, led = self._now(datas, failed)
             # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
@@ -163,7 +183,7 @@ class SoftPads:
             if since == interval or step == steps or early:
                 reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
                 since = 0
-        self.report = _joined(reports)
+        self.report = _joined(reports) | {"inside_robot": self._depth_inside(datas, failed)}
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -174,8 +194,10 @@ class SoftPads:
         """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
         return self._wrench[name].copy()
 
-    def reading(self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
-        """Surface and forces of one sensor, for all environments."""
+    def reading(
+        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
+    ) -> PadReading:
+        """Surface and forces of one sensor, for the environments named, one row each; None is all."""
         reading = self.soft.reading(name, grid, failed)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
@@ -184,20 +206,21 @@ class SoftPads:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        return PadReading(reading.surface, wrench, failed.copy(), traction)
+        found = PadReading(reading.surface, wrench, failed.copy(), traction)
+        return found if envs is None else found.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """None: the solver refuses a start in which bodies overlap."""
         return []
 
-    def _ahead(self, data: mujoco.MjData, b: int, control: Controller) -> bool:
+    def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
         """One step of MuJoCo; returns whether the state is still sound."""
         mujoco.mj_step1(self.model, data)
-        control(data, float(data.time))
+        drive([b])
         if self._coupling is not None:
             self._coupling.apply(data, b)
         mujoco.mj_step2(self.model, data)
-        if is_lost(data):
+        if lost([data])[0]:
             return False
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
@@ -237,14 +260,51 @@ class SoftPads:
 
     def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
         """Show MuJoCo where the solver has its bodies."""
+        self._show(datas, envs, {body.spec.name: self.soft.pose(body.spec.name) for body in self._own})
+
+    def _show(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray, poses: Mapping[str, np.ndarray]) -> None:
         for body in self._own:
-            poses = self.soft.pose(body.spec.name)
+            at = poses[body.spec.name]
             for b in envs:
-                datas[b].mocap_pos[body.mocap] = poses[b, :3, 3]
-                mujoco.mju_mat2Quat(datas[b].mocap_quat[body.mocap], np.ascontiguousarray(poses[b, :3, :3]).ravel())
+                datas[b].mocap_pos[body.mocap] = at[b, :3, 3]
+                datas[b].mocap_quat[body.mocap] = quaternion(at[b, :3, :3])
         if self._own:
             for b in envs:
                 mujoco.mj_kinematics(self.model, datas[b])
+
+    def _inside(
+        self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False
+    ) -> Iterator[tuple[int, Inside]]:
+        """What lies inside cases and links, by environment; rigid bodies as MuJoCo shows them, soft ones as they are."""
+        soft = {name: self.soft.mesh(name)[0] for name, body in self.soft.bodies.items() if body.is_soft and not only_rigid}
+        for b in envs:
+            found = self._robot.rigid(datas[b])
+            for name, vertices in soft.items():
+                found += self._robot.soft(datas[b], name, vertices[b])
+            yield from ((int(b), one) for one in found if one.depth > _INSIDE)
+
+    def _refuse_inside(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range, *, only_rigid: bool = False) -> None:
+        for b, one in self._inside(datas, envs, only_rigid=only_rigid):
+            where = f" in environment {b}" if len(datas) > 1 else ""
+            raise OverlapError(f"{one.body!r} starts {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}")
+
+    def _depth_inside(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
+        """The deepest [m], (B,); the first time for every body and geom a warning."""
+        depth = np.zeros(len(datas))
+        for b, one in self._inside(datas, np.flatnonzero(~failed)):
+            depth[b] = max(depth[b], one.depth)
+            if (one.body, one.geom) not in self._told:
+                self._told.add((one.body, one.geom))
+                rule = (
+                    "simulated bodies meet gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
+                )
+                where = f" in environment {b} at {datas[b].time:.3f} s"
+                warnings.warn(
+                    f"{one.body!r} is {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}: {rule}",
+                    RuntimeWarning,
+                    stacklevel=4,
+                )
+        return depth
 
     def _pad_poses(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
         """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
@@ -293,31 +353,18 @@ def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
     fixed = scene.body(str(body.held_by))
     fixed_from_body = np.linalg.inv(pose_of(fixed.position, fixed.quaternion)) @ pose_of(body.position, body.quaternion)
     parts = object_parts(fixed)
-    known = ("plane", "box", "sphere", "cylinder")
     for part in parts:
-        if part.kind not in known:
+        if part.kind not in SOLIDS:
             rule = "cannot hold a soft body: its shape must be made of these"
-            raise SpecError(rule, file=scene.source, key=f"body[{index}].held_by", value=fixed.name, choices=known)
+            raise SpecError(rule, file=scene.source, key=f"body[{index}].held_by", value=fixed.name, choices=SOLIDS)
 
     def held(vertices: np.ndarray) -> np.ndarray:
         inside = np.zeros(len(vertices), bool)
         for part in parts:
-            to_part = np.linalg.inv(part.object_from_part) @ fixed_from_body
-            inside |= _inside(part, vertices @ to_part[:3, :3].T + to_part[:3, 3])
+            inside |= point_depth(part, vertices @ fixed_from_body[:3, :3].T + fixed_from_body[:3, 3]) >= -_TOUCH
         return inside
 
     return held
-
-
-def _inside(part: Part, at: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3), part frame, lie in a part or within ``_TOUCH`` of it."""
-    if part.kind == "plane":
-        return np.asarray(at[:, 2] <= _TOUCH)
-    if part.kind == "box":
-        return np.all(np.abs(at) <= np.asarray(part.size) + _TOUCH, axis=1)
-    if part.kind == "sphere":
-        return np.linalg.norm(at, axis=1) <= part.size[0] + _TOUCH
-    return (np.hypot(at[:, 0], at[:, 1]) <= part.size[0] + _TOUCH) & (np.abs(at[:, 2]) <= part.size[1] + _TOUCH)
 
 
 def _joined(reports: Sequence[SceneReport]) -> dict[str, np.ndarray]:

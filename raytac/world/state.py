@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
 
-__all__ = ["Control", "Controller", "WorldState", "is_lost"]
+__all__ = ["BatchController", "Control", "Controller", "Drive", "WorldState", "lost"]
 
 _LARGEST_SPEED = 1e4
 """Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
@@ -19,8 +20,20 @@ _LARGEST_SPEED = 1e4
 Controller = Callable[[mujoco.MjData, float], None]
 """Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
 and bias forces are up to date."""
-Control = Controller | Sequence[Controller] | np.ndarray
-"""One controller for all environments, one for each, or constant controls (nu,) or (B, nu)."""
+Drive = Callable[[Sequence[int] | np.ndarray], None]
+"""Writes ``data.ctrl`` of the environments named, at the same moments."""
+
+
+class BatchController(ABC):
+    """A controller of all environments in one call."""
+
+    @abstractmethod
+    def drive(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
+        """Write ``ctrl`` of ``datas[b]`` for every b of ``envs``; called as a ``Controller`` is. Those not named have failed."""
+
+
+Control = Controller | BatchController | Sequence[Controller] | np.ndarray
+"""One controller for all environments or for each at a time, one for each, or constant controls (nu,) or (B, nu)."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,7 @@ class WorldState:
     """What the pads' solver says of this step, each (B,); empty with the rigid pad."""
 
 
-def is_lost(data: mujoco.MjData) -> bool:
-    """Whether a state of MuJoCo is beyond use: a number is not finite, or a joint runs away."""
-    return not ((np.abs(data.qvel) < _LARGEST_SPEED).all() and np.isfinite(data.qpos).all())
+def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
+    """Which of one or more states of MuJoCo are beyond use, (n,): a number is not finite, or a joint runs away."""
+    speed, place = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
+    return np.logical_not((np.abs(speed) < _LARGEST_SPEED).all(axis=1) & np.isfinite(place).all(axis=1))

@@ -16,12 +16,13 @@ import numpy as np
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
-from raytac.markers.contacts import chosen_envs
+from raytac.gel.batch import chosen_envs
 from raytac.physics.batch_check import rigid_poses
+from raytac.physics.rotation import quaternion
 from raytac.physics.solver import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import pose, quaternion
+from raytac.robots.pose import body_poses, site_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
 from raytac.specs.press import PADS
@@ -29,7 +30,7 @@ from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.rigid_pads import RigidPads
-from raytac.world.state import Control, Controller, WorldState
+from raytac.world.state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.physics.soft_scene import SoftScene
@@ -177,7 +178,7 @@ class TactileWorld:
             OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
                 pad a start may be one in contact, as it was recorded, so overlap is not looked for.
         """
-        chosen = list(range(self.num_envs)) if envs is None else chosen_envs(envs, self.num_envs)
+        chosen = chosen_envs(envs, self.num_envs)
         places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
         free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
         for name in places:
@@ -258,7 +259,7 @@ class TactileWorld:
                 something that it may touch, in the only environment (it has failed then). Of several environments the one that moves so
                 is marked in ``failed``, with a ``RuntimeWarning``.
         """
-        self._pads.advance(self.data, self._controllers(self.hold if control is None else control), self._failed)
+        self._pads.advance(self.data, self._drive(self.hold if control is None else control), self._failed)
         return self.state()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
@@ -269,27 +270,31 @@ class TactileWorld:
 
     def state(self) -> WorldState:
         """What the world is like now."""
-        arm, names = self.arm, self.composed.bodies
-        lost = self._failed
-        pads = {m.name: _stack([m.world_from_pad(d) for d in self.data], lost) for m in self.composed.sensors}
-        bodies = {
-            name: _stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in self.data], lost)
-            for name, body in names.items()
-        }
-        joints = None if arm is None else _stack([d.qpos[arm.qpos] for d in self.data], lost)
+        arm, lost = self.arm, self._failed
+        pads = {m.name: site_poses(self.data, int(self.model.site(m.site).id)) for m in self.composed.sensors}
+        bodies = {name: body_poses(self.data, body.index) for name, body in self.composed.bodies.items()}
+        joints = None if arm is None else np.array([d.qpos for d in self.data])[:, arm.qpos]
+        for values in (*pads.values(), *bodies.values(), *(() if joints is None else (joints,))):
+            values[lost] = np.nan
         wrench = {name: np.where(lost[:, None], np.nan, self._pads.wrench(name)) for name in self.sensor_names}
         return WorldState(
             np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
         )
 
-    def observe(self, sensors: Sequence[str] | None = None) -> dict[str, TactileFrame]:
+    def observe(
+        self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
+    ) -> dict[str, TactileFrame]:
         """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
 
         Markers that follow a contact's history (``fots``) see only what is observed: call it every control step if they are asked for.
 
+        ``envs`` (a mask (B,) or a list) gives frames with one row an environment named, and nothing of the others goes on: no noise is
+        drawn for them and no history written. One that is named twice has two rows that are the same.
+
         Raises:
-            InputError: an unknown sensor; as ``TactileSensor.update``.
+            InputError: an unknown sensor or environment; as ``TactileSensor.update``.
         """
+        rows = None if envs is None else chosen_envs(envs, self.num_envs)
         chosen = self.sensor_names if sensors is None else tuple(sensors)
         for name in chosen:
             if name not in self.sensor_names:
@@ -297,7 +302,7 @@ class TactileWorld:
         frames = {}
         for name in chosen:
             sensor = self.sensors[name]
-            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed))
+            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed, rows), rows)
         return frames
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -319,21 +324,37 @@ class TactileWorld:
         poses = self.state().world_from_body[name]
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
 
-    def _controllers(self, control: Control) -> list[Controller]:
+    def _drive(self, control: Control) -> Drive:
+        """What writes the controls of environments, from any way to say it."""
+        if isinstance(control, BatchController):
+            return lambda envs: control.drive(self.data, envs)
         if isinstance(control, np.ndarray):
-            values = np.asarray(control, float)
-            if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
-                rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
-                raise InputError("control", value=values.shape, rule=rule)
-            return [_constant(row) for row in np.broadcast_to(values, (self.num_envs, self.model.nu))]
-        if callable(control):
-            return [control] * self.num_envs
-        if len(control) != self.num_envs:
-            raise InputError("control", value=len(control), rule=f"must be one controller, or one for each of {self.num_envs}")
-        for controller in control:
+            rows = self._constant_controls(control)
+
+            def write(envs: Sequence[int] | np.ndarray) -> None:
+                for b in envs:
+                    self.data[b].ctrl[:] = rows[b]
+
+            return write
+        each = [control] * self.num_envs if callable(control) else list(control)
+        if len(each) != self.num_envs:
+            raise InputError("control", value=len(each), rule=f"must be one controller, or one for each of {self.num_envs}")
+        for controller in each:
             if not callable(controller):
                 raise InputError("control", value=controller, rule="must be a controller; constant controls are a NumPy array")
-        return list(control)
+
+        def call(envs: Sequence[int] | np.ndarray) -> None:
+            for b in envs:
+                each[b](self.data[b], float(self.data[b].time))
+
+        return call
+
+    def _constant_controls(self, control: np.ndarray) -> np.ndarray:
+        values = np.asarray(control, float)
+        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
+            rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
+            raise InputError("control", value=values.shape, rule=rule)
+        return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
     def _check_start(self) -> None:
         """Refuse a start in which bodies overlap."""
@@ -347,16 +368,3 @@ class TactileWorld:
             if depth > _OVERLAP:
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 raise InputError("body", value=body, rule=rule)
-
-
-def _constant(values: np.ndarray) -> Controller:
-    def write(data: mujoco.MjData, time: float) -> None:
-        data.ctrl[:] = values
-
-    return write
-
-
-def _stack(rows: list[np.ndarray], failed: np.ndarray) -> np.ndarray:
-    stacked = np.stack(rows).astype(float)
-    stacked[failed] = np.nan
-    return stacked

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 import raytac.envs
 import raytac.envs.lift_cube
-from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv
+from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv, scripted
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
@@ -20,7 +20,6 @@ from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
-from tests.envs import scripted
 
 ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
 
@@ -96,6 +95,44 @@ def test_a_vector_does_what_single_environments_of_its_seeds_do() -> None:
     assert steps[-1][0]["sensor_markers"].any(), "nothing was touched"
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_with_noise_in_every_frame_too_when_they_begin_anew_at_different_times(mode: AutoresetMode) -> None:
+    disturbed = MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=5e-5)
+    tactile = ObservationSettings(("rgb", "markers", "wrench"), resolution=(16, 12), optics="phong", difference=True, stack=2)
+    options = {
+        "tactile": tactile,
+        "randomization": Randomization(noise=2.0, exposure=0.2, markers=disturbed),
+        "max_episode_steps": 4,
+    }
+    many = RollBallVectorEnv(3, autoreset_mode=mode, **options)
+    alone = [RollBallEnv(**options) for _ in range(3)]
+    seen = many.reset(seed=7)[0]
+    mine = [env.reset(seed=7 + b)[0] for b, env in enumerate(alone)]
+    rng, late, begun = np.random.default_rng(0), np.zeros(3, bool), np.zeros(3, int)
+    for step in range(11):
+        for b in range(3):
+            assert equal(mine[b], {name: values[b] for name, values in seen.items()}), (step, b)
+        if step == 2:  # so that they end at different times
+            seen = many.reset(options={"reset_mask": np.array([False, True, False])})[0]
+            mine[1] = alone[1].reset()[0]
+        actions = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
+        actions[:, 2] = -0.5
+        seen, _, terminated, truncated, infos = many.step(actions)
+        for b, env in enumerate(alone):
+            if late[b]:
+                mine[b], ended = env.reset()[0], False
+            else:
+                mine[b], _, over, cut, _ = env.step(actions[b])
+                ended = over or cut
+            assert ended == (terminated[b] or truncated[b])
+            begun[b] += ended
+            if ended and mode is AutoresetMode.SAME_STEP:
+                assert equal(mine[b], infos["final_obs"][b])
+                mine[b], ended = env.reset()[0], False
+            late[b] = ended
+    assert begun.min() >= 2 and len(np.unique(seen["sensor_rgb"][:2].reshape(2, -1), axis=0)) == 2
+
+
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
 def test_environments_begin_anew_when_the_mode_says(mode: AutoresetMode) -> None:
     many = RollBallVectorEnv(2, autoreset_mode=mode, max_episode_steps=3, tactile=("wrench",))
@@ -141,7 +178,7 @@ def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
     batch.reset(range(4), [np.random.default_rng(b) for b in range(4)])
     ended = np.zeros(4, bool)
     for _ in range(150):
-        out = batch.step(np.zeros((4, 4)))
+        out = batch.step(np.zeros((4, 2)))
         fresh = out.terminated & ~ended
         assert (out.terms["terminated"][fresh] == -2.0).all() and (out.terms["alive"][fresh] == 0.0).all()
         ended |= out.terminated
@@ -239,3 +276,16 @@ def test_a_simulated_pad_is_a_setting_that_changes_no_shape() -> None:
     for _ in range(2):  # up to first touch: a step in contact takes seconds
         seen = soft.step(np.array([[0, 0, -1.0], [0, 0, 0.0]], np.float32))[0]
     assert soft.observation_space.contains(seen) and seen["sensor_wrench"][0, 2] < 0.0 == seen["sensor_wrench"][1, 2]
+
+
+def test_the_wrench_alone_is_the_wrench_that_is_seen_beside_markers() -> None:
+    both, alone = (RollBallVectorEnv(2, tactile=t, max_episode_steps=5) for t in (("markers", "wrench"), ("wrench",)))
+    seen = [env.reset(seed=0)[0]["sensor_wrench"] for env in (both, alone)]
+    pressed = False
+    for _ in range(7):
+        np.testing.assert_array_equal(seen[0], seen[1])
+        seen = [env.step(np.array([[0.2, 0, -1.0], [0, 0.1, -0.5]], np.float32))[0]["sensor_wrench"] for env in (both, alone)]
+        pressed |= bool((seen[0][:, 2] < 0.0).any())
+    assert pressed
+    with pytest.raises(InputError, match="alone"):
+        both.batch.observers["sensor"].observe_wrench(np.zeros((2, 6)), np.zeros(2, bool), np.ones(2, bool))

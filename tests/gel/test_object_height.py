@@ -248,6 +248,18 @@ def test_union_batch_and_bounds() -> None:
         assert X[hit.any(axis=0)].min() >= low[0] - 1e-12 and Y[hit.any(axis=1)].max() <= high[1] + 1e-12
 
 
+@pytest.mark.parametrize("kind", [*sorted(GEOMS), "plane", "cone", "torus"])
+def test_environments_with_nodes_of_their_own_are_as_alone(kind: str) -> None:
+    """Upright, tilted and lost ones in one batch."""
+    part = primitive(kind, {**GEOMS, "plane": (), "cone": (2e-3, 3e-3, 0.5e-3), "torus": (2e-3, 1e-3)}[kind])
+    poses = np.stack([np.eye(4), random_pose(1), np.full((4, 4), np.nan), random_pose(2)])
+    x, y = (np.stack([line + shift for shift in (0.0, 1e-3, -2e-3, 5e-4)]) for line in (X, Y))
+    together = object_height([part], poses, x, y)
+    for b in range(4):
+        np.testing.assert_array_equal(together[b], object_height([part], poses[b : b + 1], x[b], y[b])[0])
+    assert np.isnan(together[2]).all() and np.isfinite(together[[0, 1, 3]]).any()
+
+
 def test_below_only_leaves_out_what_is_above_it() -> None:
     import trimesh
 

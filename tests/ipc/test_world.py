@@ -67,6 +67,31 @@ def test_press_balances_forces_and_stays_apart() -> None:
     assert world.traction("pad").shape == (1, len(world.surface("pad")[0]), 3)
 
 
+def test_forces_by_pair_add_up_to_those_of_each_body() -> None:
+    """Normal forces and friction of two balls on one pad, summed contact by contact, against what the solver's gradient says."""
+    bodies: list = [bonded_pad(small_pad())]
+    for name, x in (("left", -2.5e-3), ("right", 2.5e-3)):
+        bodies.append(ipc.KinematicBody(name, ipc.icosphere(2e-3, 2), ipc.Pose((x, 0.0, 2e-3 + GAP))))
+    world = ipc.World(bodies, ipc.Settings(dt=0.01, d_hat=1e-4, friction=0.5), num_envs=2, device="cpu")
+    start = {name: world.frame(name)[1] for name in ("left", "right")}
+    for k in range(1, 7):
+        world.set_target("left", start["left"] + k * np.array([[2e-5, 0.0, -8e-5], [0.0, 0.0, 1e-4]]))
+        world.set_target("right", start["right"] + k * np.array([0.0, 3e-5, -6e-5]))
+        assert world.step().converged.all()
+    found = world.pressing()
+    assert set(found) == {("pad", "left"), ("pad", "right")}
+    vertices = world.surface("pad")[0]
+    at, forces = world.positions("pad")[:, vertices], world.contact_forces("pad")
+    for name, mine in (("left", at[0, :, 0] < 0.0), ("right", at[0, :, 0] > 0.0)):
+        pair = found["pad", name]
+        size = np.linalg.norm(world.wrench(name).force, axis=1).max()
+        arm = at[:, mine] - np.nan_to_num(pair.place)[:, None]
+        np.testing.assert_allclose(pair.wrench[:, :3], forces[:, mine].sum(axis=1), atol=1e-9 * size)
+        np.testing.assert_allclose(pair.wrench[:, 3:], np.cross(arm, forces[:, mine]).sum(axis=1), atol=1e-9 * size)
+        assert np.linalg.norm((pair.wrench[:, :3] - pair.normal)[0]) > 0.05 * size  # friction is in it
+    assert not found["pad", "left"].wrench[1].any() and np.isnan(found["pad", "left"].place[1]).all()
+
+
 def test_bonded_vertices_do_not_move_and_follow_their_frame() -> None:
     world = make_world()
     press(world, 0.6e-3, 4)

@@ -19,6 +19,8 @@ NU = 0.48
 HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e9)
 """An elastic half-space on which nothing slips."""
 PAD = PunchSpec(0.7, 6e-3, 1e3)
+TURN = 9 * math.pi / 32 / 1.5
+"""Spin at the edge over shear, each as far as it sticks alone."""
 PLACES = np.random.default_rng(0).uniform(-8e-3, 8e-3, (200, 2))
 
 
@@ -34,13 +36,28 @@ def moved(
     """Markers (M, 2) moved by contacts (G_x, G_y, Δs_x, Δs_y, Δθ, T_xx, T_xy, T_yy, h̄), by the kernel."""
     cells = ContactCells.over(grid)
     kernel = FotsKernel(cells.x, cells.y, device="cpu")
-    table = np.array(contacts)[None]
-    parts = np.ones(table.shape[:2], bool), table[..., :2], table[..., 2:4], table[..., 4], table[..., 5:8], table[..., 8]
+    unread = np.full((len(contacts), 2), 1e3)
+    table = np.concatenate([np.ones((len(contacts), 1)), np.array(contacts), unread], axis=1)[None]
     nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
     samples = nothing if depth is None else depth[None].astype(np.float32)
     box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
     constants = FotsConstants(gain, 1e5, 0.8e5, 1e-3, 1.2e5, 0.5, punch)
-    return kernel.displacement(markers[None], samples, box, parts, constants)[0].astype(float)
+    return kernel.displacement(markers[None], samples, box, table, constants)[0].astype(float)
+
+
+def limited(way: np.ndarray, theta: float, most: float, widest: float) -> tuple[np.ndarray, float]:
+    """The closest point of the ellipsoid in elastic energy, by bisection: K_t / K_f = A², as on incompressible rubber."""
+    x, y = np.hypot(*way) / most, abs(theta) / widest
+    if x * x + y * y <= 1:
+        return way, theta
+    low, high = 0.0, x + y
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        if (x / (1 + middle)) ** 2 + (y / (1 + middle / TURN**2)) ** 2 > 1:
+            low = middle
+        else:
+            high = middle
+    return way / (1 + low), theta / (1 + low / TURN**2)
 
 
 def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, gain: float, depth: np.ndarray) -> np.ndarray:
@@ -51,9 +68,8 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
         for gx, gy, sx, sy, theta, xx, xy, yy, mean in contacts:
             shape = np.array([[xx, xy], [xy, yy]])
             radius = np.linalg.det(shape) ** 0.25
-            way, most = np.array([sx, sy]), punch.slip * mean * radius
-            if np.hypot(*way) > most:
-                way = way * most / np.hypot(*way)
+            most = punch.slip * mean * radius
+            way, theta = limited(np.array([sx, sy]), theta, most, TURN * most / radius)
             x = np.array([mx, my]) - (np.array([gx, gy]) - way)
             low, high = 0.0, float(x @ x)
             for _ in range(80):
@@ -71,8 +87,6 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
                 2 / math.pi * fade * ((math.asin(t) - punch.anisotropy * g) * way + 2 * punch.anisotropy * g * hat * (hat @ way))
             )
             es += 2 / math.pi * fade * math.asin(t)
-            widest = 9 * math.pi / 32 / 1.5 * most / radius
-            theta = min(max(theta, -widest), widest)
             w = 2 / math.pi * (math.asin(t) - g)
             twists += w * np.array(
                 [math.cos(theta) * x[0] - math.sin(theta) * x[1] - x[0], math.sin(theta) * x[0] + math.cos(theta) * x[1] - x[1]]
@@ -96,6 +110,7 @@ def test_it_equals_a_loop(grid: PadGrid) -> None:
     contacts = [
         (1e-3, -5e-4, 3e-4, -4e-4, -0.15, 9e-6, 3e-6, 2.5e-6, 3e-4),
         (-3e-3, 2e-3, -5e-4, 6e-4, 0.6, 1e-6, 0.0, 1e-6, 1.5e-4),  # past its slip, sideways and around
+        (4e-3, 3e-3, 2e-4, 1e-4, -0.05, 1e-6, 0.0, 1e-6, 2.5e-4),  # within either limit alone, not within both
     ]
     cells = ContactCells.over(grid)
     depth = np.where((cells.x[None] - 1e-3) ** 2 + (cells.y[:, None] + 5e-4) ** 2 < 4e-6, 3e-4, 0.0)
@@ -176,6 +191,30 @@ def test_it_stops_where_it_slips(grid: PadGrid) -> None:
         spun = [np.linalg.norm(moved(grid, PAD, [disc(2e-3, twist=t, mean=mean)], edge)) for t in (0.05, 0.8, 1.6)]
         assert spun[0] == pytest.approx(2 * math.sin(0.025) * 1.9e-3, rel=1e-4) and spun[1] == pytest.approx(spun[2], rel=1e-6)
         assert spun[1] == pytest.approx(2 * math.sin(0.5 * 3 * math.pi / 16 * most / 2e-3) * 1.9e-3, rel=1e-4)
+
+
+def test_a_contact_that_spins_gives_way_sideways(grid: PadGrid) -> None:
+    """Shear and spin share one friction: far past the limit the shear that is left goes to 0 as the spin grows, and the other way round."""
+    centre, edge = np.zeros((1, 2)), np.array([[1.9e-3, 0.0]])
+    most = PAD.slip * 3e-4 * 2e-3
+    widest = TURN * most / 2e-3
+
+    def left(way: float, turn: float) -> tuple[float, float]:
+        dragged, theta = limited(np.array([way, 0.0]), turn, most, widest)
+        contact = (dragged[0], 0.0, way, 0.0, turn, 4e-6, 0.0, 4e-6, 3e-4)
+        shift = moved(grid, PAD, [contact], centre)[0, 0]
+        spun = moved(grid, PAD, [contact], edge)[0] - (shift, 0.0)
+        assert np.linalg.norm(spun) == pytest.approx(2 * math.sin(0.5 * theta) * 1.9e-3, rel=1e-3)
+        return shift, theta
+
+    within = left(0.6 * most, 0.6 * widest)
+    assert within == pytest.approx((0.6 * most, 0.6 * widest), rel=1e-5)
+    shears, turns = zip(*(left(2 * most, k * widest) for k in (0.0, 0.5, 2.0, 8.0, 30.0)), strict=True)
+    assert shears[0] == pytest.approx(most, rel=1e-5) and turns[0] == 0
+    assert (np.diff(shears) < 0).all() and (np.diff(turns) > 0).all()
+    assert shears[-1] < 0.25 * most and turns[-1] == pytest.approx(widest, rel=0.05)
+    for shear, turn in zip(shears, turns, strict=True):
+        assert math.hypot(shear / most, turn / widest) == pytest.approx(1, rel=1e-5)
 
 
 def test_alike_in_all_directions_and_as_published(grid: PadGrid) -> None:

@@ -110,18 +110,40 @@ def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.slow
-def test_calibrate_quickly(tmp_path: Path) -> None:
-    out = tmp_path / "fit"
-    assert main(["calibrate", "markers", "--pad", "coarse", "--quick", "--device", "cpu", "--out", str(out)]) == 0
+def test_calibrate_quickly_and_go_on_after_an_interrupt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import raytac.markers.calibration_presses as presses
     from raytac.io.metrics import read_metrics
     from raytac.report.markers import FILES
     from raytac.specs import load_marker_motion
 
-    assert {path.name for path in out.iterdir()} == set(FILES)
+    out, begun = tmp_path / "fit", []
+    args = ["calibrate", "markers", "--pad", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
+    simulate = presses.simulate_press
+
+    def interrupted(sensor, press, **options):
+        begun.append(press.name)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return simulate(sensor, press, **options)
+
+    monkeypatch.setattr(presses, "simulate_press", interrupted)
+    assert main(args) == 130
+    assert "finished presses are kept" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["presses"] and len(list((out / "presses").iterdir())) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["fit"]
+    assert main(args) == 0
+    assert len(begun) == 5 and begun[2] == begun[3]  # those before are not pressed again
+    assert {path.name for path in out.iterdir()} == {*FILES, "presses"}
     metrics = read_metrics(out / "metrics.json")
+    assert (metrics["presses"], metrics["presses_reused"]) == (4, 2)
     still = metrics["held_out.fots.normal.truth_mean_um"]
     assert isinstance(still, float) and 0 < float(metrics["held_out.fots.normal.mean_um"]) < 0.7 * still
-    assert "Presses held out" in load_marker_motion(out / "marker_motion.toml").provenance
+    motion = load_marker_motion(out / "marker_motion.toml")
+    for part in ("Presses held out", "level coarse", "warp-lang", "simulated on cpu"):
+        assert part in motion.provenance
+    assert f"held out: normal {float(metrics['held_out.fots.normal.mean_um']):.1f} um" in motion.provenance
 
 
 def test_a_base_must_not_have_a_base(tmp_path: Path) -> None:

@@ -40,6 +40,19 @@ def frame(step: int = 0, failed: tuple[int, ...] = (), size: tuple[int, int] = (
     return TactileFrame(surface, rgb=rgb, markers=markers, wrench=wrench, failed=flags)
 
 
+def rows_of(whole: TactileFrame, rows: list[int]) -> TactileFrame:
+    """A frame of some of its environments."""
+    surface, markers = whole.surface, whole.markers
+    assert markers is not None and whole.rgb is not None and whole.wrench is not None and whole.failed is not None
+    return TactileFrame(
+        GelSurface(GRID, surface.height[rows], surface.contact[rows], surface.contact_centre[rows]),
+        rgb=whole.rgb[rows],
+        markers=MarkerFrame(*(values[rows] for values in vars(markers).values())),
+        wrench=whole.wrench[rows],
+        failed=whole.failed[rows],
+    )
+
+
 def observer(*modalities: str, randomization: Randomization | None = None, seed: int = 0, **settings) -> TactileObserver:
     made = ObservationSettings(modalities, **{"resolution": (12, 8), "crop": (0, 0, 0, 0), **settings})
     return TactileObserver(SENSOR, made, num_envs=B, randomization=randomization, seed=seed)
@@ -99,14 +112,30 @@ def test_stack_holds_the_last_frames_oldest_first_and_begins_anew_where_told() -
 def test_failed_environments_and_those_not_asked_keep_what_they_saw() -> None:
     seen = observer("wrench", "markers", normalise=False)
     seen.observe(frame(0))
-    later = seen.observe(frame(1, failed=(2,)), envs=np.array([True, False, True]))
+    given = rows_of(frame(1, failed=(2,)), [0, 2])
+    later = seen.observe(given, envs=np.array([True, False, True]))
     np.testing.assert_array_equal(later["wrench"][:, 0], [1.0, 0.0, 0.0])
     assert all(np.isfinite(values).all() for values in later.values())
+    last = seen.last()
+    assert last.keys() == later.keys() and all(np.array_equal(last[name], later[name]) for name in last)
+    with pytest.raises(InputError, match="must have 1 environments"):
+        seen.observe(given, envs=[1])
     broken = frame(1)
     assert broken.wrench is not None
     broken.wrench[1, 3] = np.inf
     with pytest.raises(InputError, match="environment 1"):
         seen.observe(broken)
+
+
+def test_rows_may_come_in_any_order_and_twice() -> None:
+    noisy = Randomization(noise=3.0, exposure=0.2)
+    whole, some = (observer("rgb", "wrench", stack=2, randomization=noisy) for _ in range(2))
+    for step in range(3):
+        expected = whole.observe(frame(step))
+        some.observe(rows_of(frame(step), [1]), envs=[1])
+        found = some.observe(rows_of(frame(step), [2, 0, 0]), envs=[2, 0, 0])
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values)
 
 
 def test_crop_and_downscale_are_of_the_rendered_image() -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -238,6 +239,32 @@ def test_depths_by_environment_and_a_failed_one_leaves_the_others_running() -> N
     np.testing.assert_allclose(states[-1].depth, [0.2e-3, np.nan, 0.4e-3])
     height = pad.surface(states[-1]).height
     assert np.isnan(height[1]).all() and np.isfinite(height[[0, 2]]).all()
+
+
+def test_turn_shear_and_twist_by_environment_are_those_of_scenes_of_their_own() -> None:
+    turns = np.array([[1.0, 0.0, 0.0, 0.0], [0.98, 0.1, 0.0, 0.2], [2.0, 0.0, -0.2, -0.5]])
+    shears = np.array([[0.3e-3, 0.0], [-0.2e-3, 0.1e-3], [0.0, 0.4e-3]])
+    twists = np.array([0.1, -0.2, 0.05])
+    own = np.array([0.9, 0.0, 0.3, 0.1])
+    stages = indent(0.6e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.3)
+    scene = scene_of("torus", *stages, quaternion=tuple(own))
+    pad, states = press(scene, num_envs=3, rotations=turns, shears=shears, twists=twists)
+    for b in range(3):
+        turned = np.empty(4)
+        mujoco.mju_mulQuat(turned, turns[b], own)
+        alone_stages = indent(0.6e-3), StageSpec("shear", shear=tuple(shears[b])), StageSpec("twist", twist=twists[b])
+        alone, single = press(scene_of("torus", *alone_stages, quaternion=tuple(turned)))
+        for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque"):
+            np.testing.assert_allclose(getattr(states[-1], name)[b], getattr(single[-1], name)[0], rtol=1e-6, atol=1e-9)
+        apart = pad.surface(states[-1]).height[b] - alone.surface(single[-1]).height[0]
+        assert np.abs(apart).max() < 1e-8 and np.ptp(pad.surface(states[-1]).height[b]) > 0.5e-3
+
+
+def test_a_turn_of_zeros_is_refused_and_one_that_is_not_finite_fails_alone() -> None:
+    with pytest.raises(InputError, match=r"rotations.*environment 1"):
+        press(scene_of("sphere", indent(0.5e-3)), num_envs=2, rotations=np.array([[1.0, 0, 0, 0], [0.0, 0, 0, 0]]))
+    _, states = press(scene_of("sphere", indent(0.5e-3)), num_envs=2, rotations=np.array([[1.0, 0, 0, 0], [np.nan, 0, 0, 0]]))
+    np.testing.assert_array_equal(states[-1].failed, [False, True])
 
 
 def test_diverging_state_marks_its_environment() -> None:

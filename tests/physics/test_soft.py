@@ -316,6 +316,23 @@ def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
         assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=1e-3)
 
 
+def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
+    turns = np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(0.6), 0.0, math.sin(0.6), 0.0]])
+    shears = np.array([[0.1e-3, 0.0], [0.0, -0.2e-3]])
+    stages = indent(0.4e-3), StageSpec("shear", shear=(1e-3, 1e-3))
+    many = soft(press(*stages, kind="cylinder"), num_envs=2, rotations=turns, shears=shears)
+    state = many.peak(many.run())
+    for b in range(2):
+        scene = press(indent(0.4e-3), StageSpec("shear", shear=tuple(shears[b])), kind="cylinder")
+        one = soft(replace(scene, object=replace(scene.object, quaternion=tuple(turns[b]))))
+        alone = one.peak(one.run())
+        # A batch takes as many steps as the longest of its ways asks for.
+        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 3e-6
+        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=5e-3)
+        assert alone.shear_force[0] == pytest.approx(state.shear_force[b], rel=0.03, abs=2e-3)
+    assert state.normal_force[1] < 0.5 * state.normal_force[0]  # on its rim
+
+
 def test_every_environment_has_its_depth():
     depths = np.array([0.2e-3, 0.4e-3])
     pad = soft(press(indent(0.3e-3)), num_envs=2, depths=depths)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
+from raytac.physics.rotation import quaternion, rotation_vector
 from raytac.robots.mount import case_depth, mount_sensor, standing_on
-from raytac.robots.pose import pose, pose_error, quaternion
+from raytac.robots.pose import pose, pose_error
 from raytac.specs.sensor_file import load_sensor
 
 ROBOT = """
@@ -133,3 +134,17 @@ def test_a_pose_error_leads_from_one_pose_to_the_other():
     np.testing.assert_allclose(turn.reshape(3, 3) @ b[:3, :3], a[:3, :3], atol=1e-12)
     np.testing.assert_allclose(error[:3], (0.5, 2.0, 4.0))
     assert 0.1 < angle <= np.pi and np.abs(quaternion(np.eye(3)) - (1, 0, 0, 0)).max() == 0.0
+
+
+def test_rotation_vectors_are_mujocos_at_every_angle():
+    axes = np.random.default_rng(0).normal(size=(40, 3))
+    axes[:3] = np.eye(3)
+    angles = np.tile([0.0, 1e-9, 1e-4, 1.0, 2.5, np.pi - 1e-7, np.pi - 1e-3, 3.0], 5)
+    turns = angles[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    matrices = np.zeros((40, 9))
+    for matrix, turn, angle in zip(matrices, turns, angles, strict=True):
+        q = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * turn / max(angle, 1e-300))])
+        mujoco.mju_quat2Mat(matrix, q)
+    found = rotation_vector(matrices.reshape(4, 10, 3, 3)).reshape(40, 3)
+    np.testing.assert_allclose(found, turns, atol=1e-8)
+    np.testing.assert_array_equal(found[7], rotation_vector(matrices[7].reshape(3, 3)))

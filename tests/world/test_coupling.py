@@ -107,6 +107,29 @@ def test_a_contact_opens_instead_of_pulling():
     assert abs(data.qvel[0] - before) < 1e-9 and np.abs(data.xfrc_applied[1]).max() < 1e-12
 
 
+def test_an_open_contact_takes_its_friction_and_torque_with_it():
+    """Of two contacts one opens: what is left of w₀ is what the other one bears."""
+    model = mujoco.MjModel.from_xml_string(SLIDER.format(h=1e-3, g=0.0, z=0.0, m=0.1, drive=""))
+    data = mujoco.MjData(model)
+    data.qvel[0] = -1.0  # upwards
+    mujoco.mj_forward(model, data)
+    coupling = Coupling(model, [1])
+    at, origin = np.array([2e-3, 0.0, 0.0]), data.xpos[1]
+    opening, staying = np.array([0.4, -0.3, 2.0, 1e-3, 0.0, 2e-3]), np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    about_origin = np.append(opening[:3], opening[3:] + np.cross(at - origin, opening[:3]))
+    weak = np.diag([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])  # so soft that it does not open
+    contacts = [
+        Touching(1, np.diag([1e5] * 3 + [0.0] * 3), at, None, opening[:3], opening),
+        Touching(1, weak, origin.copy(), None, staying[:3], staying),
+    ]
+    coupling.update(data, 0, (about_origin + staying)[None], contacts)
+    mujoco.mj_step1(model, data)
+    coupling.apply(data, 0)
+    left = data.xfrc_applied[1].copy()  # about the centre of mass
+    left[3:] += np.cross(data.xipos[1] - data.xpos[1], left[:3])
+    np.testing.assert_allclose(left, staying, atol=1e-4)
+
+
 def test_a_light_finger_presses_a_flat_face_with_its_force():
     """40 g on 5e4 N/m and more, exchanged every 10 ms: with the law it settles at its force, without it is thrown about."""
     forces = {}

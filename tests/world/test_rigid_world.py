@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 from raytac.errors import InputError, SpecError
 from raytac.physics.rigid import RigidPad
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor, load_task
+from raytac.world.state import BatchController
 from raytac.world.world import TactileWorld
 
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05)
@@ -171,6 +173,55 @@ def test_a_batch_is_as_its_environments_alone() -> None:
     np.testing.assert_array_equal(frames[0].surface.height[1], frames[1].surface.height[0])
 
 
+def test_many_balls_at_many_places_are_each_as_alone() -> None:
+    """On every grid of nodes at once, in windows of their own, off the pad and not touching at all."""
+    at = np.array(
+        [[0.0, 0.0, 0.0049], [0.0101, 0.0, 0.0046], [-0.0097, 0.0074, 0.0044], [0.003, -0.004, 0.02], [0.0196, 0.0, 0.004]]
+    )
+    cube = BodySpec("cube", "box", {"length": 0.03, "width": 0.03, "height": 0.01}, position=(0.0, 0.0, 0.05), mass=0.05)
+    scene = replace(UP, bodies=(BALL, cube), gravity=(0.0, 0.0, 0.0))
+    many = TactileWorld(scene, outputs=("wrench",), num_envs=len(at))
+
+    def place(world: TactileWorld, b: int, k: int) -> None:
+        world.data[b].qpos[:3] = at[k]
+        if k == 3:
+            world.data[b].qpos[7:10] = 0.001, 0.002, 0.0048
+
+    for b in range(len(at)):
+        place(many, b, b)
+    state = many.step()
+    frames = many.observe()["sensor"]
+    pushed = [max(data.qvel[2], data.qvel[8]) > 1e-3 for data in many.data]
+    assert pushed == [True, True, True, True, False]
+    for b in range(len(at)):
+        alone = TactileWorld(scene, outputs=("wrench",))
+        place(alone, 0, b)
+        np.testing.assert_array_equal(alone.step().wrench["sensor"][0], state.wrench["sensor"][b])
+        np.testing.assert_array_equal(alone.data[0].qvel, many.data[b].qvel)
+        np.testing.assert_array_equal(alone.observe()["sensor"].surface.height[0], frames.surface.height[b])
+
+
+def test_a_controller_of_the_batch_drives_as_one_for_each_does() -> None:
+    class Lift(BatchController):
+        def drive(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
+            for b in envs:
+                datas[b].ctrl[:] = 0.03 - 0.002 * b
+
+    slide = TaskScene("grip", RobotSpec("floating_gripper", opening=0.04), (), gravity=(0.0, 0.0, 0.0))
+    batch, each, rows = (TactileWorld(slide, outputs=(), num_envs=2) for _ in range(3))
+    nu = batch.model.nu
+    for _ in range(3):
+        seen = (
+            batch.step(Lift()),
+            each.step([lambda data, time, b=b: data.ctrl.fill(0.03 - 0.002 * b) for b in range(2)]),
+            rows.step(np.array([[0.03] * nu, [0.03 - 0.002] * nu])),
+        )
+    for name in ("left", "right"):
+        for other in seen[1:]:
+            np.testing.assert_array_equal(seen[0].world_from_pad[name], other.world_from_pad[name])
+        assert 1e-5 < np.ptp(seen[0].world_from_pad[name][:, :3, 3], axis=0).max() < 5e-3
+
+
 def test_an_environment_that_breaks_down_fails_alone() -> None:
     world = TactileWorld(UP, outputs=("wrench",), num_envs=2)
     world.data[0].qvel[0] = 1e6
@@ -179,6 +230,8 @@ def test_an_environment_that_breaks_down_fails_alone() -> None:
     frame = world.observe()["sensor"]
     assert frame.failed is not None and frame.failed.tolist() == [True, False]
     assert np.isnan(frame.surface.height[0]).all() and np.isfinite(frame.surface.height[1]).all()
+    world.data[1].qvel[0] = 1e6
+    assert world.step().failed.all() and world.step().failed.all()
     assert not world.reset().failed.any()
 
 

@@ -71,6 +71,42 @@ def test_a_start_that_overlaps_is_refused() -> None:
         TactileWorld(replace(UP, bodies=(replace(BALL, position=(0.0, 0.0, 0.0047)),)))
 
 
+BESIDE = replace(BALL, position=(0.0152, 0.0, -0.001), params={"radius": 0.002})
+"""A ball above the rim of the case, beside the gel: in the solver nothing is there to stop it."""
+
+
+def test_a_body_that_falls_through_the_case_is_told_once_and_reported() -> None:
+    world = TactileWorld(replace(UP, bodies=(BESIDE,)), outputs=("wrench",))
+    assert world.step().report["inside_robot"].tolist() == [0.0]
+    with pytest.warns(RuntimeWarning, match="'ball' is .* mm inside the robot's geom 'sensor_case' .*pass through cases") as told:
+        for _ in range(4):
+            state = world.step()
+    assert len([w for w in told if issubclass(w.category, RuntimeWarning)]) == 1
+    # The case's top is the gel's back: as deep as the ball's lowest point lies below it, or as far as it is from the outer wall.
+    spec = world.composed.sensor_specs[0]
+    top, wall = -spec.gelpad.thickness, 0.5 * spec.case.size[0] + 0.8e-3
+    ball = state.world_from_body["ball"][0, :3, 3]
+    expected = min(top - (ball[2] - 0.002), wall - (ball[0] - 0.002))
+    assert state.report["inside_robot"][0] == pytest.approx(expected, abs=2e-4) and expected > 1e-3
+    assert world.reset().report["inside_robot"].tolist() == [0.0]
+
+
+def test_a_start_inside_the_case_or_a_link_is_refused() -> None:
+    inside = replace(BESIDE, position=(0.0152, 0.0, -0.008))
+    with pytest.raises(OverlapError, match=r"'ball' starts .* mm inside the robot's geom 'sensor_case'"):
+        TactileWorld(replace(UP, bodies=(inside,)))
+    soft = replace(inside, kind="box", params=dict.fromkeys(("length", "width", "height"), 0.004), dynamics="soft", cell=0.002)
+    with pytest.raises(OverlapError, match=r"'ball' starts .* mm inside the robot's geom 'sensor_case'"):
+        TactileWorld(replace(UP, bodies=(soft,)))
+    world = TactileWorld(replace(UP, bodies=(BESIDE,)))
+    before = world.step()
+    to = before.world_from_body["ball"].copy()
+    to[0, 2, 3] = -0.008
+    with pytest.raises(OverlapError, match="inside the robot's geom"):
+        world.reset(bodies={"ball": to})
+    np.testing.assert_array_equal(world.state().world_from_body["ball"], before.world_from_body["ball"])
+
+
 def test_a_motion_that_cannot_be_resolved_is_refused() -> None:
     down = RobotSpec("floating_gripper", opening=0.04, position=(0.0, 0.0, 0.05), quaternion=(0.0, 1.0, 0.0, 0.0))
     box = BodySpec("box", "box", {"length": 0.03, "width": 0.03, "height": 0.03}, position=(0.0, 0.0, 0.05), dynamics="fixed")

@@ -80,11 +80,17 @@ def test_a_start_that_cannot_be_changes_nothing(physics: str) -> None:
     before = world.step()
     at = shifted(world, "ball", 2, 0.0)
     tool = before.world_from_pad["sensor"][0, :3, 3]
-    at[1, :3, 3] = tool  # in the pad
+    at[1, :3, 3] = tool - [0.0, 0.0, 0.003]  # in the pad
+    deeper = at.copy()
+    deeper[1, 2, 3] += 0.005  # in the case
     joints = np.repeat(world.composed.start[world.arm.qpos][None], 2, axis=0)  # type: ignore[union-attr]
     joints[1, 3] = 1.0
     wrong: list[tuple[dict[str, Any], str]] = [({"joints": joints}, "of environment 1 must be within")]
-    wrong += [({"bodies": {"ball": at}}, "overlap")] if physics == "ipc" else []
+    if physics == "ipc":
+        wrong += [
+            ({"bodies": {"ball": at}}, "bodies overlap"),
+            ({"bodies": {"ball": deeper}}, "inside the robot's geom 'sensor_case'"),
+        ]
     for starts, text in wrong:
         with pytest.raises((InputError, OverlapError), match=text):
             world.reset(**starts)

@@ -1,26 +1,29 @@
-"""Policies by hand, from what the batch knows: they show that a task can be done, and how well."""
+"""Policies by hand, from the state that the batch knows: they show that a task can be done, and what that earns."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
 
 import numpy as np
 
 from raytac.envs.batch import TaskBatch
 
-__all__ = ["balance_pole", "lift_cube", "push_cube", "roll_ball"]
+__all__ = ["SCRIPTED", "balance_pole", "lift_cube", "push_cube", "roll_ball"]
 
 GAINS = np.array([-5.2, -5.0, -32.4, -4.6])
 """Of x, ẋ, θ, θ̇."""
 
 
 def push_cube(batch: TaskBatch) -> np.ndarray:
-    """Press with about 1.5 N, then go where the cube is missed; all the time stay over the cube."""
+    """Press with some 5 N, then go where the cube is missed, 2 mm a step at most."""
     tool, cube, goal = batch._tool[:, :3, 3], batch._body[:, :3, 3], batch._goal
     force = -batch.world.state().wrench["sensor"][:, 2]
     pressed = force > 0.5
     missing = np.where(pressed[:, None], goal - cube, 0.0)
     action = np.zeros((len(tool), 3))
-    action[:, :2] = np.clip(missing[:, :2] / 0.02, -0.4, 0.4)
-    action[:, 2] = np.clip(0.3 * (force - 1.5), -0.5, 0.5)
+    action[:, :2] = np.clip(missing[:, :2] / 0.012, -0.67, 0.67)
+    action[:, 2] = np.clip(0.05 * (force - 6.0), -0.4, 0.3)
     return action
 
 
@@ -38,12 +41,10 @@ def balance_pole(batch: TaskBatch) -> np.ndarray:
     """A linear quadratic regulator of a pole on a cart: state x, ẋ, θ, θ̇, input ẍ; thin rod, θ̈ = 3g/2L θ − 3/2L ẍ."""
     axis, spin = batch._body[:, :3, 2], batch._body_speed[:, 3:]
     lean, rate = axis[:, :2], np.stack([spin[:, 1], -spin[:, 0]], axis=1)
-    commanded = batch._action[:, :2] * 4e-3 / batch.control_timestep
+    commanded = batch._action[:, :2] * 2e-3 / batch.control_timestep
     away = batch.steering._target[:, :2, 3] - batch._start_tool[:2, 3]
     push = np.einsum("k,kbi->bi", GAINS, np.stack([away, commanded, lean, rate]))
-    action = np.zeros((len(axis), 4))
-    action[:, :2] = np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 4e-3, -1.0, 1.0)
-    return action
+    return np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 2e-3, -1.0, 1.0)
 
 
 def lift_cube(batch: TaskBatch) -> np.ndarray:
@@ -58,3 +59,12 @@ def lift_cube(batch: TaskBatch) -> np.ndarray:
     action[:, :3] = np.clip(target / 5e-3, -1.0, 1.0) * np.where(held, 0.4, 1.0)[:, None]
     action[:, 3] = np.where(held, np.where(force > 12.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
     return action
+
+
+SCRIPTED: Final[Mapping[str, Callable[[TaskBatch], np.ndarray]]] = {
+    "PushCube": push_cube,
+    "BalancePole": balance_pole,
+    "LiftCube": lift_cube,
+    "RollBall": roll_ball,
+}
+"""Actions (B, k) from a batch, by the name of the task."""

@@ -1,0 +1,211 @@
+"""Watch a policy and count how often it succeeds: a film of the scene with what the sensors see beside it, and a success rate.
+
+    python experiments/play.py experiments/policies/balance_pole.pt
+    python experiments/play.py scripted --task LiftCube --episodes 20
+
+Writes ``film.gif`` (``film.mp4`` with ``--mp4``, where the program ffmpeg is installed), ``strip.png`` and ``metrics.json``. The film
+needs MuJoCo's offscreen renderer (``MUJOCO_GL``, ``egl`` unless it is set); without, the rate is told all the same. Seeds are those of
+evaluation: no training has seen them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+
+from raytac.errors import BackendError, InputError, RaytacError
+from raytac.io.folder import result_folder
+from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.options import CommonOptions
+from raytac.observe import MODALITIES, ObservationSettings
+from raytac.report.machine import machine
+
+if TYPE_CHECKING:
+    from experiments.ppo_training import Evaluation, Recipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Play a policy; ``seed`` is that of the episode of the film, counted from the first held-out one."""
+
+    policy: tyro.conf.Positional[str] = "scripted"
+    """A file that ``train_ppo.py`` has written, or ``scripted``."""
+    task: str = "LiftCube"
+    """Task of the scripted policy; a file knows its own."""
+    episodes: int = 100
+    """Episodes that the success rate is counted from; 0: the film alone."""
+    num_envs: int = 16
+    """Environments that they run in."""
+    film: bool = True
+    """Draw an episode."""
+    mp4: bool = False
+    """Write the film as MP4 by ffmpeg instead of as GIF."""
+    optics: str = "phong"
+    """Optical model of the sensors' images in the film; the policy is not shown them unless it was trained with them."""
+
+
+def main(args: Args) -> dict[str, Metric]:
+    """Play, and write all."""
+    start = time.perf_counter()
+    if args.mp4 and shutil.which("ffmpeg") is None:
+        raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
+    recipe = _recipe(args)
+    out = args.out or Path("runs/play") / (f"{args.task}_scripted" if recipe is None else Path(args.policy).stem)
+    found: dict[str, Metric] = {"device": "cpu" if args.device == "auto" else args.device, "policy": args.policy, **machine()}
+    found["task"] = args.task if recipe is None else recipe.task
+    names = ("film.gif", "film.mp4", "strip.png", "metrics.json")
+    with result_folder(out, names) as folder:
+        if args.film:
+            try:
+                frames = list(_frames(args, recipe))
+            except BackendError as error:
+                print(f"no film: {error}", file=sys.stderr)
+            else:
+                _write_film(frames, folder / ("film.mp4" if args.mp4 else "film.gif"))
+                _write_strip(frames, folder / "strip.png")
+        if args.episodes:
+            result = _rate(args, recipe)
+            low, high = result.interval
+            found |= {
+                "episodes": result.episodes, "success": result.successes / result.episodes, "success_low": low,
+                "success_high": high, "return": result.mean_return, "length": result.mean_length,
+            }  # fmt: skip
+            print(
+                f"{found['task']}: success {result.successes}/{result.episodes} (95 %: {low:.3f} to {high:.3f}), "
+                f"return {result.mean_return:.1f}, length {result.mean_length:.0f}"
+            )
+        found |= {
+            "experiment": "play",
+            "seed": args.seed,
+            "wall_s": time.perf_counter() - start,
+            **versions((*VERSIONED, "gymnasium")),
+        }
+        write_metrics(folder / "metrics.json", found)
+    print(f"-> {out}")
+    return found
+
+
+def _recipe(args: Args) -> Recipe | None:
+    """That of the policy; None for a scripted one."""
+    from raytac.envs.scripted import SCRIPTED
+
+    if args.policy != "scripted":
+        from experiments.ppo_training import Checkpoint
+
+        saved = Checkpoint.load(Path(args.policy)).recipe
+        return replace(saved, processes=1, num_envs=args.num_envs, device="cpu" if args.device == "auto" else args.device)
+    if args.task not in SCRIPTED:
+        raise InputError("task", value=args.task, rule="must be a known task", choices=tuple(SCRIPTED))
+    return None
+
+
+def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
+    """Over held-out seeds."""
+    from experiments.ppo_training import HELD_OUT, KINDS, Checkpoint, Evaluation, Learner, evaluate
+    from raytac.envs.scripted import SCRIPTED
+
+    if recipe is not None:
+        learner = Learner(recipe)
+        learner.restore(Checkpoint.load(Path(args.policy)))
+        return evaluate(learner, args.episodes, first_seed=2 * 10**6)
+    env, policy = KINDS[args.task](args.num_envs, tactile=None), SCRIPTED[args.task]
+    returns, lengths, successes = [], [], 0
+    while len(returns) < args.episodes:
+        env.reset(seed=HELD_OUT + 2 * 10**6 + len(returns))
+        running, earned, steps = np.ones(env.num_envs, bool), np.zeros(env.num_envs), 0
+        while running.any():
+            _, reward, terminated, truncated, infos = env.step(np.clip(policy(env.batch), -1.0, 1.0))
+            earned, steps = earned + reward * running, steps + 1
+            ended = running & (terminated | truncated)
+            returns += earned[ended].tolist()
+            lengths += [steps] * int(ended.sum())
+            successes += int(infos["success"][ended].sum())
+            running &= ~ended
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+
+
+def _frames(args: Args, recipe: Recipe | None) -> Iterator[np.ndarray]:
+    """Pictures of one episode, one a step."""
+    from experiments.ppo_training import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
+    from raytac.envs.scripted import SCRIPTED
+
+    seed = HELD_OUT + 2 * 10**6 + args.seed
+    if recipe is None:
+        shown = ObservationSettings(("rgb", "markers"), resolution=(160, 120), optics=args.optics)
+        env, policy = KINDS[args.task](1, tactile=shown, render_mode="rgb_array", device=args.device), SCRIPTED[args.task]
+        env.reset(seed=seed)
+        for _ in range(env.batch.max_episode_steps):
+            yield _picture(env.render())
+            _, _, terminated, truncated, _ = env.step(np.clip(policy(env.batch), -1.0, 1.0))
+            if terminated[0] or truncated[0]:
+                return
+        return
+    settings = tactile_settings(recipe.tactile)
+    told = KINDS[recipe.task].task.tactile if settings == "task" else () if settings is None else settings.modalities  # type: ignore[union-attr]
+    if "rgb" in told:
+        learner = Learner(replace(recipe, num_envs=1), render_mode="rgb_array")
+    else:
+        every = tuple(name for name in MODALITIES if name in (*told, "rgb", "markers"))
+        shown = ObservationSettings(every, resolution=(160, 120), optics=args.optics)
+        hidden = [name for name in every if name not in told]
+        learner = Learner(replace(recipe, num_envs=1), hidden=hidden, tactile=shown, render_mode="rgb_array", pitch=0.4e-3)
+    learner.restore(Checkpoint.load(Path(args.policy)))
+    learner.normaliser.training = False
+    env = learner.model.get_env()
+    assert env is not None
+    env.seed(seed)
+    observation, ended = env.reset(), False
+    while not ended:
+        yield _picture(learner.base.env.render())  # type: ignore[union-attr]
+        observation, _, done, _ = env.step(learner.predict(observation))  # type: ignore[arg-type]
+        ended = bool(done[0])
+
+
+def _picture(pictures: tuple[np.ndarray, ...] | None) -> np.ndarray:
+    assert pictures is not None
+    return pictures[0]
+
+
+def _write_film(frames: list[np.ndarray], path: Path, step: float = 0.02) -> None:
+    """All frames as MP4, at the speed of life; every third as GIF, which can show no more."""
+    from PIL import Image
+
+    if path.suffix == ".gif":
+        images = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=96) for frame in frames[::3]]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=round(3e3 * step), loop=0)
+        return
+    height, width = (2 * (n // 2) for n in frames[0].shape[:2])  # the usual format of colours wants even numbers
+    command = [
+        "ffmpeg", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(1.0 / step),
+        "-i", "-", "-pix_fmt", "yuv420p", "-y", str(path),
+    ]  # fmt: skip
+    raw = b"".join(np.ascontiguousarray(frame[:height, :width]).tobytes() for frame in frames)
+    done = subprocess.run(command, input=raw, capture_output=True, check=False)
+    if done.returncode:
+        raise BackendError(f"ffmpeg could not write {path.name}: {done.stderr.decode(errors='replace').strip()}")
+
+
+def _write_strip(frames: list[np.ndarray], path: Path, count: int = 4) -> None:
+    """Some frames one below the other."""
+    from PIL import Image
+
+    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    Image.fromarray(np.concatenate(chosen)).save(path)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo is imported later, and reads it then
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except RaytacError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,234 @@
+"""Train policies by stable-baselines3's PPO: a task, with and without touch, over seeds; resumable, evaluated on seeds never trained on.
+
+    python experiments/train_ppo.py --task PushCube --seeds 0,1,2 --tactile task,none --processes 4
+    python experiments/train_ppo.py --task BalancePole --steps 300000 --side-by-side --most-s 540
+
+The same command again goes on where it was, after Ctrl-C, a crash or ``--most-s``. Each pair of touch and seed is one training in
+``<out>/<tactile>/seed<k>/``: ``progress.csv`` (one row a rollout), ``evaluation.csv`` (one a segment), ``checkpoint.pt`` (to resume)
+and, where TensorBoard is installed, its events. ``<out>/`` gets ``metrics.json``, ``curves.png`` where Matplotlib is installed, and
+``policy_<tactile>_seed<k>.pt`` of each training, which ``experiments/play.py`` plays.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from raytac.errors import InputError, RaytacError
+from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.options import CommonOptions, parse_names
+from raytac.report.machine import machine
+
+TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
+RECIPES: dict[str, dict[str, Any]] = {
+    "PushCube": {"steps": 600_000},
+    "BalancePole": {"steps": 600_000, "history": 3},
+    "LiftCube": {"steps": 1_000_000},
+    "RollBall": {"steps": 400_000, "history": 3},
+}
+"""What differs from ``Recipe``'s own, by task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Train a task; ``seed`` is not used, see ``seeds``."""
+
+    task: str = "PushCube"
+    """One of PushCube, BalancePole, LiftCube, RollBall."""
+    tactile: str = "task,none"
+    """What is felt, joined by commas, each trained with the same seeds: ``task`` (as the environment has it), ``none``, or
+    modalities joined by ``+``, as in ``markers+wrench``."""
+    seeds: str = "0,1,2"
+    """Seeds joined by commas; the same seed gives the same weights."""
+    steps: int | None = None
+    """Environment steps of each training; the task's own if not given."""
+    num_envs: int = 16
+    """Environments of each training."""
+    processes: int = 1
+    """Processes of each training that these are spread over: one core each."""
+    side_by_side: bool = False
+    """Run all trainings at once instead of one after the other."""
+    evaluation: int = 16
+    """Episodes evaluated after each segment."""
+    final_evaluation: int = 100
+    """Episodes of the last evaluation, on other held-out seeds."""
+    most_s: float | None = None
+    """Begin nothing that would not be done by so many seconds from the start (judged by the last segment); resume later."""
+    rollout: int | None = None
+    learning_rate: float | None = None
+    gamma: float | None = None
+    log_std: float | None = None
+    history: int | None = None
+    segment: int | None = None
+    epochs: int | None = None
+    entropy: float | None = None
+    minibatch: int | None = None
+    """These nine: of ``experiments.ppo_training.Recipe``; the task's own if not given."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    args: Args
+    tactile: str
+    seed: int
+    start: float
+    """Unix time [s]."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.tactile}_seed{self.seed}"
+
+    @property
+    def folder(self) -> Path:
+        return _out(self.args) / self.tactile / f"seed{self.seed}"
+
+
+def main(args: Args) -> dict[str, Metric]:
+    """Run all trainings and write ``metrics.json``."""
+    start = time.time()
+    if args.task not in TASKS:
+        raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
+    kinds = parse_names(args.tactile, "tactile")
+    seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
+    from experiments.ppo_training import tactile_settings
+
+    for kind in kinds:
+        tactile_settings(kind)  # so that an unknown modality is told before anything is trained
+    jobs = [_Job(args, kind, seed, start) for seed in seeds for kind in kinds]
+    found: dict[str, Metric] = {"device": "cpu" if args.device == "auto" else args.device, **machine()}
+    interrupted = False
+    try:
+        _side_by_side(jobs) if args.side_by_side else [_train(job) for job in jobs]
+    except KeyboardInterrupt:
+        interrupted = True
+        print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
+    found |= _gathered(jobs)
+    out = _out(args)
+    found |= {"experiment": "train_ppo", "task": args.task, "wall_s": time.time() - start}
+    found |= versions((*VERSIONED, "gymnasium", "stable_baselines3", "torch"))
+    write_metrics(out / "metrics.json", found)
+    try:
+        from experiments.training_curves import draw_curves
+    except ImportError:
+        print("no curves.png: Matplotlib is not installed; experiments/training_curves.py draws it later")
+    else:
+        draw_curves(out, title=args.task)
+    print(f"-> {out}")
+    if interrupted:
+        sys.exit(130)
+    return found
+
+
+def _out(args: Args) -> Path:
+    return args.out or Path("runs/train_ppo") / args.task
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise InputError("seeds", value=text, rule="must be whole numbers >= 0 joined by commas")
+    return int(text)
+
+
+def _train(job: _Job) -> None:
+    """One training, up to its end or to the time that is given."""
+    import torch
+
+    from experiments.ppo_training import Recipe, Training, evaluate
+
+    torch.set_num_threads(1)
+    args = job.args
+    given = ("steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy", "minibatch")
+    told = {name: getattr(args, name) for name in given if getattr(args, name) is not None}
+    device = "cpu" if args.device == "auto" else args.device
+    recipe = Recipe(
+        args.task, job.tactile, job.seed, **{**RECIPES[args.task], **told},
+        num_envs=args.num_envs, processes=args.processes, device=device,
+    )  # fmt: skip
+    training = Training(recipe, job.folder, evaluation=args.evaluation, say=lambda text: print(text, flush=True))
+    last = 0.0
+    try:
+        while not training.is_done:
+            if args.most_s is not None and time.time() + 1.1 * last - job.start > args.most_s - _final_s(args, last, recipe):
+                break
+            begin = time.time()
+            training.run_segment()
+            last = time.time() - begin
+        result = evaluate(training.learner, args.final_evaluation, first_seed=10**6)
+        low, high = result.interval
+        found: dict[str, Metric] = {
+            "steps": training.steps, "training_wall_s": training.wall_s, "episodes": result.episodes,
+            "success": result.successes / result.episodes, "success_low": low, "success_high": high,
+            "return": result.mean_return, "length": result.mean_length, "device": device, "wall_s": time.time() - job.start,
+        }  # fmt: skip
+        training.learner.checkpoint().save(_out(args) / f"policy_{job.name}.pt", resumable=False)
+        write_metrics(job.folder / "metrics.json", found | versions(("stable_baselines3", "torch")))
+        print(f"{args.task} {job.name}: success {result.successes}/{result.episodes} ({low:.2f} to {high:.2f})", flush=True)
+    finally:
+        training.learner.close()
+
+
+def _final_s(args: Args, last: float, recipe: Any) -> float:
+    """About how long the last evaluation takes, by the pace of a segment [s]."""
+    segment = recipe.segment * recipe.rollout * recipe.num_envs + 200 * args.evaluation
+    return last * 200 * args.final_evaluation / segment
+
+
+def _side_by_side(jobs: list[_Job]) -> None:
+    """Each in a process of its own; Ctrl-C reaches all of them, and each ends by itself."""
+    from raytac.envs.sb3 import one_thread
+
+    context = multiprocessing.get_context("spawn")
+    running = [context.Process(target=_child, args=(job,), name=job.name) for job in jobs]
+    with one_thread():
+        for process in running:
+            process.start()
+    try:
+        for process in running:
+            process.join()
+    except KeyboardInterrupt:
+        for process in running:
+            if process.is_alive() and process.pid is not None:
+                os.kill(process.pid, signal.SIGINT)
+        for process in running:
+            process.join()
+        raise
+    failed = [process.name for process in running if process.exitcode]
+    if failed:
+        raise InputError("trainings", value=failed, rule="ended with an error, which is told above")
+
+
+def _child(job: _Job) -> None:
+    try:
+        _train(job)
+    except KeyboardInterrupt:
+        sys.exit(0)
+    except RaytacError as error:
+        sys.exit(f"error: {job.name}: {error}")
+
+
+def _gathered(jobs: list[_Job]) -> dict[str, Metric]:
+    """``<tactile>.seed<k>.<key>`` of the trainings that have been evaluated to the end."""
+    from raytac.io.metrics import read_metrics
+
+    found: dict[str, Metric] = {}
+    for job in jobs:
+        if (job.folder / "metrics.json").exists():
+            values = read_metrics(job.folder / "metrics.json")
+            key = f"{job.tactile.replace('+', '_')}.seed{job.seed}"
+            found |= {f"{key}.{name}": value for name, value in values.items() if not name.startswith(("versions", "device"))}
+    return found
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except RaytacError as error:
+        sys.exit(f"error: {error}")

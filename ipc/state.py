@@ -1,0 +1,119 @@
+"""A snapshot of a world, and what moving a frame at once changes in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipc.bodies import AffineBody, Body
+from ipc.layout import Layout, rotation_matrix
+
+__all__ = ["State", "start_state", "teleported"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class State:
+    """A snapshot of every environment; arrays lead with the environment, B.
+
+    Attributes:
+        y: node positions in their body's frame [m] (B, N, 3).
+        velocity, velocity_before: node velocities, world frame [m/s] (B, N, 3).
+        position_before: node positions one step earlier, world frame [m] (B, N, 3).
+        frame_rotation, frame_position: frames of bodies, grips and aims, quaternion (w, x, y, z) (B, frames, 4) and [m] (B, frames, 3).
+        second_order: BDF2 has a history (B,).
+        kappa: [Pa] (B,).
+        failed: (B,).
+    """
+
+    y: Floats
+    velocity: Floats
+    velocity_before: Floats
+    position_before: Floats
+    frame_rotation: Floats
+    frame_position: Floats
+    second_order: NDArray[np.int32]
+    kappa: Floats
+    failed: NDArray[np.bool_]
+
+
+def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
+    """Undeformed and at rest, where the layout has the bodies."""
+    nodes = np.broadcast_to(layout.node_rest, (num_envs, *layout.node_rest.shape))
+    frames = layout.frame_pose
+    return State(
+        y=nodes.copy(),
+        velocity=np.zeros(nodes.shape),
+        velocity_before=np.zeros(nodes.shape),
+        position_before=np.zeros(nodes.shape),
+        frame_rotation=np.broadcast_to(frames[:, 3:], (num_envs, len(frames), 4)).copy(),
+        frame_position=np.broadcast_to(frames[:, :3], (num_envs, len(frames), 3)).copy(),
+        second_order=np.zeros(num_envs, np.int32),
+        kappa=np.full(num_envs, kappa),
+        failed=np.zeros(num_envs, bool),
+    )
+
+
+def teleported(
+    state: State,
+    layout: Layout,
+    body: Body,
+    frame: int,
+    position: Floats | None,
+    rotation: Floats | None,
+    mask: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Put a frame elsewhere in the environments of the mask, with all that is bonded to it, at rest; changes ``state``.
+
+    Args:
+        body: that the frame belongs to.
+        position, rotation: [m] (B, 3), unit quaternion (w, x, y, z) (B, 4); None keeps it.
+
+    Returns:
+        the frames that moved, (frames,).
+    """
+    before = rotation_matrix(state.frame_rotation), state.frame_position.copy()
+    if position is not None:
+        state.frame_position[mask, frame] = position[mask]
+    if rotation is not None:
+        state.frame_rotation[mask, frame] = rotation[mask]
+    index = int(layout.frame_body[frame])
+    moved = np.arange(len(layout.frame_names)) == frame
+    nodes = slice(layout.node_start[index], layout.node_start[index + 1])
+    if frame == index:
+        _carry_grips(state, layout, index, mask, before)
+        moved = layout.frame_body == index
+    elif isinstance(body, AffineBody):
+        turned = np.einsum("bij,nj->bni", rotation_matrix(state.frame_rotation[:, frame]), layout.aim_local[nodes])
+        state.y[mask, nodes] = (turned + state.frame_position[:, frame, None])[mask]
+    state.velocity[mask, nodes] = 0.0
+    state.second_order[mask] = 0
+    return moved
+
+
+def _carry_grips(state: State, layout: Layout, body: int, mask: NDArray[np.bool_], before: tuple[Floats, Floats]) -> None:
+    """Grips keep their places in the frame of the body that was moved."""
+    turn = rotation_matrix(state.frame_rotation[:, body]) @ np.swapaxes(before[0][:, body], -1, -2)
+    for grip in np.flatnonzero((layout.frame_body == body) & (layout.frame_moves == 1)):
+        if grip == body:
+            continue
+        arm = np.einsum("bij,bj->bi", turn, before[1][:, grip] - before[1][:, body])
+        state.frame_position[mask, grip] = (state.frame_position[:, body] + arm)[mask]
+        state.frame_rotation[mask, grip] = _quaternions(turn @ before[0][:, grip])[mask]
+
+
+def _quaternions(rotations: Floats) -> Floats:
+    """Unit quaternions (w, x, y, z) of rotation matrices, (..., 3, 3) to (..., 4): the eigenvector of Bar-Itzhack's matrix."""
+    m = np.moveaxis(rotations, (-2, -1), (0, 1))
+    zero = m[0, 0] * 0
+    rows = [
+        [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+        [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+        [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+    ]
+    matrix = np.stack([np.stack([zero + e for e in row], axis=-1) for row in rows], axis=-2)
+    return np.linalg.eigh(matrix)[1][..., -1]

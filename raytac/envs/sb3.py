@@ -1,0 +1,227 @@
+"""Environments for stable-baselines3, which this module imports: a vector of ours as its ``VecEnv``, and several of them in processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from raytac.envs.environments import TactileVectorEnv
+from raytac.errors import InputError
+
+__all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
+
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+Observations = dict[str, np.ndarray]
+Answer = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Processes started within have one thread of BLAS: small matrices gain nothing from more, and many processes share the cores."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+class _DictVecEnv(VecEnv):
+    """What both have in common: attributes by name, and no wrappers within."""
+
+    def close(self) -> None:
+        """Nothing is held but memory."""
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """The attribute of the vector, once for every environment asked for."""
+        return [self._attribute(attr_name)] * len(list(self._get_indices(indices)))
+
+    def _attribute(self, name: str) -> Any:
+        if name == "render_mode":
+            return None
+        raise AttributeError(name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Refused: environments of one world share everything."""
+        raise InputError("attr_name", value=attr_name, rule="cannot be set: environments of a vector share their world")
+
+    def env_method(self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **kwargs: Any) -> list[Any]:
+        """Refused: environments of one world have no methods of their own."""
+        raise InputError("method_name", value=method_name, rule="cannot be called: environments of a vector share their world")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
+        """None is."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class TactileVecEnv(_DictVecEnv):
+    """A ``TactileVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
+
+    ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. ``seed(s)``
+    before ``reset`` seeds environment b with s + b.
+    """
+
+    def __init__(self, env: TactileVectorEnv) -> None:
+        """Raises ``InputError`` for a vector that does not begin episodes anew in the same step, as a ``VecEnv`` must."""
+        mode = env.metadata["autoreset_mode"]
+        if mode is not AutoresetMode.SAME_STEP:
+            raise InputError("autoreset_mode", value=mode.value, rule="must be 'SameStep' for stable-baselines3")
+        self.env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._actions = np.zeros((env.num_envs, *env.single_action_space.shape))  # type: ignore[misc]
+
+    def reset(self) -> Observations:
+        """Begin episodes in all; those that ``seed`` has told a seed begin with it."""
+        observation, _ = self.env.reset(seed=self._seeds)
+        self._reset_seeds()
+        self._reset_options()
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for ``step_wait``."""
+        self._actions = actions
+
+    def step_wait(self) -> Answer:
+        """Raises ``InputError`` for actions that are not finite or out of bounds; it names the environment."""
+        observation, reward, terminated, truncated, told = self.env.step(self._actions)
+        infos: list[dict[str, Any]] = [
+            {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut)}
+            for success, failed, cut in zip(told["success"], told["failed"], truncated, strict=True)
+        ]
+        for b in np.flatnonzero(terminated | truncated):
+            infos[b]["terminal_observation"] = told["final_obs"][b]
+        return observation, reward.astype(np.float32), terminated | truncated, infos
+
+
+class ProcessVecEnv(_DictVecEnv):
+    """``processes`` vectors side by side, each in a process with a world of its own: one ``VecEnv`` of all their environments.
+
+    Physics runs on one core a world, so this is how a machine of many cores is used. Ctrl-C reaches
+    the caller alone, and workers end with it.
+    """
+
+    def __init__(self, kind: type[TactileVectorEnv], *, num_envs: int, processes: int, seed: int = 0, **options: Any) -> None:
+        """Start the processes.
+
+        Args:
+            kind: the task's vector, such as ``PushCubeVectorEnv``.
+            num_envs: number of environments in all, the same number in each process.
+            processes: number of processes.
+            seed: of what is drawn once a world; process k has seed + k.
+            options: of ``TaskBatch``; they must pickle.
+
+        Raises:
+            InputError: a number of environments that the processes cannot share evenly; as ``TaskBatch``.
+        """
+        if processes < 1 or num_envs < 1 or num_envs % processes:
+            rule = f"must be a multiple of the number of processes, which is {processes} and must be at least 1"
+            raise InputError("num_envs", value=num_envs, rule=rule)
+        each = num_envs // processes
+        context = multiprocessing.get_context("spawn")
+        self._workers: list[tuple[Any, Connection]] = []
+        with one_thread():
+            for k in range(processes):
+                mine, theirs = context.Pipe()
+                arguments = theirs, kind, each, {**options, "seed": seed + k}
+                worker = context.Process(target=_work, args=arguments, daemon=True, name=f"raytac-envs-{k}")
+                worker.start()
+                theirs.close()
+                self._workers.append((worker, mine))
+        self._each = each
+        spaces = self._answers()
+        super().__init__(num_envs, *spaces[0])
+
+    def reset(self) -> Observations:
+        """As ``TactileVecEnv.reset``."""
+        for k, (_, pipe) in enumerate(self._workers):
+            pipe.send(("reset", self._seeds[k * self._each : (k + 1) * self._each]))
+        self._reset_seeds()
+        self._reset_options()
+        return _joined(self._answers())
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Set all processes going. Raises ``InputError`` for actions that are not finite; it names the environment."""
+        actions = np.asarray(actions)
+        if not np.isfinite(actions).all():
+            env = int(np.argwhere(~np.isfinite(actions))[0, 0])
+            raise InputError("actions", value=actions[env].tolist(), rule=f"must be finite; in environment {env} they are not")
+        for (_, pipe), rows in zip(self._workers, np.split(actions, len(self._workers)), strict=True):
+            pipe.send(("step", rows))
+
+    def step_wait(self) -> Answer:
+        """Raises as ``TactileVecEnv.step_wait``; the message names the process and which environments it has."""
+        observations, rewards, dones, infos = zip(*self._answers(), strict=True)
+        return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
+
+    def close(self) -> None:
+        """End the processes."""
+        for worker, pipe in self._workers:
+            pipe.close()
+            worker.join(timeout=5.0)
+            if worker.is_alive():
+                worker.terminate()
+        self._workers = []
+
+    def _answers(self) -> list[Any]:
+        """One answer of every process; all are read before an error is raised, so that none is taken for a later one's."""
+        answers = []
+        for k, (worker, pipe) in enumerate(self._workers):
+            try:
+                answers.append(pipe.recv())
+            except (EOFError, ConnectionResetError):
+                answers.append((False, RuntimeError(f"process {k} ended by itself, exit code {worker.exitcode}"), ""))
+        for k, (fine, value, where) in enumerate(answers):
+            if not fine:
+                name = f"environments {k * self._each} to {(k + 1) * self._each - 1}, in process {k}"
+                value.add_note(f"raised by {name}:\n{where}")
+                raise value
+        return [value for _, value, _ in answers]
+
+
+def _joined(parts: Sequence[Observations]) -> Observations:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _work(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
+    """A process: makes its vector, then answers until the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        env = TactileVecEnv(kind(num_envs, **options))
+        pipe.send((True, (env.observation_space, env.action_space), ""))
+    except Exception as error:
+        pipe.send((False, error, traceback.format_exc()))
+        return
+    orders: dict[str, Callable[[Any], Any]] = {"reset": lambda seeds: _reset(env, seeds), "step": env.step}
+    while True:
+        try:
+            order, value = pipe.recv()
+        except (EOFError, ConnectionResetError):
+            return
+        try:
+            answer = True, orders[order](value), ""
+        except Exception as error:
+            answer = False, error, traceback.format_exc()
+        try:
+            pipe.send(answer)
+        except (BrokenPipeError, ConnectionResetError):
+            return
+
+
+def _reset(env: TactileVecEnv, seeds: Sequence[int | None]) -> Observations:
+    env._seeds = list(seeds)
+    return env.reset()

@@ -1,0 +1,69 @@
+"""Observed images of many pads that never leave the device: for a solver and a learner that are both there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface
+from raytac.observe.observer import TactileObserver
+from raytac.sensor import TactileSensor
+
+__all__ = ["DeviceImages"]
+
+
+class DeviceImages:
+    """The ``rgb`` of a ``TactileObserver``, from heights on the device to an image on the device.
+
+    .. code-block:: python
+
+        observer = TactileObserver("gelsight_mini", ObservationSettings(("rgb",), resolution=(320, 240), difference=True), num_envs=512)
+        images = DeviceImages(observer, observer.make_sensor(device="cuda"))
+        rgb = as_tensors(images.observe(heights))["rgb"]  # (512, 240, 320, 3) uint8, on the GPU
+
+    Cut, mean over ``downscale`` pixels and difference to rest are those of ``TactileObserver.observe``, to the last bit. Keeps no history
+    and knows of no failed environments.
+    """
+
+    def __init__(self, observer: TactileObserver, sensor: TactileSensor) -> None:
+        """Build the renderer and render the pad at rest.
+
+        Args:
+            observer: what is observed; of its modalities only ``rgb`` is.
+            sensor: made with ``observer.make_sensor``; its device is where everything stays.
+
+        Raises:
+            InputError: settings that the device does not know: no ``rgb``, a stack, cameras that drift; an optical mode without images
+                on the device.
+            BackendError: the renderer or the device does not work here.
+        """
+        from raytac.optics.device_image import DeviceImage, ImageCut
+
+        settings, layout = observer.settings, observer.layout
+        if "rgb" not in settings.modalities:
+            raise InputError(
+                "modalities", value=settings.modalities, rule="must have 'rgb': images stay on the device, nothing else"
+            )
+        if settings.stack != 1:
+            raise InputError("stack", value=settings.stack, rule="must be 1 on the device, where nothing is kept")
+        if observer.randomization.changes_images:
+            raise InputError("randomization", value=observer.randomization, rule="must not change images on the device")
+        cut = ImageCut(layout.observed, layout.left, layout.top, layout.downscale)
+        self.grid = sensor.grid
+        self._image = DeviceImage(sensor.optical_mode, sensor.grid, cut, difference=settings.difference)
+
+    def upload(self, surface: GelSurface) -> tuple[Any, Any]:
+        """Heights and contact of B surfaces as arrays on the device, for ``observe``."""
+        return self._image.upload(surface)
+
+    def observe(self, heights: Any, contact: Any = None) -> dict[str, Any]:
+        """``rgb`` (B, height, width, 3), uint8, on the device; ``as_tensors`` makes it a PyTorch tensor without a copy.
+
+        Args:
+            heights: [m], B·Ny·Nx of them on the device, finite, which is not checked: a Dr.Jit array or a float32 PyTorch tensor.
+            contact: where the object touches, as many bytes; only for optical modes that need it.
+
+        Raises:
+            InputError: no whole number of grids, a batch too large for the memory, or contact missing.
+        """
+        return {"rgb": self._image(heights, contact)}

@@ -1,0 +1,124 @@
+"""From heights on the device to the images that a learner observes, on the same device: cut, averaged, compared with the image at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.image_mode import ImageMode
+from raytac.optics.raytrace import RayTracer
+from raytac.optics.recording import no_collection
+
+__all__ = ["DeviceImage", "ImageCut"]
+
+
+@dataclass(frozen=True)
+class ImageCut:
+    """What is kept of a rendered image, in pixels of the observed one."""
+
+    size: tuple[int, int]
+    """(width, height) of the observed image."""
+    left: int
+    top: int
+    downscale: int
+    """Rendered pixels along both sides of an observed one, which is their mean, rounded half up."""
+
+
+class DeviceImage:
+    """Renders with one optical mode and cuts on the device; nothing leaves it. One recording a batch size, as the modes have."""
+
+    def __init__(self, mode: Any, grid: PadGrid, cut: ImageCut, *, difference: bool) -> None:
+        """Render the pad at rest once, which prepares the mode for its grid.
+
+        Args:
+            mode: an ``ImageMode``, or a ``RayTracer`` with the integrator ``fast``.
+            grid: of the heights to come.
+            cut: what is kept.
+            difference: give (255 + image − image at rest) // 2 instead of the image.
+
+        Raises:
+            InputError: a mode that has no images on the device, or a cut beyond the rendered image.
+        """
+        if not isinstance(mode, ImageMode) and not (isinstance(mode, RayTracer) and mode.integrator == "fast"):
+            value = getattr(mode, "label", mode)
+            raise InputError(
+                "optics", value=value, rule="must be taxim, phong or raytrace with the integrator fast to stay on the device"
+            )
+        self._mode, self._cut, self.mi = mode, cut, mode.mi
+        (width, height), (right, bottom) = cut.size, mode.camera.resolution
+        if (cut.left + width) * cut.downscale > right or (cut.top + height) * cut.downscale > bottom:
+            raise InputError("cut", value=cut, rule=f"must lie within the rendered {right}x{bottom}")
+        self._nodes = grid.rest.size
+        self._is_whole = (width, height) == (right, bottom)
+        self._frozen: dict[int, Any] = {}
+        rgb = mode.render(GelSurface.at_rest(grid)).rgb
+        if rgb is None:
+            raise InputError("outputs", value=mode.outputs, rule="must hold 'rgb'")
+        self._rest = None
+        if difference:
+            rest = self._kept(self.mi.UInt8(rgb.ravel()), 1, None)
+            dr.eval(rest)
+            self._rest = rest
+
+    def upload(self, surface: GelSurface) -> tuple[Any, Any]:
+        """Heights (B·Ny·Nx) and contact of a surface on the device; heights must be finite."""
+        heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+        contact = self.mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+        dr.eval(heights, contact)
+        return heights, contact
+
+    def __call__(self, heights: Any, contact: Any = None) -> Any:
+        """Images (B, height, width, 3), uint8, a Dr.Jit tensor that DLPack hands on without a copy; they are there when this returns.
+
+        Args:
+            heights: [m], B·Ny·Nx of them on this device, finite, which is not checked: a Dr.Jit array, or a float32 PyTorch tensor.
+            contact: where the object touches, as many bytes; only for modes that need it.
+
+        Raises:
+            InputError: no whole number of grids, or contact missing.
+        """
+        mi = self.mi
+        heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))
+        if isinstance(self._mode, RayTracer):
+            image = self._mode.render_device(heights)["rgb"]
+        else:
+            image = self._mode.render_device(heights, contact)[0]
+        envs = dr.width(heights) // self._nodes
+        if not self._is_whole or self._rest is not None:
+            if envs not in self._frozen:
+                self._frozen[envs] = dr.freeze(lambda image, rest: self._kept(image, envs, rest))
+            with no_collection():
+                image = self._frozen[envs](image, self._rest)
+        width, height = self._cut.size
+        dr.eval(image)
+        dr.sync_thread()  # another library's stream does not wait for this one's
+        tensor: Any = dr.tensor_t(type(image))
+        return tensor(image, (envs, height, width, 3))
+
+    @staticmethod
+    def _array(values: Any, kind: Any) -> Any:
+        """A tensor of another library as an array on this device, without a copy where it is on it already."""
+        tensor: Any = dr.tensor_t(kind)
+        return values if values is None or isinstance(values, kind) else tensor(values).array
+
+    def _kept(self, image: Any, envs: int, rest: Any) -> Any:
+        """Cut, mean and difference of images (B·H·W·3, UInt8)."""
+        mi, cut, (width, height), k = self.mi, self._cut, self._cut.size, self._cut.downscale
+        columns, rows = self._mode.camera.resolution
+        i = dr.arange(mi.UInt32, envs * width * height * 3)
+        channel, pixel = i % 3, i // 3
+        column, row, env = pixel % width, (pixel // width) % height, pixel // (width * height)
+        first = ((env * rows + (row + cut.top) * k) * columns + (column + cut.left) * k) * 3 + channel
+        total = mi.UInt32(k * k // 2)
+        for dy in range(k):
+            for dx in range(k):
+                total += mi.UInt32(dr.gather(mi.UInt8, image, first + (dy * columns + dx) * 3))
+        value = total // (k * k)
+        if rest is None:
+            return mi.UInt8(value)
+        return mi.UInt8((255 + value - mi.UInt32(dr.gather(mi.UInt8, rest, i % (width * height * 3)))) // 2)

@@ -1,0 +1,92 @@
+"""Finished presses of the simulated pad, kept on disk so that an interrupted calibration goes on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
+from raytac.io.code_digest import code_digest
+from raytac.io.metrics import versions
+from raytac.markers.calibration_presses import Press, PressStates
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["PressStore", "press_code"]
+
+_CODE = ("ipc", "raytac.physics")
+"""Packages of which every module may change what a press does."""
+
+
+class PressStore:
+    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it: gelpad, press, level, device, code and versions."""
+
+    def __init__(
+        self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, code: str, say: Callable[[str], object] = print
+    ) -> None:
+        """``code``: see ``press_code``; ``say`` tells of presses that cannot be used."""
+        self.folder, self._say = Path(folder), say
+        self.reused = 0
+        """Presses that were read and not damaged."""
+        self._basis = repr((gelpad, pad, device, code, versions(("numpy", "warp-lang"))))
+
+    def read(self, press: Press) -> PressStates | None:
+        """The states of a press, or None if they are not kept or their file is damaged."""
+        path = self._path(press)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as kept:
+                mesh = CoatMesh(*(kept[name] for name in ("rest", "faces", "lines_x", "lines_y")))
+                states = PressStates(tuple(kept["loads"].tolist()), kept["poses"], DeformedCoat(mesh, kept["positions"]))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:  # every member has a checksum
+            self._say(f"{path.name} cannot be used ({error}): pressed again")
+            return None
+        self.reused += 1
+        return states
+
+    def write(self, press: Press, states: PressStates) -> None:
+        """Keep the states of a press: the file is written beside its place and then renamed, so that no half of one looks finished."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path, mesh = self._path(press), states.coat.mesh
+        partial = self.folder / f".{path.name}.{os.getpid()}.partial"
+        try:
+            with partial.open("wb") as stream:
+                np.savez(
+                    stream,
+                    loads=np.array(states.loads),
+                    poses=states.poses,
+                    positions=states.coat.positions,
+                    rest=mesh.rest,
+                    faces=mesh.faces,
+                    lines_x=mesh.lines_x,
+                    lines_y=mesh.lines_y,
+                )
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _path(self, press: Press) -> Path:
+        return self.folder / f"{press.name}-{hashlib.sha256((self._basis + repr(press)).encode()).hexdigest()[:20]}.npz"
+
+
+def press_code() -> str:
+    """Digest of the source code that a press depends on: the presses' own, and all of the solver and of physics."""
+    return code_digest("raytac.markers.calibration_presses", *_modules())
+
+
+def _modules() -> list[str]:
+    """Names of all modules of the packages ``_CODE``; none is run but their ``__init__``."""
+    found = []
+    for package in _CODE:
+        spec = importlib.util.find_spec(package)
+        for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+            for path in sorted(Path(folder).rglob("*.py")):
+                parts = path.relative_to(folder).with_suffix("").parts
+                found.append(".".join((package, *(part for part in parts if part != "__init__"))))
+    return found

@@ -1,0 +1,140 @@
+"""Environments for stable-baselines3, and training with them: the same numbers as the vector's, alone and in processes; exact resuming."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.envs import RollBallVectorEnv
+from raytac.errors import InputError
+
+pytest.importorskip("stable_baselines3")
+
+from experiments.ppo_training import Checkpoint, Learner, Recipe, Training, evaluate, tactile_settings
+from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
+
+
+def played(env: TactileVecEnv | ProcessVecEnv, steps: int) -> list[tuple]:
+    env.seed(3)
+    first = {name: values.copy() for name, values in env.reset().items()}
+    rng = np.random.default_rng(0)
+    return [(first, None, None, None), *(env.step(rng.uniform(-1, 1, (env.num_envs, 3))) for _ in range(steps))]
+
+
+def test_it_is_the_vector_and_so_are_processes_of_it() -> None:
+    options = {"tactile": ("wrench",), "max_episode_steps": 3}
+    plain = RollBallVectorEnv(2, **options)
+    first, _ = plain.reset(seed=3)
+    alone, spread = (
+        TactileVecEnv(RollBallVectorEnv(2, **options)),
+        ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=2, **options),
+    )
+    try:
+        one, two = played(alone, 4), played(spread, 4)
+    finally:
+        spread.close()
+    rng = np.random.default_rng(0)
+    ended = 0
+    for k, ((seen, reward, done, infos), (same, earned, over, told)) in enumerate(zip(one, two, strict=True)):
+        if k:
+            first, expected, terminated, truncated, _ = plain.step(rng.uniform(-1, 1, (2, 3)))
+            np.testing.assert_allclose(reward, expected, rtol=1e-6)
+            np.testing.assert_array_equal(done, terminated | truncated)
+            np.testing.assert_array_equal(reward, earned)
+            np.testing.assert_array_equal(done, over)
+            for b in np.flatnonzero(done):
+                assert infos[b]["TimeLimit.truncated"] and told[b]["TimeLimit.truncated"]
+                assert not np.array_equal(infos[b]["terminal_observation"]["goal"], seen["goal"][b])
+                np.testing.assert_array_equal(infos[b]["terminal_observation"]["state"], told[b]["terminal_observation"]["state"])
+                ended += 1
+        for name in first:
+            np.testing.assert_array_equal(seen[name], first[name])
+            np.testing.assert_array_equal(seen[name], same[name])
+    assert ended == 2
+
+
+def test_bad_input_comes_back_from_a_process() -> None:
+    with pytest.raises(InputError, match="multiple of the number of processes"):
+        ProcessVecEnv(RollBallVectorEnv, num_envs=3, processes=2)
+    with pytest.raises(InputError, match="known modality"):
+        ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=1, tactile=("taste",))
+    env = ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=2, tactile=None)
+    try:
+        env.reset()
+        actions = np.zeros((2, 3))
+        actions[1, 2] = np.nan
+        with pytest.raises(InputError, match="environment 1"):
+            env.step(actions)
+        actions[1, 2] = 2.0
+        with pytest.raises(InputError, match="must be finite and in") as caught:
+            env.step(actions)
+        assert "environments 1 to 1, in process 1" in caught.value.__notes__[0]
+        assert env.step(np.zeros((2, 3)))[1].shape == (2,), "it goes on after a refused step"
+    finally:
+        env.close()
+    with pytest.raises(InputError, match="SameStep"):
+        TactileVecEnv(RollBallVectorEnv(1, tactile=None, autoreset_mode="NextStep"))
+
+
+RECIPE = Recipe(
+    "RollBall", "wrench", 0, 64, num_envs=2, rollout=16, segment=1, history=2, epochs=2, minibatch=16, hidden=8
+)  # two segments
+
+
+def test_a_training_that_was_interrupted_ends_with_the_same_weights(tmp_path: Path) -> None:
+    whole = Training(RECIPE, tmp_path / "whole", evaluation=2, say=lambda _: None)
+    before = {name: value.clone() for name, value in whole.learner.model.policy.state_dict().items()}
+    while not whole.is_done:
+        whole.run_segment()
+    first = Training(RECIPE, tmp_path / "cut", evaluation=2, say=lambda _: None)
+    first.run_segment()
+    with (tmp_path / "cut" / "progress.csv").open("a", encoding="utf-8") as file:
+        file.write("48,9.0,0,,,,0.3\n")  # what a training that was killed may leave beyond its checkpoint
+    second = Training(RECIPE, tmp_path / "cut", evaluation=2, say=lambda _: None)
+    assert second.steps == 32 and not second.is_done
+    second.run_segment()
+    for name, value in whole.learner.model.policy.state_dict().items():
+        assert np.array_equal(value, second.learner.model.policy.state_dict()[name]), name
+        assert not name.endswith("weight") or not np.array_equal(value, before[name]), f"{name} was not trained"
+    a, b = (Checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("whole", "cut"))
+    assert (
+        a.steps == b.steps == 64
+        and a.normaliser["observation"]["state"]["count"] == b.normaliser["observation"]["state"]["count"]
+    )
+    for name in ("progress.csv", "evaluation.csv"):
+        rows = [list(csv.DictReader((tmp_path / run / name).open(encoding="utf-8"))) for run in ("whole", "cut")]
+        assert [row["steps"] for row in rows[0]] == [row["steps"] for row in rows[1]] == ["32", "64"]
+    assert [row["return"] for row in rows[0]] == [row["return"] for row in rows[1]]
+    with pytest.raises(InputError, match="'gamma'"):
+        Training(replace(RECIPE, gamma=0.5), tmp_path / "cut")
+
+
+def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path) -> None:
+    learner = Learner(RECIPE)
+    observation = learner.normaliser.reset()
+    learner.normaliser.step(np.zeros((2, 3)))  # so that the normaliser has statistics
+    learner.checkpoint().save(tmp_path / "policy.pt", resumable=False)
+    other = Learner(replace(RECIPE, seed=5))
+    assert not np.array_equal(other.predict(observation), learner.predict(observation))  # type: ignore[arg-type]
+    other.restore(Checkpoint.load(tmp_path / "policy.pt"))
+    np.testing.assert_array_equal(other.predict(observation), learner.predict(observation))  # type: ignore[arg-type]
+    mine, its = learner.normaliser.obs_rms, other.normaliser.obs_rms
+    np.testing.assert_array_equal(mine["goal"].mean, its["goal"].mean)  # type: ignore[index]
+    result = evaluate(other, 3)
+    assert result.episodes == 4 and result.mean_length <= 150.0
+    (tmp_path / "wrong.pt").write_text("no checkpoint")
+    for name in ("wrong.pt", "missing.pt"):
+        with pytest.raises(InputError, match="checkpoint"):
+            Checkpoint.load(tmp_path / name)
+
+
+def test_modalities_by_name() -> None:
+    assert tactile_settings("none") is None and tactile_settings("task") == "task"
+    with pytest.raises(InputError, match="modality"):
+        tactile_settings("markers+taste")
+    with pytest.raises(InputError, match="task"):
+        Learner(replace(RECIPE, task="Juggle"))

@@ -1,0 +1,118 @@
+"""Playing: a film's pictures, the success rate of a scripted policy and of a checkpoint, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from raytac.errors import InputError
+from raytac.io.metrics import read_metrics
+
+pytest.importorskip("stable_baselines3")
+
+from experiments.play import Args, main
+from experiments.ppo_training import Learner, Recipe
+from experiments.training_curves import draw_curves
+
+
+def test_the_rate_of_a_scripted_policy_and_of_a_checkpoint(tmp_path: Path) -> None:
+    found = main(Args(policy="scripted", task="RollBall", episodes=2, num_envs=2, film=False, out=tmp_path / "scripted"))
+    assert found["success"] == 1.0 and float(found["success_low"]) < 0.5 and found["length"] == 150
+    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4))
+    learner.checkpoint().save(tmp_path / "policy.pt", resumable=False)
+    found = main(Args(policy=str(tmp_path / "policy.pt"), episodes=2, num_envs=2, film=False, out=tmp_path / "trained"))
+    assert found["task"] == "RollBall" and 0.0 <= found["success"] <= 1.0  # type: ignore[operator]
+    assert read_metrics(tmp_path / "trained" / "metrics.json")["episodes"] == 2
+
+
+def test_what_is_shown_in_a_film_is_hidden_from_the_policy() -> None:
+    recipe = Recipe("RollBall", "wrench", 0, 10, num_envs=1, rollout=2, hidden=4)
+    from raytac.observe import ObservationSettings
+
+    rich = Learner(recipe, hidden=("markers",), tactile=ObservationSettings(("markers", "wrench")))
+    poor = Learner(recipe)
+    poor.restore(rich.checkpoint())
+    seen, same = (learner.normaliser.observation_space for learner in (rich, poor))
+    assert seen == same and "sensor_markers" in rich.base.observation_space.spaces  # type: ignore[attr-defined]
+    assert "sensor_markers" not in rich.normaliser.reset()
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    for wrong in (Args(policy="nothing.pt", out=tmp_path), Args(task="Juggle", out=tmp_path)):
+        with pytest.raises(InputError):
+            main(wrong)
+    with pytest.raises(InputError, match="must hold trainings"):
+        draw_curves(tmp_path)
+    with pytest.raises(InputError, match="of this task and these observations"):
+        Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2)).restore(
+            Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4)).checkpoint()
+        )
+
+
+def test_curves_are_drawn_from_runs_that_differ_in_length(tmp_path: Path) -> None:
+    for kind in ("task", "none"):
+        for seed, steps in enumerate(([10, 20, 30], [10, 20])):
+            folder = tmp_path / kind / f"seed{seed}"
+            folder.mkdir(parents=True)
+            rows = "".join(f"{n},{n / 30},{n}\n" for n in steps)
+            (folder / "evaluation.csv").write_text("steps,success,return\n" + rows, encoding="utf-8")
+    assert draw_curves(tmp_path).stat().st_size > 1000
+
+
+_SCRIPT = """
+import sys
+import gymnasium, mujoco, numpy as np
+try:
+    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+except Exception as error:
+    print(error)
+    sys.exit(77)
+import raytac.envs
+from raytac.envs import PushCubeVectorEnv
+from raytac.observe import ObservationSettings
+shown = ObservationSettings(("rgb", "markers"), resolution=(32, 24), optics="phong")
+env = gymnasium.make("raytac/PushCube-v0", render_mode="rgb_array", tactile=shown)
+env.reset(seed=0)
+before = env.render()
+for _ in range(6):
+    env.step(np.array([0, 0, -1.0], np.float32))
+after = env.render()
+assert before.shape == after.shape and before.dtype == np.uint8 and before.shape[0] == 240 and before.shape[1] > 320
+changed = (before != after).any(axis=2)
+assert changed[:, 320:].any(), "the pad that is pressed looks as before"
+assert (before[:, :320] == 235).all(axis=2).mean() > 0.1 and (before[:, :320] != 235).any()
+green = (before[..., 1].astype(int) - before[..., 0] > 60) & (before[..., 1].astype(int) - before[..., 2] > 60)
+assert green[:, :320].sum() > 3, "no goal is seen"
+env.close()
+many = PushCubeVectorEnv(2, render_mode="rgb_array", tactile=None)
+many.reset(seed=0)
+first, second = many.render()
+assert first.shape == (240, 320, 3) and (first != second).any()
+many.close()
+"""
+
+
+def test_pictures_of_environments() -> None:
+    """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    environment.setdefault("MUJOCO_GL", "egl")
+    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=environment, capture_output=True, text=True, timeout=200)
+    if done.returncode == 77 or "EGL" in done.stderr or "OpenGL" in done.stderr:
+        pytest.skip(f"no offscreen OpenGL here: {(done.stdout + done.stderr).strip()[-200:]}")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_render_mode_that_is_not_there() -> None:
+    from raytac.envs import RollBallEnv, RollBallVectorEnv
+
+    for make in (RollBallEnv, RollBallVectorEnv):
+        with pytest.raises(InputError, match="rgb_array"):
+            make(render_mode="human", tactile=None)
+    env = RollBallEnv(render_mode="rgb_array", tactile=None)
+    with pytest.raises(InputError, match="reset"):
+        env.render()
+    assert RollBallEnv(tactile=None).render() is None
