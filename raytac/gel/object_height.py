@@ -95,7 +95,7 @@ def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.
     assert part.vertices is not None and part.faces is not None
     as_triangles = part.kind == "mesh" or not looks_down(part, pose)
     placed = part.vertices @ pose[:3, :3].T + pose[:3, 3] if as_triangles else None
-    low, high = _part_bounds(part, pose) if placed is None else (placed.min(axis=0), placed.max(axis=0))
+    low, high = _part_bounds(part, pose) if placed is None else np.array([[line.min(), line.max()] for line in placed.T]).T
     columns, rows = _span(x, low[0], high[0]), _span(y, low[1], high[1])
     window = lowest[rows, columns]
     if low[2] > below or window.size == 0:
@@ -115,7 +115,8 @@ def _span(line: np.ndarray, low: float, high: float) -> slice:
 def _candidates(placed: np.ndarray, faces: np.ndarray, closed: bool, below: float) -> np.ndarray:
     """Corners (T, 3, 3) of the triangles that can be part of the underside."""
     if np.isfinite(below):
-        faces = faces[placed[:, 2][faces].min(axis=1) <= below]
+        z = placed[:, 2]
+        faces = faces[np.minimum(np.minimum(z[faces[:, 0]], z[faces[:, 1]]), z[faces[:, 2]]) <= below]
     if closed:
         a, b, c = (placed[faces[:, k], :2] for k in range(3))
         looks_down = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0.0

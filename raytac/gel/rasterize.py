@@ -22,7 +22,9 @@ def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np
     lowest = np.full(ny * nx, np.inf)
     p = np.asarray(corners, float)
     step_x, step_y = (x[-1] - x[0]) / (nx - 1), (y[-1] - y[0]) / (ny - 1)
-    low, high = p.min(axis=1), p.max(axis=1)
+    # A reduction over an axis of three is many times slower than two minima.
+    low = np.minimum(np.minimum(p[:, 0], p[:, 1]), p[:, 2])
+    high = np.maximum(np.maximum(p[:, 0], p[:, 1]), p[:, 2])
     keep = (high[:, 0] >= x[0] - step_x) & (low[:, 0] <= x[-1] + step_x) & (high[:, 1] >= y[0]) & (low[:, 1] <= y[-1])
     edge_a, edge_b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = edge_a[:, 0] * edge_b[:, 1] - edge_a[:, 1] * edge_b[:, 0]

@@ -13,13 +13,13 @@ from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["first_touch_z", "gap_at_touch"]
+__all__ = ["first_touch", "first_touch_z", "gap_at_touch"]
 
 _ZOOMS, _FINE = 4, 17
 
 
-def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> float:
-    """Height z [m] of the object's origin at which it just touches the resting pad.
+def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> tuple[float, np.ndarray]:
+    """Height z [m] of the object's origin at which it just touches the resting pad, and what ``gap_at_touch`` gives there.
 
     ``pose`` (4, 4): rotation and x, y of the object in the pad frame; its z is ignored. The touch is at the node of ``grid`` with
     the least distance between object and gel, refined by zooming in on it (a factor 8, four times), so that the result does not
@@ -30,9 +30,10 @@ def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, g
     above = pose.copy()
     above[2, 3] = 0.0
     x, y = grid.x, grid.y
-    least = np.inf
+    least, gaps = np.inf, []
     for _ in range(_ZOOMS + 1):
         gap = object_height(parts, above[None], x, y)[0] - rest_height(gelpad, x[None, :], y[:, None])
+        gaps.append(gap)
         j, i = np.unravel_index(np.argmin(gap), gap.shape)
         least = min(least, float(gap[j, i]))
         if not np.isfinite(least):
@@ -41,7 +42,12 @@ def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, g
             rule = f"no part of the object, which spans {span}, is above a node of the pad"
             raise InputError("position", value=tuple(above[:2, 3].tolist()), rule=rule)
         x, y = _around(x, int(i), grid.x), _around(y, int(j), grid.y)
-    return -least
+    return -least, np.maximum(gaps[0] - least, 0.0)
+
+
+def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> float:
+    """The height alone."""
+    return first_touch(parts, pose, gelpad, grid)[0]
 
 
 def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.ndarray:

@@ -14,7 +14,7 @@ from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.contact_state import ContactState
-from raytac.physics.first_touch import first_touch_z, gap_at_touch
+from raytac.physics.first_touch import first_touch
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.press_plan import (
     CLEARANCE,
@@ -233,10 +233,9 @@ class RigidPad:
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
-            pose[2, 3] = first_touch_z(self.parts, pose, self.sensor.gelpad, self.grid)
-            gap = gap_at_touch(self.parts, pose, self.grid)
+            touch, gap = first_touch(self.parts, pose, self.sensor.gelpad, self.grid)
             pitch = self.grid.pitch
-            self._touches[key] = float(pose[2, 3]), LoadLaw(gap, pitch[0] * pitch[1], self.sensor.gelpad)
+            self._touches[key] = touch, LoadLaw(gap, pitch[0] * pitch[1], self.sensor.gelpad)
         return self._touches[key]
 
     def _advance(

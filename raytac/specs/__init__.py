@@ -22,6 +22,8 @@ from raytac.specs.sensor import (
 )
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.sensor_file import load_lights, load_sensor, with_lights
+from raytac.specs.sweep import PressRanges, SweepSpec
+from raytac.specs.sweep_file import load_sweep
 from raytac.specs.task import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.specs.task_file import load_task
 
@@ -37,6 +39,7 @@ __all__ = [
     "MarkerSpec",
     "MountSpec",
     "ObjectSpec",
+    "PressRanges",
     "PressScene",
     "PunchSpec",
     "RefractionSpec",
@@ -44,6 +47,7 @@ __all__ = [
     "RobotSpec",
     "SensorSpec",
     "StageSpec",
+    "SweepSpec",
     "TaskScene",
     "available",
     "load_lights",
@@ -52,6 +56,7 @@ __all__ = [
     "load_press",
     "load_scene",
     "load_sensor",
+    "load_sweep",
     "load_task",
     "validate_press",
     "validate_sensor",

@@ -1,4 +1,4 @@
-"""From a name or a path to the file that holds a sensor, its lights, its markers' motion, a press scene or a task scene."""
+"""From a name or a path to the file that holds a sensor, its lights, its markers' motion, a press scene, a task scene or a sweep."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "press scene": ("scenes", "press"),
     "task scene": ("scenes", "tasks"),
     "lights": ("lights", ""),
+    "sweep": ("scenes", "sweeps"),
     "marker motion": ("scenes", "markers"),
 }
 
 
 def available(what: str) -> tuple[str, ...]:
-    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"``, ``"task scene"``, ``"lights"`` or ``"marker motion"``."""
+    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"``, ``"task scene"``, ``"lights"``, ``"sweep"`` or ``"marker
+    motion"``."""
     return tuple(sorted(path.stem for path in _folder(what).glob("*.toml")))
 
 

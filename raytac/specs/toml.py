@@ -161,17 +161,35 @@ class Integer:
 
 @dataclass(frozen=True)
 class Text:
-    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words)."""
+    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words); or, with
+    ``length`` = ``ANY``, a list of one or more of them, none twice."""
 
     choices: tuple[str, ...] = ()
     pattern: str = r"(?s).+"
     described: str = "a non-empty string"
     default: Any = REQUIRED
+    length: int = 0
 
     def rule(self, unit: Unit) -> str:
+        if self.length:
+            return (
+                "must be a list of known names, none twice"
+                if self.choices
+                else f"must be a list, each {self.described}, none twice"
+            )
         return "must be a known name" if self.choices else f"must be {self.described}"
 
-    def parse(self, value: object, unit: Unit) -> str:
+    def parse(self, value: object, unit: Unit) -> str | tuple[str, ...]:
+        if not self.length:
+            return self._one(value, unit)
+        if not isinstance(value, list) or not value:
+            raise _Refused(self.rule(unit), self.choices)
+        words = tuple(self._one(item, unit) for item in value)
+        if len(set(words)) != len(words):
+            raise _Refused(self.rule(unit), self.choices)
+        return words
+
+    def _one(self, value: object, unit: Unit) -> str:
         if not isinstance(value, str) or (self.choices and value not in self.choices):
             raise _Refused(self.rule(unit), self.choices)
         if not re.fullmatch(self.pattern, value) or "\0" in value:

@@ -12,6 +12,8 @@ from raytac.observe.device_images import DeviceImages
 from raytac.sensor import TactileSensor
 
 B = 3
+DIRECT = {"optics": "raytrace", "optics_options": {"bounce": False}}
+"""Quickest to build: light that comes straight from the LEDs."""
 
 
 def dented(grid: PadGrid) -> GelSurface:
@@ -23,7 +25,7 @@ def dented(grid: PadGrid) -> GelSurface:
 
 
 def both(**settings) -> tuple[TactileObserver, TactileSensor, DeviceImages]:
-    made = ObservationSettings(("rgb",), **{"resolution": (24, 16), "optics": "phong", **settings})
+    made = ObservationSettings(("rgb",), **{**DIRECT, "resolution": (24, 16), **settings})
     observer = TactileObserver("gelsight_mini", made, num_envs=B)
     sensor = observer.make_sensor(device="cpu")
     return observer, sensor, DeviceImages(observer, sensor)
@@ -32,10 +34,10 @@ def both(**settings) -> tuple[TactileObserver, TactileSensor, DeviceImages]:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"crop": (0, 0, 0, 0)},
+        {"crop": (0, 0, 0, 0), "optics": "phong", "optics_options": {}},
         {"crop": (3, 1, 2, 4), "downscale": 3, "difference": True},
         {"resolution": (16, 16), "downscale": 2},
-        {"optics": "raytrace", "difference": True},
+        {"difference": True},
     ],
 )
 def test_the_device_gives_what_the_host_does(settings: dict) -> None:
@@ -68,13 +70,29 @@ def test_pytorch_gives_and_gets_without_a_copy() -> None:
     np.testing.assert_array_equal(tensors["rgb"].numpy(), np.asarray(images.observe(*images.upload(surface))["rgb"]))
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("optics", ["phong", "raytrace"])
+def test_a_gpu_hands_its_memory_to_pytorch(optics: str) -> None:
+    torch = pytest.importorskip("torch")
+    settings = ObservationSettings(("rgb",), resolution=(24, 16), optics=optics, difference=True, downscale=2)
+    observer = TactileObserver("gelsight_mini", settings, num_envs=B)
+    sensor = observer.make_sensor(device="cuda")
+    images = DeviceImages(observer, sensor)
+    surface = dented(images.grid)
+    expected = observer.observe(sensor.update(surface), sensor)["rgb"]
+    for heights in (images.upload(surface)[0], torch.from_numpy(surface.height.reshape(-1)).cuda()):
+        tensor = as_tensors(images.observe(heights))["rgb"]
+        assert tensor.is_cuda
+        np.testing.assert_array_equal(tensor.cpu().numpy(), expected)
+
+
 def test_what_the_device_does_not_know_is_refused() -> None:
     for settings, randomization, text in (
         ({"modalities": ("markers",)}, None, "must have 'rgb'"),
         ({"modalities": ("rgb",), "stack": 2}, None, "nothing is kept"),
         ({"modalities": ("rgb",)}, Randomization(noise=1.0), "must not change images"),
     ):
-        made = ObservationSettings(**{"resolution": (24, 16), "optics": "phong", **settings})
+        made = ObservationSettings(**{**DIRECT, "resolution": (24, 16), **settings})
         observer = TactileObserver("gelsight_mini_9x11", made, num_envs=B, randomization=randomization)
         with pytest.raises(InputError, match=text):
             DeviceImages(observer, observer.make_sensor(device="cpu"))

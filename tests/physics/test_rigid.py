@@ -12,7 +12,7 @@ import pytest
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.pad import make_grid, rest_height
-from raytac.physics.first_touch import first_touch_z, gap_at_touch
+from raytac.physics.first_touch import first_touch, first_touch_z, gap_at_touch
 from raytac.physics.load_law import LoadLaw, layer_stiffening, reduced_modulus
 from raytac.physics.objects import object_parts
 from raytac.physics.rig import PressRig
@@ -154,6 +154,9 @@ def test_first_touch_has_no_overlap_and_no_gap(kind: str) -> None:
     pose = state.pad_from_object[0].copy()
     pose[2, 3] -= CLEARANCE
     gap = gap_at_touch(pad.parts, pose, pad.grid)
+    z, found = first_touch(pad.parts, pose, pad.sensor.gelpad, pad.grid)
+    assert z == pytest.approx(pose[2, 3], abs=1e-9)
+    np.testing.assert_allclose(found, gap, atol=1e-9)
     assert 0.0 <= gap.min() < 20e-6  # a sharp corner may lie between nodes
     assert not pad.surface_from_pose(pose[None]).contact.any() or gap.min() < 1e-9
 

@@ -1,0 +1,147 @@
+"""``dataset.json`` and ``README.md``: what a data set says of itself, without any path of the machine that made it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from raytac.dataset.arrays import ARRAYS, COLUMNS, SHARED
+from raytac.dataset.plan import DatasetPlan
+from raytac.dataset.shard import ShardRecord, sha256_of
+from raytac.errors import InputError
+
+__all__ = ["FILE", "FORMAT_VERSION", "describe", "read_description", "write_description"]
+
+FILE = "dataset.json"
+FORMAT_VERSION = 1
+_FRAME = (
+    "pad frame: origin at the centre of the undeformed outer gel surface, +z out of the sensor towards the object, +x image right, "
+    "+y image down; SI units"
+)
+
+
+def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path | None) -> dict[str, Any]:
+    """All of ``dataset.json``; ``manifest`` is None while shards are missing."""
+    made: dict[str, dict[str, Any]] = {}
+    for record in records:
+        key = json.dumps(record.made_by, sort_keys=True)
+        made.setdefault(key, {**record.made_by, "shards": 0})["shards"] += 1
+    status = [row["status"] for record in records for row in record.rows]
+    sensors = {}
+    for sensor in plan.sweep.sensors:
+        shapes = plan.array_shapes(sensor)
+        sensors[sensor.name] = {
+            "resolution": list(plan.resolution(sensor)),
+            "pixel_m": list(sensor.camera.pitch_at(plan.resolution(sensor))),
+            "pad_size_m": list(sensor.gelpad.size),
+            "pad_thickness_m": sensor.gelpad.thickness,
+            "arrays": {name: ["N", *shape] for name, shape in shapes.items()},
+        }
+    kept = plan.array_shapes(plan.sweep.sensors[0])
+    return {
+        "format": "raytac presses",
+        "format_version": FORMAT_VERSION,
+        "name": plan.sweep.name,
+        "complete": manifest is not None,
+        "presses": plan.sweep.count,
+        "sound": status.count("ok"),
+        "failed": status.count("failed"),
+        "shards": plan.shards,
+        "manifest_sha256": sha256_of(manifest) if manifest is not None else "",
+        "frame": _FRAME,
+        "arrays": {
+            name: {"dtype": array.dtype, "shape": ["N", *array.shape], "unit": array.unit, "meaning": array.meaning}
+            for name, array in ARRAYS.items()
+            if name in kept
+        },
+        "arrays_of_a_shard": {
+            name: {"dtype": array.dtype, "shape": list(array.shape), "unit": array.unit, "meaning": array.meaning}
+            for name, array in SHARED.items()
+            if array.is_kept(plan.sweep.outputs, False)
+        },
+        "columns": {name: {"type": c.type, "unit": c.unit, "meaning": c.meaning} for name, c in COLUMNS.items()},
+        "sensors": sensors,
+        "made_by": list(made.values()),
+        "plan_sha256": plan.digest,
+        "plan": plan.description,
+    }
+
+
+def write_description(folder: Path, found: dict[str, Any]) -> None:
+    """Write ``README.md`` and ``dataset.json``, the latter last."""
+    for name, text in (("README.md", _readme(found)), (FILE, json.dumps(found, indent=1, ensure_ascii=False) + "\n")):
+        partial = folder / f".{name}.partial"
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, folder / name)
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """``dataset.json`` of a data set.
+
+    Raises:
+        InputError: there is none, it cannot be read, or it is of a later format.
+    """
+    path = Path(folder) / FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        version = found["format_version"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("data set", value=folder, rule=f"must be a folder with a {FILE} ({type(error).__name__})") from error
+    if version != FORMAT_VERSION:
+        raise InputError("data set", value=version, rule=f"must be of format version {FORMAT_VERSION}")
+    return found
+
+
+def _readme(found: dict[str, Any]) -> str:
+    def table(items: dict[str, dict[str, Any]], kind: str) -> list[str]:
+        lines = [f"| name | {kind} | unit | meaning |", "|---|---|---|---|"]
+        for name, item in items.items():
+            shape = f"{item['dtype']} ({', '.join(str(n) for n in item['shape'])})" if "shape" in item else item["type"]
+            lines.append(f"| `{name}` | {shape} | {item['unit']} | {item['meaning']} |")
+        return lines
+
+    lines = [
+        f"# {found['name']}",
+        "",
+        f"{found['presses']} simulated presses of {', '.join(found['plan']['objects'])} into {', '.join(found['sensors'])}, by raytac: "
+        f"{found['sound']} sound, {found['failed']} failed, {found['shards']} shards. "
+        + ("Complete." if found["complete"] else "NOT complete: run the same command again."),
+        "",
+        f"Frame: {found['frame']}.",
+        "",
+        "- `manifest.parquet`: one row a press, in the order of their numbers; failed ones with their reason.",
+        "- `shards/NNNNNN.npz`: arrays of the sound presses of one shard, `numpy.load` reads them; SHA-256 of every file in the manifest.",
+        "- `shards/NNNNNN.json`: the rows of that shard, from which the manifest is made.",
+        "- `dataset.json`: all of this page, the plan, versions and state of the code for programs.",
+        "",
+        "```python",
+        "from raytac.dataset import PressDataset",
+        "",
+        'data = PressDataset("THIS_FOLDER", ("rgb", "wrench"))',
+        'data[0]["rgb"]',
+        "```",
+        "",
+        "## Arrays of a shard, the press first",
+        "",
+        *table(found["arrays"], "type (shape)"),
+        "",
+        "## Arrays of a shard, once",
+        "",
+        *table(found["arrays_of_a_shard"], "type (shape)"),
+        "",
+        "H, W: image; Ny, Nx: grid over the pad; M: markers. By sensor:",
+        "",
+        *(
+            f"- `{name}`: " + ", ".join(f"{key} {tuple(shape)}" for key, shape in sensor["arrays"].items())
+            for name, sensor in found["sensors"].items()
+        ),
+        "",
+        "## Columns of the manifest",
+        "",
+        *table(found["columns"], "type"),
+        "",
+    ]
+    return "\n".join(lines)

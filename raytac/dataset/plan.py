@@ -1,0 +1,308 @@
+"""Which presses a data set has: every one drawn from the seed and its own number, whoever renders it and whatever comes before."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from raytac.dataset.arrays import ARRAYS, DATASET_OUTPUTS, SHARED, ArrayKind
+from raytac.errors import InputError, RaytacError, SpecError
+from raytac.gel.pad import grid_pitch, make_grid
+from raytac.gel.surface import PadGrid
+from raytac.markers import MarkerPerturbation
+from raytac.markers.pattern import MarkerPattern
+from raytac.observe import Randomization, randomised_sensor
+from raytac.sensor import TactileSensor
+from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
+
+__all__ = ["DatasetPlan", "Presses", "press_scene_of"]
+
+_DRAWS = 10
+"""Uniform numbers that every press draws, used or not: a range that changes changes no other value."""
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Parameters of N presses; SI units, pad frame."""
+
+    index: np.ndarray
+    """Number in the data set, (N,)."""
+    scene: np.ndarray
+    """Number of the object among the sweep's, (N,)."""
+    seed: np.ndarray
+    """Of noise in images and markers, (N,)."""
+    press_depth: np.ndarray
+    """Travel below first touch [m], (N,)."""
+    x: np.ndarray
+    y: np.ndarray
+    """Added to the place of the scene's object [m], (N,)."""
+    yaw: np.ndarray
+    """[rad], (N,)."""
+    tilt: np.ndarray
+    tilt_direction: np.ndarray
+    """The object leans by ``tilt`` towards this direction, measured from +x to +y [rad], (N,)."""
+    shear_x: np.ndarray
+    shear_y: np.ndarray
+    """Way sideways after the indent [m], (N,)."""
+    twist: np.ndarray
+    """Turn about +z after that [rad], (N,)."""
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __getitem__(self, which: np.ndarray | slice) -> Presses:
+        return Presses(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    @property
+    def rotations(self) -> np.ndarray:
+        """Turn of the object: yaw about +z, then the lean; wxyz, (N, 4)."""
+        half, lean, way = 0.5 * self.yaw, 0.5 * self.tilt, self.tilt_direction
+        # The axis of the lean is +z × direction.
+        axis = np.stack([np.zeros_like(way), -np.sin(way), np.cos(way), np.zeros_like(way)], axis=1)
+        a = np.cos(lean)[:, None] * np.array([1.0, 0.0, 0.0, 0.0]) + np.sin(lean)[:, None] * axis
+        w, z = np.cos(half), np.sin(half)
+        return np.stack(
+            [a[:, 0] * w, a[:, 1] * w + a[:, 2] * z, a[:, 2] * w - a[:, 1] * z, a[:, 0] * z],
+            axis=1,
+        )
+
+
+class DatasetPlan:
+    """A sweep, checked, cut into shards of one sensor each.
+
+    .. code-block:: python
+
+        plan = DatasetPlan(load_sweep("demo"))
+        plan.presses(3)  # parameters of the presses of shard 3
+        plan.sensor(3)  # and the sensor that they are pressed into
+    """
+
+    def __init__(self, sweep: SweepSpec) -> None:
+        """Check all that can be told before anything is rendered.
+
+        Raises:
+            InputError: an output that no data set has, a model that the sensor lacks, or randomisation of markers that are not asked for.
+            SpecError: a range that no press into one of the sensors can follow; names the file and key.
+        """
+        self.sweep = sweep
+        for name in sweep.outputs:
+            if name not in DATASET_OUTPUTS:
+                raise InputError("outputs", value=name, rule="must be known names", choices=DATASET_OUTPUTS)
+        if sweep.marker_perturbation and sweep.markers is None:
+            rule = "perturbs markers, which the sweep does not ask for: markers = …"
+            raise InputError("randomization.markers", value=dict(sweep.marker_perturbation), rule=rule)
+        self.randomization = Randomization(**sweep.randomization, markers=MarkerPerturbation(**sweep.marker_perturbation))
+        if sweep.variants > 1 and not self.randomization.changes_sensor:
+            rule = "copies of a sensor differ only where the randomisation changes sensors (led_power, friction, …)"
+            raise InputError("variants", value=sweep.variants, rule=rule)
+        if self.randomization.changes_images and "rgb" not in sweep.outputs:
+            raise InputError("randomization", value=dict(sweep.randomization), rule="changes images: outputs must have 'rgb'")
+        for scene in sweep.objects:
+            self._check_object(scene)
+        for sensor in sweep.sensors:
+            self._check_reach(sensor)
+            TactileSensor(sensor, **self.sensor_options(1), device="cpu")
+            self._check_markers(sensor)
+
+    # --- shards ----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.sweep.count // self.sweep.shard_size)
+
+    def variant(self, shard: int) -> tuple[int, int]:
+        """Number of the sensor that a shard is pressed into, and of its drawn copy: shards take turns."""
+        which = shard % (len(self.sweep.sensors) * self.sweep.variants)
+        return which % len(self.sweep.sensors), which // len(self.sweep.sensors)
+
+    def sensor(self, shard: int) -> SensorSpec:
+        """Sensor of a shard, as drawn."""
+        which, copy = self.variant(shard)
+        seed = int(np.random.SeedSequence((self.sweep.seed, 0x5E, copy)).generate_state(1)[0])
+        return randomised_sensor(self.sweep.sensors[which], self.randomization, seed)
+
+    def presses(self, shard: int) -> Presses:
+        """Presses of a shard; press i depends on the sweep's seed, ranges and objects, and on i."""
+        first = shard * self.sweep.shard_size
+        if not 0 <= shard < self.shards:
+            raise InputError("shard", value=shard, rule=f"must be in [0, {self.shards})")
+        return self.draw(np.arange(first, min(first + self.sweep.shard_size, self.sweep.count)))
+
+    def draw(self, index: np.ndarray) -> Presses:
+        """Presses by their numbers."""
+        streams = [np.random.default_rng((self.sweep.seed, int(i))) for i in index]
+        u = np.array([stream.random(_DRAWS) for stream in streams]).reshape(len(index), _DRAWS).T
+        seed = np.array([stream.integers(2**32) for stream in streams], np.int64)
+        r = self.sweep.ranges
+
+        def between(ends: tuple[float, float], share: np.ndarray) -> np.ndarray:
+            return ends[0] + (ends[1] - ends[0]) * share
+
+        length, way = between(r.shear, u[6]), 2.0 * np.pi * u[7]
+        return Presses(
+            index=np.asarray(index, np.int64),
+            scene=np.minimum((u[0] * len(self.sweep.objects)).astype(np.int64), len(self.sweep.objects) - 1),
+            seed=seed,
+            press_depth=between(r.depth, u[1]),
+            x=between(r.x, u[2]),
+            y=between(r.y, u[3]),
+            yaw=between(r.yaw, u[4]),
+            tilt=between(r.tilt, u[5]),
+            tilt_direction=2.0 * np.pi * u[9],
+            shear_x=length * np.cos(way),
+            shear_y=length * np.sin(way),
+            twist=between(r.twist, u[8]),
+        )
+
+    # --- sensors ---------------------------------------------------------------------------------------------------------------
+
+    def sensor_options(self, num_envs: int) -> dict[str, Any]:
+        """Keyword arguments of the ``TactileSensor`` that gives what is kept, but for sensor and device."""
+        sweep = self.sweep
+        return {
+            "physics": sweep.physics,
+            "pad": sweep.pad,
+            "optics": sweep.optics,
+            "outputs": tuple(name for name in sweep.outputs if name != "contact"),
+            "markers": sweep.markers,
+            "marker_perturbation": replace(self.randomization.markers) if sweep.markers is not None else None,
+            "resolution": sweep.resolution,
+            "pitch": sweep.pitch,
+            "num_envs": num_envs,
+            "seed": sweep.seed,
+        }
+
+    def resolution(self, sensor: SensorSpec) -> tuple[int, int]:
+        """(width, height) of the images [px]."""
+        return self.sweep.resolution or sensor.camera.resolution
+
+    def grid(self, sensor: SensorSpec) -> PadGrid:
+        """Nodes of the maps over the pad."""
+        pitch = self.sweep.pitch or grid_pitch(sensor.camera.pitch_at(self.resolution(sensor)))
+        return make_grid(sensor.gelpad, pitch)
+
+    def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] = ARRAYS) -> dict[str, tuple[int, ...]]:
+        """Shape of every array of one press into a sensor, by name; with ``SHARED`` of those that a shard holds once."""
+        width, height = self.resolution(sensor)
+        sizes = {
+            "H": height,
+            "W": width,
+            "Ny": self.grid(sensor).shape[0],
+            "Nx": self.grid(sensor).shape[1],
+            "M": sensor.markers.rows * sensor.markers.columns,
+        }
+        markers = self.sweep.markers is not None
+        kept = {name: array for name, array in kinds.items() if array.is_kept(self.sweep.outputs, markers)}
+        return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kept.items()}
+
+    def press_bytes(self, sensor: SensorSpec) -> int:
+        """What one press into a sensor takes on disk, not compressed, and nothing of what a shard holds once."""
+        return _bytes(self.array_shapes(sensor), ARRAYS)
+
+    def shard_bytes(self, shard: int) -> int:
+        """What a shard takes on disk, not compressed, but for some kilobytes of headers and rows."""
+        sensor = self.sweep.sensors[self.variant(shard)[0]]
+        count = min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
+        return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
+
+    # --- identity --------------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """All that the presses depend on but code and device, as plain values without any path."""
+        sweep = self.sweep
+        plain = {
+            f.name: getattr(sweep, f.name)
+            for f in fields(sweep)
+            if f.name not in ("sensors", "objects", "source", "ranges", "name")
+        }
+        found = {
+            **plain,
+            "press": {f.name: list(getattr(sweep.ranges, f.name)) for f in fields(sweep.ranges)},
+            "sensors": {s.name: _sensor_digest(s) for s in sweep.sensors},
+            "objects": {scene.name: _object_of(scene) for scene in sweep.objects},
+        }
+        return json.loads(json.dumps(found, default=dict))
+
+    @cached_property
+    def digest(self) -> str:
+        """64 hex digits that change with anything in ``description``."""
+        return hashlib.sha256(json.dumps(self.description, sort_keys=True).encode()).hexdigest()
+
+    def _check_object(self, scene: PressScene) -> None:
+        dynamics, key = scene.object.dynamics, "object.dynamics"
+        if dynamics == "affine":
+            raise SpecError("a free body cannot be pressed to a depth", file=scene.source, key=key, value=dynamics)
+        if dynamics == "soft" and (self.sweep.physics != "ipc" or self.sweep.ranges.tilt != (0.0, 0.0)):
+            rule = 'a soft object needs physics = "ipc" and tilt_deg = [0, 0]: it is held at its top'
+            raise SpecError(rule, file=scene.source, key=key, value=dynamics)
+
+    def _check_reach(self, sensor: SensorSpec) -> None:
+        ranges, pad = self.sweep.ranges, sensor.gelpad
+        if not ranges.depth[1] < pad.thickness:
+            rule = f"must be less deep than the pad of {sensor.name} is thick, {pad.thickness * 1e3:.4g} mm"
+            raise self._error("depth_mm", ranges.depth, rule)
+        for axis, size in zip("xy", pad.size, strict=True):
+            ends: tuple[float, float] = getattr(ranges, axis)
+            if max(-ends[0], ends[1]) > 0.5 * size:
+                rule = f"must lie on the pad of {sensor.name}: {axis} in ±{0.5e3 * size:.4g} mm"
+                raise self._error(f"{axis}_mm", ends, rule)
+
+    def _check_markers(self, sensor: SensorSpec) -> None:
+        """Refuse shifts and turns of the pattern that take a marker out of the view, now and not at the press that draws them."""
+        largest = self.randomization.markers
+        if self.sweep.markers is not None and largest.moves_pattern:
+            ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])
+            shift, turn = largest.shift * ends[:, :2], largest.turn * ends[:, 2]
+            MarkerPattern.of(sensor, self.resolution(sensor), shift=shift, turn=turn)
+
+    def _error(self, key: str, ends: tuple[float, float], rule: str) -> RaytacError:
+        return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=[float(f"{v * 1e3:.6g}") for v in ends])
+
+
+def press_scene_of(scene: PressScene, ranges: Any) -> PressScene:
+    """A scene's object with the trajectory of a sweep: indent, then a shear and a twist where the sweep has any."""
+    stages = [StageSpec("indent", depth=ranges.depth[1])]
+    if ranges.shear != (0.0, 0.0):
+        stages.append(StageSpec("shear"))
+    if ranges.twist != (0.0, 0.0):
+        stages.append(StageSpec("twist"))
+    return replace(scene, trajectory=tuple(stages), source=None, physics=None, pad=None)
+
+
+def _bytes(shapes: Mapping[str, tuple[int, ...]], kinds: Mapping[str, ArrayKind]) -> int:
+    return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(kinds[name].dtype).itemsize for name, shape in shapes.items())
+
+
+def _sensor_digest(sensor: SensorSpec) -> str:
+    plain = replace(sensor, source=None, lights=replace(sensor.lights, source=None))
+    if plain.marker_motion is not None and hasattr(plain.marker_motion, "source"):
+        plain = replace(plain, marker_motion=replace(plain.marker_motion, source=None))
+    return hashlib.sha256(repr(plain).encode()).hexdigest()
+
+
+def _object_of(scene: PressScene) -> dict[str, Any]:
+    """Object and moving side without paths: a file goes in by its name and contents."""
+    params: Mapping[str, Any] = dict(scene.object.params)
+    if "path" in params:
+        file = Path(str(params["path"]))
+        params = {**params, "path": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    spec = scene.object
+    return {
+        "kind": spec.kind,
+        "params": params,
+        "position": list(spec.position),
+        "quaternion": list(spec.quaternion),
+        "dynamics": spec.dynamics,
+        "youngs_modulus": spec.youngs_modulus,
+        "poisson_ratio": spec.poisson_ratio,
+        "moves": scene.moves,
+    }

@@ -1,0 +1,257 @@
+"""From the presses of a shard to its arrays: what one worker does, on whatever machine it runs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from raytac.dataset.arrays import ARRAYS
+from raytac.dataset.plan import DatasetPlan, Presses, press_scene_of
+from raytac.errors import AssetError, BackendError, RaytacError
+from raytac.frame import TactileFrame
+from raytac.io.git_state import git_state
+from raytac.io.metrics import versions
+from raytac.observe.randomization import CameraDrift
+from raytac.sensor import NarrowContactWarning, TactileSensor
+from raytac.sensor.pad import load_pad
+from raytac.specs import PressScene, SensorSpec
+from raytac.specs.press import PADS
+
+__all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
+
+_KEPT = 4
+"""Sensors that a worker keeps built; each holds a renderer's scene."""
+_UNSETTLED = "the press did not settle, or its state is not finite"
+Row = dict[str, str | int | float | None]
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """What every worker of a run is told."""
+
+    plan: DatasetPlan
+    device: str = "auto"
+    batch: int = 16
+    """Presses that are computed at once."""
+
+
+@dataclass(frozen=True)
+class ShardResult:
+    """What came of one shard."""
+
+    shard: int
+    arrays: dict[str, np.ndarray]
+    """By name, of the presses that went well, in the order of their numbers; and those of ``SHARED``. Empty if none went well."""
+    rows: list[Row]
+    """One a press, failed or not: all columns of the manifest but those of the file."""
+    made_by: dict[str, str | int | float]
+    """Device, physics and optics, versions and state of the code."""
+    worker: str = ""
+    """Who rendered it; goes into no file."""
+
+
+@dataclass
+class _Built:
+    """A sensor with all that its shards share."""
+
+    sensor: TactileSensor
+    drift: CameraDrift | None
+    shared: dict[str, np.ndarray]
+
+
+class ShardRenderer:
+    """Renders shards of one plan, in any order; what a shard holds does not depend on those before.
+
+    .. code-block:: python
+
+        result = ShardRenderer(RenderJob(plan, device="cpu")).render(3)
+        result.arrays["rgb"]  # (N, H, W, 3)
+    """
+
+    def __init__(self, job: RenderJob) -> None:
+        self.job, self.plan = job, job.plan
+        self._scenes = [press_scene_of(scene, self.plan.sweep.ranges) for scene in self.plan.sweep.objects]
+        self._built: dict[tuple[int, int], _Built] = {}
+
+    def prepare(self, shard: int = 0) -> None:
+        """Build what a shard needs, so that a machine that cannot render says so at once.
+
+        Raises:
+            BackendError: a renderer, solver or device does not work here.
+        """
+        self._for(shard)
+
+    def render(self, shard: int) -> ShardResult:
+        """Press and image all presses of a shard; those that fail are in ``rows`` with their reason.
+
+        Raises:
+            BackendError: a renderer, solver or device does not work here.
+        """
+        presses, built = self.plan.presses(shard), self._for(shard)
+        arrays: dict[int, dict[str, np.ndarray]] = {}
+        notes: dict[int, Row] = {}
+        for which, scene in enumerate(self._scenes):
+            places = np.flatnonzero(presses.scene == which)
+            for start in range(0, len(places), self.job.batch):
+                chosen = places[start : start + self.job.batch]
+                frame, reasons = self._press(built, scene, presses[chosen])
+                made = self._arrays(built, frame, presses[chosen])
+                for b, place in enumerate(chosen.tolist()):
+                    own = {name: values[b] for name, values in made.items()}
+                    reason = reasons[b] or _not_finite(own)
+                    notes[place] = {"status": "failed" if reason else "ok", "reason": reason}
+                    if not reason:
+                        arrays[place] = own
+                        notes[place] |= _figures(frame, b)
+        order = sorted(arrays)
+        joined = {name: np.stack([arrays[place][name] for place in order]) for name in arrays[order[0]]} if order else {}
+        rows = [self._row(shard, presses, place, notes[place]) for place in range(len(presses))]
+        return ShardResult(shard, joined | built.shared if order else {}, rows, self._made_by(built))
+
+    # --- sensors ---------------------------------------------------------------------------------------------------------------
+
+    def _for(self, shard: int) -> _Built:
+        key = self.plan.variant(shard)
+        if key in self._built:
+            self._built[key] = self._built.pop(key)  # the last used comes last
+        else:
+            while len(self._built) >= _KEPT:
+                self._built.pop(next(iter(self._built)))
+            self._built[key] = self._build(self.plan.sensor(shard))
+        return self._built[key]
+
+    def _build(self, spec: SensorSpec) -> _Built:
+        plan, batch = self.plan, self.job.batch
+        sensor = TactileSensor(spec, **plan.sensor_options(batch), device=self.job.device)
+        rest = sensor.rest()  # before any press, whose placement of the pattern it would show
+        shared = {"grid_x": sensor.grid.x, "grid_y": sensor.grid.y, "rest_height": rest.surface.height[0]}
+        if rest.rgb is not None:
+            shared["rest_rgb"] = rest.rgb[0]
+        drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
+        return _Built(sensor, drift, shared)
+
+    # --- presses ---------------------------------------------------------------------------------------------------------------
+
+    def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
+        """Frame of B environments, of which the first are the presses; and the reason of each that failed, else an empty text."""
+        reasons = [""] * len(presses)
+        own = self._own(presses)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NarrowContactWarning)  # every press tells its contact_cells
+            try:
+                frame = built.sensor.press(scene, **own)
+            except (BackendError, AssetError):
+                raise
+            except RaytacError:
+                # One press that cannot be stops its batch: find it by itself, and let the others go on without.
+                for b in range(len(presses)):
+                    reasons[b] = self._reason(built.sensor, scene, presses[b : b + 1])
+                if not any(reasons):
+                    raise
+                refused = np.flatnonzero([bool(reason) for reason in reasons])
+                own["offsets"][refused] = np.nan
+                frame = built.sensor.press(scene, **own)
+        assert frame.failed is not None
+        for b in range(len(presses)):
+            if frame.failed[b] and not reasons[b]:
+                reasons[b] = _UNSETTLED
+        return frame, reasons
+
+    def _own(self, presses: Presses, batch: int | None = None) -> dict[str, Any]:
+        """Arguments of ``TactileSensor.press``; environments without a press are lost from the start."""
+        batch = self.job.batch if batch is None else batch
+
+        def filled(values: np.ndarray, rest: float = 0.0) -> np.ndarray:
+            out = np.full((batch, *values.shape[1:]), rest)
+            out[: len(values)] = values
+            return out
+
+        return {
+            "offsets": filled(np.stack([presses.x, presses.y], axis=1), np.nan),
+            "depths": filled(presses.press_depth, self.plan.sweep.ranges.depth[1]),
+            "rotations": filled(presses.rotations, 1.0),
+            "shears": filled(np.stack([presses.shear_x, presses.shear_y], axis=1)),
+            "twists": filled(presses.twist),
+            "seeds": [*presses.seed.tolist(), *[0] * (batch - len(presses))],
+        }
+
+    def _reason(self, sensor: TactileSensor, scene: PressScene, press: Presses) -> str:
+        """Why a press cannot be, found by trying it alone; empty if it can."""
+        own = self._own(press, 1)
+        del own["seeds"]
+        level, sweep = self.plan.sweep.pad or PADS[0], self.plan.sweep
+        try:
+            pad = load_pad(
+                sensor.spec, scene, physics=sweep.physics, level=level, device=self.job.device, pitch=sensor.pitch, **own
+            )
+            for _ in pad.run():
+                pass
+        except (BackendError, AssetError):
+            raise
+        except RaytacError as error:
+            return str(error)
+        return ""
+
+    def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
+        found: dict[str, Any] = {name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")}
+        surface = frame.surface
+        found |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
+        if "contact" in self.plan.sweep.outputs:
+            found["contact"] = surface.contact
+        if frame.rgb is not None:
+            found["rgb"] = self._drifted(built, frame.rgb, presses)
+        if frame.markers is not None:
+            m = frame.markers
+            found |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
+            found |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
+        return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in found.items()}
+
+    def _drifted(self, built: _Built, rgb: np.ndarray, presses: Presses) -> np.ndarray:
+        if built.drift is None:
+            return rgb
+        which = range(len(presses))
+        built.drift.reseed(which, presses.seed.tolist())
+        built.drift.reset(which)
+        return built.drift.apply(rgb)
+
+    # --- figures ---------------------------------------------------------------------------------------------------------------
+
+    def _row(self, shard: int, presses: Presses, place: int, note: Mapping[str, Any]) -> Row:
+        which, copy = self.plan.variant(shard)
+        row: Row = {f.name: getattr(presses, f.name)[place].item() for f in fields(presses) if f.name != "scene"}
+        row |= {"sensor": self.plan.sweep.sensors[which].name, "variant": copy}
+        return row | {"object": self._scenes[presses.scene[place]].name} | dict(note)
+
+    def _made_by(self, built: _Built) -> dict[str, str | int | float]:
+        sensor = built.sensor
+        return {"device": sensor.device_used, "mode": sensor.label, **versions(), **git_state()}
+
+
+def _figures(frame: TactileFrame, b: int) -> Row:
+    """Figures of one press for the manifest."""
+    found: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
+    if frame.wrench is not None:
+        names = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+        found |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
+    for name in ("contact_area", "contact_cells"):
+        values = getattr(frame, name)
+        if values is not None and np.isfinite(values[b]):
+            found[name] = float(values[b])
+    return found
+
+
+def _not_finite(arrays: Mapping[str, np.ndarray]) -> str:
+    """Which array of a press holds a number that is not finite, where it ought to; empty if none."""
+    lost = arrays.get("marker_visible")
+    for name, values in arrays.items():
+        if values.dtype.kind != "f":
+            continue
+        if name in ("markers", "markers_px") and lost is not None:
+            values = values[lost]
+        if not np.isfinite(values).all():
+            return f"{name} holds a number that is not finite"
+    return ""

@@ -1,0 +1,210 @@
+"""Render a data set into a folder: what is missing or damaged there, on the engine of one's choice."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from raytac.dataset.describe import FILE, describe, read_description, write_description
+from raytac.dataset.engines import ENGINES, render_here
+from raytac.dataset.manifest import check_pyarrow, write_manifest
+from raytac.dataset.plan import DatasetPlan
+from raytac.dataset.ray_engine import render_on_ray
+from raytac.dataset.renderer import RenderJob
+from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
+from raytac.errors import InputError
+
+__all__ = ["Check", "RunReport", "render_dataset", "verify_dataset"]
+
+_SPARE = 1.05
+"""The estimated size must fit this many times on the disk."""
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What a run did."""
+
+    folder: Path
+    rendered: int
+    """Shards that this run rendered; the others were there."""
+    presses: int
+    """Presses in these."""
+    failed: int
+    """Presses of the whole data set that failed."""
+    render_s: float
+    """Time from the first shard's start to the last one's end [s], with what workers load first."""
+    steady_presses_per_s: float | None
+    """Presses a second after the first shard came, when all is loaded; None if no more than that was rendered."""
+    device: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """What ``verify_dataset`` found."""
+
+    shards: int
+    wrong: dict[int, str]
+    """Shards that are not whole, with what is wrong."""
+
+
+def render_dataset(
+    plan: DatasetPlan,
+    folder: Path,
+    *,
+    engine: str = "local",
+    device: str = "auto",
+    batch: int = 16,
+    workers: int | None = None,
+    address: str | None = None,
+    compress: bool = False,
+    progress: bool = False,
+    say: Callable[[str], object] = lambda text: None,
+) -> RunReport:
+    """Render the shards that ``folder`` lacks, and write manifest and description.
+
+    Shards that are there are read and compared with their checksums; those that are whole stay. A run that is killed leaves whole
+    shards only, and the same call goes on with the others.
+
+    Args:
+        plan: what to render.
+        folder: of the data set; made if need be.
+        engine: one of ``ENGINES``: ``local``, in this process, or ``ray``.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        batch: presses that are computed at once.
+        workers, address: of Ray, see ``render_on_ray``.
+        compress: deflate the arrays; they then cannot be mapped into memory.
+        progress: a bar of presses on standard error, if that is a terminal.
+        say: is told what is found and done, one line at a time.
+
+    Raises:
+        InputError: a bad argument, a folder with another data set or in use by another run, or a disk without room enough.
+        BackendError: pyarrow, Ray, a renderer or a solver is missing or does not work.
+    """
+    if engine not in ENGINES:
+        raise InputError("engine", value=engine, rule="must be a known name", choices=ENGINES)
+    if batch < 1:
+        raise InputError("batch", value=batch, rule="must be a whole number >= 1")
+    if engine == "local" and (workers is not None or address is not None):
+        raise InputError("workers, address", value=(workers, address), rule="are settings of engine='ray'")
+    check_pyarrow()
+    folder = Path(folder)
+    with _alone(folder):
+        _check_same(folder, plan)
+        store = ShardStore(folder, plan.digest, compress=compress)
+        store.clear_partial()
+        records = _whole(store, plan, progress, say)
+        missing = [shard for shard in range(plan.shards) if shard not in records]
+        _check_room(folder, plan, missing, say)
+        write_description(folder, describe(plan, _ordered(records), None))
+        job = RenderJob(plan, device, batch)
+        start, done, first = time.perf_counter(), 0, None
+        if missing:
+            results = (
+                render_here(job, missing) if engine == "local" else render_on_ray(job, missing, workers=workers, address=address)
+            )
+            total = sum(len(record.rows) for record in records.values())
+            with tqdm(total=plan.sweep.count, initial=total, unit="press", disable=None if progress else True) as bar:
+                for result in results:
+                    records[result.shard] = store.write(result)
+                    done += len(result.rows)
+                    first = first or (time.perf_counter(), done)
+                    bar.update(len(result.rows))
+        took = time.perf_counter() - start
+        whole = _ordered(records)
+        write_description(folder, describe(plan, whole, write_manifest(folder, whole)))
+    failed = sum(row["status"] == "failed" for record in whole for row in record.rows)
+    steady = (done - first[1]) / (start + took - first[0]) if first is not None and done > first[1] else None
+    return RunReport(folder, len(missing), done, failed, took, steady, str(whole[-1].made_by["device"]))
+
+
+def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
+    """Compare every file of a data set with its checksum; needs no plan and changes nothing.
+
+    Raises:
+        InputError: no data set, or one whose manifest differs from its checksum.
+    """
+    from raytac.dataset.manifest import FILE as MANIFEST
+    from raytac.dataset.shard import sha256_of
+
+    found = read_description(folder)
+    manifest = Path(folder) / MANIFEST
+    if found["complete"] and (not manifest.is_file() or sha256_of(manifest) != found["manifest_sha256"]):
+        raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to mend it")
+    store = ShardStore(folder, found["plan_sha256"])
+    wrong = {}
+    for shard in tqdm(range(found["shards"]), unit="shard", disable=None if progress else True, leave=False):
+        record = store.read(shard)
+        if isinstance(record, str):
+            wrong[shard] = record
+    return Check(found["shards"], wrong)
+
+
+def _whole(store: ShardStore, plan: DatasetPlan, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
+    """Records of the shards that are there and whole."""
+    records = {}
+    for shard in tqdm(range(plan.shards), "checking", unit="shard", disable=None if progress else True, leave=False):
+        record = store.read(shard)
+        if isinstance(record, ShardRecord):
+            records[shard] = record
+        elif record != "missing":
+            say(f"{record}: rendered again")
+    if records:
+        say(f"{len(records)} of {plan.shards} shards are there and whole")
+    return records
+
+
+def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
+    return [records[shard] for shard in sorted(records)]
+
+
+def _check_same(folder: Path, plan: DatasetPlan) -> None:
+    if not (folder / FILE).is_file():
+        if (folder / FOLDER).is_dir() and any((folder / FOLDER).iterdir()):
+            raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
+        return
+    found = read_description(folder)
+    if found["plan_sha256"] != plan.digest:
+        changed = _differences(found["plan"], plan.description)
+        rule = (
+            f"holds another data set, which differs in {', '.join(changed) or 'its version'}: choose another folder, or remove it"
+        )
+        raise InputError("out", value=folder, rule=rule)
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    return [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
+
+
+def _check_room(folder: Path, plan: DatasetPlan, missing: list[int], say: Callable[[str], object]) -> None:
+    """Compare what is missing with the free disk; arrays that are to be compressed are counted in full."""
+    need, free = sum(plan.shard_bytes(shard) for shard in missing), shutil.disk_usage(folder).free
+    if missing:
+        say(f"{len(missing)} of {plan.shards} shards to render: about {need / 1e9:.3g} GB, {free / 1e9:.3g} GB free")
+    if need * _SPARE > free:
+        rule = f"has {free / 1e9:.3g} GB free, and the data set takes about {need / 1e9:.3g} GB"
+        raise InputError("out", value=folder, rule=rule)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep other runs out of the folder; the lock goes with the process, however it ends."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise InputError("out", value=folder, rule=f"must be a folder that can be written ({error.strerror})") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError("out", value=folder, rule="is in use by another run") from error
+        yield
