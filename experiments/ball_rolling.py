@@ -7,19 +7,17 @@ The arm is moved by differential inverse kinematics and feels where the ball is:
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from experiments.rolling_control import PHASES, RollingController, Strokes
+from experiments.running import recorded, run
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.metrics import Metric
 from raytac.io.options import CommonOptions, parse_resolution
 from raytac.world.world import TactileWorld
 
@@ -67,15 +65,12 @@ class Record:
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     for name in args.physics:
         if name not in OPTICS:
             raise RaytacError(f"--physics {name}: must be one of {', '.join(OPTICS)}")
-    out = args.out if args.out is not None else Path("runs") / "ball_rolling"
     if args.quick:
         args = replace(args, goals_mm=((2.0, 1.0),), optics="phong", resolution="64x48", steps=150)
-    metrics: dict[str, Metric] = {"experiment": "ball_rolling", "seed": args.seed}
-    with result_folder(out) as folder:
+    with recorded(args, "ball_rolling") as (folder, metrics):
         for name in args.physics:
             world = make_world(args, name)
             controller, record = roll(world, args)
@@ -88,8 +83,6 @@ def main(args: Args) -> None:
                 f"{name}: {found['goals_reached']} of {len(args.goals_mm)} goals, {found['goal_error_mm']:.2f} mm from the last, "
                 f"{found['steps_per_s']:.1f} steps/s"
             )
-        write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})
-    print(f"written: {out}")
 
 
 OPTICS = {"rigid": "taxim", "ipc": "raytrace"}
@@ -247,7 +240,4 @@ def film(record: Record, path: Path, strip: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

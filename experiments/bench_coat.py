@@ -6,6 +6,11 @@ An edge (the cube of the scene "edge", along x, 0.8 mm deep) and a bar 3 mm wide
 Mini's pad. Both are the same all along x in the middle, so that a pad can be refined across y alone until nothing changes: the truth
 is the vertices of such a mesh, with cells of ``--cell-um`` at the sharp line (nothing is interpolated or corrected).
 
+``--shapes ball``: a ball (4 mm) pressed lightly, to 0.33 N and to 0.3 mm, and what markers see of it. The truth is a pad with cells of four
+times ``--cell-um`` in the middle, its solver's vertices; markers are 285 points on a grid of 1 mm that ride on the coat.
+``ball.<load>.<level>.markers_um``, ``markers_most_um``: mean and greatest sideways distance of a marker from the truth;
+``mesh_markers_um`` …: the same on the solver's vertices; ``force_n``, ``contact_mm2``; with ``truth`` for a level: its own motion.
+
 ``<shape>.<level>.near_um``, ``ring_um``, ``far_um``: root mean square of the shown height less the truth, on the line x = 0, within 1 mm
 of the edge or rim, 1 to 2 mm, 2 to 4 mm; ``mesh_near_um`` …: the same of the solver's vertices joined by straight lines, which is what
 there was to see; ``force_n`` of each, and ``truth_force_n``.
@@ -28,14 +33,17 @@ from raytac.gel.coat_mesh import CoatMesh
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
+from raytac.markers.surface import bind
 from raytac.physics.soft import SoftPad
-from raytac.physics.soft_mesh import PadMesh, pad_mesh
+from raytac.physics.soft_mesh import PadLevel, PadMesh, pad_mesh
 from raytac.sensor import PADS
 from raytac.specs import SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
 SHAPES = {"edge": 0.0, "bar": 1.5e-3}
 """y of the sharp line [m]."""
+BALL = "ball"
+LIGHT = {"force": StageSpec("indent", force=0.33), "depth": StageSpec("indent", depth=0.3e-3)}
 RANGES = {"near": (0.02e-3, 1e-3), "ring": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
 _GROWTH, _DOWN = 0.14, 0.25
 """How much a cell grows for each unit of distance from the sharp line, across and downwards."""
@@ -48,7 +56,7 @@ class Args(CommonOptions):
     levels: str = "coarse,medium"
     """Levels to measure, joined by commas."""
     shapes: str = ",".join(SHAPES)
-    """Of edge, bar."""
+    """Of edge, bar, ball."""
     cell_um: float = 60.0
     """Cells of the truth at the sharp line [µm]."""
     sensor: str = "gelsight_mini"
@@ -57,13 +65,15 @@ class Args(CommonOptions):
     def run(self) -> int:
         start = time.perf_counter()
         levels, shapes = parse_names(self.levels, "levels"), parse_names(self.shapes, "shapes")
-        for value, name, choices in [(v, "levels", PADS) for v in levels] + [(v, "shapes", SHAPES) for v in shapes]:
+        for value, name, choices in [(v, "levels", PADS) for v in levels] + [(v, "shapes", (*SHAPES, BALL)) for v in shapes]:
             if value not in choices:
                 raise InputError(name, value=value, rule="must be known", choices=tuple(choices))
         spec = load_sensor(self.sensor)
         metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um, "seed": self.seed, "device": "cpu"}
         with result_folder(self.out or Path("runs") / "bench_coat", ("metrics.json",)) as folder:
-            for shape in shapes:
+            if BALL in shapes:
+                metrics |= marked(spec, levels, 4e-6 * self.cell_um)
+            for shape in (shape for shape in shapes if shape != BALL):
                 mesh = refined(spec, SHAPES[shape], self.cell_um * 1e-6)
                 truth, metrics[f"{shape}.truth_force_n"], _ = pressed(spec, shape, mesh)
                 metrics[f"{shape}.truth_vertices"] = len(mesh.tets.vertices)
@@ -96,6 +106,42 @@ def pressed(spec: SensorSpec, shape: str, mesh: PadMesh) -> tuple[Section, float
     line = pad.solver.scene.coat("pad")[0].reshape(rows, columns, 3)[:, columns // 2]
     shown = pad.surface(state).height[0][:, pad.grid.shape[1] // 2].astype(float)
     return (line[:, 1], line[:, 2]), float(state.normal_force[0]), (pad.grid.y, shown)
+
+
+def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, Metric]:
+    """Markers under a ball pressed lightly, off those of a pad with cells of ``cell`` [m] in the middle."""
+    target = ObjectSpec("sphere", {"radius": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05)
+    probes = np.stack(np.meshgrid(np.arange(-9, 10) * 1e-3, np.arange(-7, 8) * 1e-3), axis=-1).reshape(-1, 2)
+    truth_mesh = pad_mesh(spec.gelpad, PadLevel(2.9 * cell, max(round(2.2e-3 / cell), 3), 7.0, 5.0, cell / 25.0))
+    metrics: dict[str, Metric] = {}
+    for load, stage in LIGHT.items():
+        truth = np.zeros(0)
+        for level in ("truth", *levels):
+            mesh = truth_mesh if level == "truth" else pad_mesh(spec.gelpad, level)
+            pad = SoftPad(spec, PressScene(BALL, target, (stage,)), pitch=0.1e-3, pad=mesh)
+            state = pad.peak(pad.run())
+            surface, reading = pad.surface(state), state.reading
+            assert reading is not None and surface.coat is not None
+            vertices, weights = bind(mesh.coat, probes)
+            solver, shown = (
+                (weights[..., None] * (at[0] - mesh.coat.rest)[vertices]).sum(axis=1)[:, :2]
+                for at in (reading.vertices, surface.coat.positions)
+            )
+            start = f"{BALL}.{load}.{level}"
+            if level == "truth":
+                truth, pairs = solver, (("", np.zeros_like(solver)),)
+                metrics[f"{start}.vertices"] = len(mesh.tets.vertices)
+            else:
+                pairs = (("", shown), ("mesh_", solver))
+            for kind, found in pairs:
+                off = 1e6 * np.linalg.norm(found - truth, axis=1)
+                metrics[f"{start}.{kind}markers_um"], metrics[f"{start}.{kind}markers_most_um"] = (
+                    float(off.mean()),
+                    float(off.max()),
+                )
+            metrics[f"{start}.force_n"] = float(state.normal_force[0])
+            metrics[f"{start}.contact_mm2"] = 1e6 * float(surface.contact.sum() * np.prod(surface.grid.pitch))
+    return metrics
 
 
 def scene(shape: str, folder: Path) -> PressScene:

@@ -7,8 +7,9 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
 
 - ``soft.<level>.steps_per_s``: solver step, reading and ``fast`` image at the sensor's resolution; median of the steps in contact, over
   ``--presses`` presses, the first not counted (it compiles). ``…best_steps_per_s``: the fastest press, for a machine that others use too.
-- ``soft.<level>.height_um``, ``…around_um``: root mean square of the height against the refined solution where that touches, and within
-  3 mm of the axis where it does not; ``--refined`` computes it (29,000 vertices; minutes), else the last level asked for stands in.
+- ``soft.<level>.height_um``, ``…around_um``: root mean square of the height against the refined solution where that touches (nearly 0 by
+  construction: every level is laid on the same object there), and within 3 mm of the axis where it does not; ``--refined`` computes it
+  (29,000 vertices; minutes), else the last level asked for stands in.
 - ``soft.<level>.imprint_error``: deepest imprint against the commanded depth. ``…force_n``: what the depth takes, beside ``law.force_n`` of
   the bonded layer (Dimitriadis et al. 2002), which is an approximation itself.
 - ``force.driven_error``, ``force.weight_error``: force on the case (bonded vertices) when 1 N is asked for; force on the coat under a free

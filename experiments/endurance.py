@@ -18,17 +18,16 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
-import tyro
 
 import ipc
 from experiments.grasp_control import GraspController, smooth
+from experiments.running import run
 from raytac.errors import RaytacError
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
@@ -282,7 +281,4 @@ def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: flo
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

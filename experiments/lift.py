@@ -9,19 +9,16 @@ friction coefficient between object and gel where it is not the gel's own.
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from experiments.grasp_control import GraspController, smooth
+from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
@@ -83,22 +80,19 @@ class Record:
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     if args.quick:
         args = replace(args, height_mm=0.5, gap_mm=0.2)
-    out = args.out if args.out is not None else Path("runs") / "lift"
     runs = [
         (case, physics)
         for case in args.cases
         for physics in args.physics
         if not (physics == "rigid" and kind_of(case)[0] == "soft")
     ]
-    metrics: dict[str, Metric] = {"experiment": "lift", "seed": args.seed, "force_n": args.force, "height_mm": args.height_mm}
-    with result_folder(out) as folder:
+    with recorded(args, "lift") as (folder, metrics):
+        metrics |= {"force_n": args.force, "height_mm": args.height_mm}
         worst: list[dict[str, float]] = []
         for case, physics in runs:
             world, times = make_world(args, case, physics), times_of(args)
-            metrics["device"] = args.device
             record, pictures = lift(world, args, times)
             found = summary(world, record, times)
             name = f"{case.replace(':', '_mu').replace('.', 'p')}.{physics}"
@@ -115,8 +109,6 @@ def main(args: Args) -> None:
         if worst:
             metrics["lift.slip_mm"] = max(found["slip_mm"] for found in worst)
             metrics["lift.held_s"] = min(found["held_s"] for found in worst)
-        write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})
-    print(f"written: {out}")
 
 
 def kind_of(case: str) -> tuple[str, float | None]:
@@ -267,7 +259,4 @@ def plot(record: Record, times: Times, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

@@ -2,11 +2,16 @@
 
     python experiments/physics_sheet.py --out runs/physics_sheet              # both pads, eight scenes: some minutes on two cores
     python experiments/physics_sheet.py --pad medium --out runs/physics_sheet_medium
+    python experiments/physics_sheet.py --scenes sphere --against fine --out runs/sphere_against_fine   # the levels against a finer one
 
 One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's.
 ``metrics.json``: ``<scene>.<physics>.`` ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``force_n``, ``contact_mm2``,
 ``press_s``; and ``<scene>.contact_um``, ``ring_um``, ``image``: height of the simulated pad less that of the rigid one, root mean square
 where both touch and within 2 mm of that, and mean absolute difference of the images (of 255).
+
+``--against LEVEL`` draws nothing and compares heights of every level below with that one: ``<scene>.<level>.`` ``contact_um`` (where both
+touch: small by construction, since every level is laid on the object there), ``near_um`` and ``ring_um``: within 1 mm of the contact of
+either, and 1 to 2 mm from it; ``force_n`` of all.
 """
 
 from __future__ import annotations
@@ -22,6 +27,7 @@ import tyro
 
 from raytac.errors import InputError, RaytacError
 from raytac.frame import TactileFrame
+from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
@@ -44,6 +50,8 @@ class Args(CommonOptions):
     """Level of the simulated pad."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
+    against: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS[1:]) + "}")] = ""
+    """Compare the levels of the simulated pad with this one instead of the two physics."""
     quick: bool = False
     """Small images of the first scene only: enough to see that all works."""
 
@@ -52,7 +60,11 @@ class Args(CommonOptions):
         names = parse_names(self.scenes, "scenes")
         if self.pad not in PADS:
             raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
+        if self.against and self.against not in PADS[1:]:
+            raise InputError("against", value=self.against, rule="must be a level with one below it", choices=PADS[1:])
         names = names[:1] if self.quick else names
+        if self.against:
+            return self._levels(names, start)
         out = self.out or Path("runs") / "physics_sheet"
         with result_folder(out, ("sheet.png", "metrics.json")) as folder:
             metrics: dict[str, Metric] = {"command": "physics_sheet", "pad": self.pad, "seed": self.seed}
@@ -84,6 +96,40 @@ class Args(CommonOptions):
             write_metrics(folder / "metrics.json", metrics | versions((*VERSIONED, "warp-lang")))
         print(out / "sheet.png")
         return 0
+
+    def _levels(self, names: tuple[str, ...], start: float) -> int:
+        out = self.out or Path("runs") / "physics_levels"
+        with result_folder(out, ("metrics.json",)) as folder:
+            metrics: dict[str, Metric] = {"command": "physics_sheet", "against": self.against, "seed": self.seed}
+            for name in names:
+                surfaces = {}
+                for level in PADS[PADS.index(self.against) :: -1]:
+                    sensor = TactileSensor(
+                        self.sensor, physics="ipc", pad=level, outputs=("height", "wrench"), device=self.device, seed=self.seed
+                    )
+                    frame = sensor.press(load_press(name))
+                    surfaces[level] = frame.surface
+                    metrics[f"{name}.{level}.force_n"] = measured(frame)["force_n"]
+                    metrics["device"] = sensor.device_used
+                    if level != self.against:
+                        found = levels_apart(surfaces[level], surfaces[self.against])
+                        metrics |= {f"{name}.{level}.{key}": value for key, value in found.items()}
+                    print(f"{name}, {level}: done after {time.perf_counter() - start:.0f} s", flush=True)
+            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
+            write_metrics(folder / "metrics.json", metrics)
+        for key, value in metrics.items():
+            if isinstance(value, float):
+                print(f"{key} = {value:.4g}")
+        return 0
+
+
+def levels_apart(one: GelSurface, truth: GelSurface) -> dict[str, Metric]:
+    """Root mean square height of a pad less that of another one [µm]: where both touch, within 1 mm of that, and 1 to 2 mm from it."""
+    off = 1e6 * (one.height[0].astype(float) - truth.height[0])
+    either = one.contact[0] | truth.contact[0]
+    near, ring = (widened(either, reach, one.grid.pitch) for reach in (0.5 * RING, RING))
+    where = {"contact_um": one.contact[0] & truth.contact[0], "near_um": near & ~either, "ring_um": ring & ~near}
+    return {key: float(np.sqrt((off[mask] ** 2).mean())) if mask.any() else float("nan") for key, mask in where.items()}
 
 
 def measured(frame: TactileFrame) -> dict[str, Metric]:

@@ -31,7 +31,7 @@ from raytac.observe import MODALITIES, ObservationSettings
 from raytac.report.machine import machine
 
 if TYPE_CHECKING:
-    from experiments.ppo_training import Evaluation, Recipe
+    from experiments.ppo_learner import Evaluation, Recipe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ def _recipe(args: Args) -> Recipe | None:
     from raytac.envs.scripted import SCRIPTED
 
     if args.policy != "scripted":
-        from experiments.ppo_training import Checkpoint
+        from experiments.ppo_learner import Checkpoint
 
         saved = Checkpoint.load(Path(args.policy)).recipe
         return replace(saved, processes=1, num_envs=args.num_envs, device="cpu" if args.device == "auto" else args.device)
@@ -111,7 +111,7 @@ def _recipe(args: Args) -> Recipe | None:
 
 def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
     """Over held-out seeds."""
-    from experiments.ppo_training import HELD_OUT, KINDS, Checkpoint, Evaluation, Learner, evaluate
+    from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Evaluation, Learner, evaluate
     from raytac.envs.scripted import SCRIPTED
 
     if recipe is not None:
@@ -136,7 +136,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
 
 def _frames(args: Args, recipe: Recipe | None) -> Iterator[np.ndarray]:
     """Pictures of one episode, one a step."""
-    from experiments.ppo_training import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
+    from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
     from raytac.envs.scripted import SCRIPTED
 
     seed = HELD_OUT + 2 * 10**6 + args.seed

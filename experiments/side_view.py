@@ -83,11 +83,11 @@ def draw_strip(shots: Sequence[Snapshot], path: Path, count: int = 6) -> None:
     from matplotlib.figure import Figure
 
     chosen = [shots[i] for i in np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))]
-    figure = Figure(figsize=(2.6 * len(chosen), 3.2), layout="constrained")
+    figure = Figure(figsize=(2.6 * len(chosen), 3.2), layout="compressed")
     for axes, shot in zip(np.atleast_1d(figure.subplots(1, len(chosen), sharey=True)), chosen, strict=True):
         _draw(axes, shot, _limits(shots))
     figure.axes[0].set_ylabel("z [mm]", fontsize="x-small")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 def film(shots: Sequence[Snapshot], path: Path) -> None:

@@ -16,7 +16,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,10 @@ RECIPES: dict[str, dict[str, Any]] = {
     "RollBall": {"steps": 400_000, "history": 3},
 }
 """What differs from ``Recipe``'s own, by task."""
+_TUNED = (
+    "steps", "teacher_steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy", "minibatch",
+)  # fmt: skip
+"""Fields of ``Recipe`` that options may change."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +66,8 @@ class Args(CommonOptions):
     """Episodes of the last evaluation, on other held-out seeds."""
     most_s: float | None = None
     """Begin nothing that would not be done by so many seconds from the start (judged by the last segment); resume later."""
+    teacher_steps: int | None = None
+    """Of the steps, so many at first imitate the scripted policy, which knows the state: minutes instead of hours."""
     rollout: int | None = None
     learning_rate: float | None = None
     gamma: float | None = None
@@ -71,7 +77,7 @@ class Args(CommonOptions):
     epochs: int | None = None
     entropy: float | None = None
     minibatch: int | None = None
-    """These nine: of ``experiments.ppo_training.Recipe``; the task's own if not given."""
+    """These nine: of ``experiments.ppo_learner.Recipe``; the task's own if not given."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ def main(args: Args) -> dict[str, Metric]:
         raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
     kinds = parse_names(args.tactile, "tactile")
     seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
-    from experiments.ppo_training import tactile_settings
+    from experiments.ppo_learner import tactile_settings
 
     for kind in kinds:
         tactile_settings(kind)  # so that an unknown modality is told before anything is trained
@@ -141,12 +147,12 @@ def _train(job: _Job) -> None:
     """One training, up to its end or to the time that is given."""
     import torch
 
-    from experiments.ppo_training import Recipe, Training, evaluate
+    from experiments.ppo_learner import Recipe, evaluate
+    from experiments.ppo_training import Training
 
     torch.set_num_threads(1)
     args = job.args
-    given = ("steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy", "minibatch")
-    told = {name: getattr(args, name) for name in given if getattr(args, name) is not None}
+    told = {f.name: getattr(args, f.name) for f in fields(Recipe) if f.name in _TUNED and getattr(args, f.name) is not None}
     device = "cpu" if args.device == "auto" else args.device
     recipe = Recipe(
         args.task, job.tactile, job.seed, **{**RECIPES[args.task], **told},

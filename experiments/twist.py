@@ -7,19 +7,17 @@ The least gap between surfaces and the least det F of any tetrahedron are kept o
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from experiments.grasp_control import GraspController, smooth
+from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.metrics import Metric
 from raytac.io.options import CommonOptions
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld
@@ -73,25 +71,20 @@ class Record:
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     if args.quick:
         args = replace(args, twist_deg=5.0, stretch_mm=0.5, rest_s=0.02, force=1.0, gap_mm=0.2)
-    out = args.out if args.out is not None else Path("runs") / "twist"
-    with result_folder(out) as folder:
+    with recorded(args, "twist") as (folder, metrics):
         world = make_world(args)
         record, pictures, times = twist(world, args)
         found = summary(record, times)
-        metrics: dict[str, Metric] = {"experiment": "twist", "seed": args.seed, "device": args.device}
         metrics |= {f"twist.{key}": value for key, value in found.items()}
         plot(record, times, folder / "twist.png")
         draw_strip(pictures, folder / "twist_strip.png")
         film(pictures, folder / "twist.gif")
-        write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})
     print(
         f"least gap {found['min_gap_m']:.2e} m, least det F {found['min_det_f']:.3f}, longest {found['longest_mm']:.1f} mm, "
         f"twisted by {found['twisted_deg']:.0f} degrees, {'snapped back' if found['snapped'] else 'still held'}"
     )
-    print(f"written: {out}")
 
 
 def make_world(args: Args) -> TactileWorld:
@@ -217,7 +210,4 @@ def plot(record: Record, times: tuple[float, ...], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

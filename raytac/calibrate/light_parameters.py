@@ -1,4 +1,4 @@
-"""What a fit of lights varies: every LED's place, aim, lobe and power, and the camera's response; all as one vector with bounds."""
+"""What a fit of lights varies: every LED's place, aim, lobe and power, the case's even glow, and the camera's response."""
 
 from __future__ import annotations
 
@@ -11,29 +11,33 @@ from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 
-__all__ = ["CEILING", "CHANNELS", "LightParameters", "channels", "darkest", "leds_at_walls"]
+__all__ = ["CEILING", "CHANNELS", "LightParameters", "darkest", "leds_at_walls", "with_parameters"]
 
 CHANNELS = ("red", "green", "blue")
 SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
-"""Outward direction (x, y) of the wall that the LEDs of a layer stay at."""
-SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
-"""Outward direction (x, y) of the wall that the LEDs of a layer stay at."""
+"""Outward direction (x, y) of the wall that the LEDs of a layer start at."""
 DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
 """Highest z [mm] of an LED: below gel and a support plate of 1 mm, so that ``refraction.model = "slab"`` stays possible."""
+REFERENCE_DISTANCE = 10e-3
+"""Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
 
 @dataclass(frozen=True)
 class LightParameters:
-    """``leds`` (L, 6): x, y, z [mm], azimuth, elevation [rad], lobe; ``power`` (L, 3): own channel [W/sr], the other two relative to it;
-    ``response`` (6,): gamma, stray light of each channel over that of its darkest background pixel, a₁ and a₂ of the vignette
-    1 + a₁r² + a₂r⁴. ``template``: the light file that names, layers and sizes come from."""
+    """What a fit varies of lights and camera, as arrays."""
 
     template: LightsSpec
+    """The light file that names, layers and sizes come from."""
     leds: np.ndarray
+    """(L, 6): x, y, z [mm], azimuth, elevation [rad], lobe."""
     power: np.ndarray
+    """(L, 3): what a coat at ``REFERENCE_DISTANCE`` that faces the LED reflects by its diffuse lobe, in full scales."""
+    glow: np.ndarray
+    """(3,): even irradiance from the case over that of the LED at that distance, for the LEDs of each layer of ``CHANNELS``."""
     response: np.ndarray
+    """(6,): gamma, stray light of each channel over that of its darkest background pixel, a₁ and a₂ of the vignette 1 + a₁r² + a₂r⁴."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -45,64 +49,57 @@ class LightParameters:
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
-                raise InputError(
-                    "led.layer", value=led.layer, rule="must be a camera channel, the LED's colour", choices=CHANNELS
-                )
+                rule = "must be a camera channel, the LED's colour"
+                raise InputError("led.layer", value=led.layer, rule=rule, choices=CHANNELS)
             x, y, z = led.axis
-            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(z), led.lobe])
-            own, *others = (led.power[c] for c in channels(led))
-            power.append([own, *(other / max(own, 1e-12) for other in others)])
+            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe])
+            power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
-        stray = np.array(response.black_level) / darkest(background, response.gamma)
+        stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
+        glow = [max((led.glow for led in sensor.lights.leds if led.layer == c), default=0.0) * _GLOW for c in CHANNELS]
         a1, a2, _ = response.vignetting
-        return cls(sensor.lights, np.array(leds), np.array(power), np.array([response.gamma, *stray, a1, a2]))
+        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), np.array([response.gamma, *stray, a1, a2]))
 
-    def flat(self) -> np.ndarray:
-        return np.concatenate([self.leds.ravel(), self.power.ravel(), self.response])
+    @property
+    def layer(self) -> np.ndarray:
+        """Index in ``CHANNELS`` of every LED's layer, (L,)."""
+        return np.array([CHANNELS.index(led.layer) for led in self.template.leds])
 
-    def at(self, x: np.ndarray) -> LightParameters:
-        """The parameters of a vector as ``flat`` gives it."""
-        cut = self.leds.size
-        return LightParameters(self.template, x[:cut].reshape(-1, 6), x[cut:-6].reshape(-1, 3), x[-6:])
-
-    def moved(self, leds: np.ndarray) -> LightParameters:
-        return dataclasses.replace(self, leds=leds)
-
-    def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Power by LED and channel (L, 3) [W/sr], and its slope by each of the LED's three parameters (L, 3, 3)."""
-        power, slope = np.zeros((len(self.leds), 3)), np.zeros((len(self.leds), 3, 3))
-        for k, (led, (main, a, b)) in enumerate(zip(self.template.leds, self.power, strict=True)):
-            own, first, second = channels(led)
-            power[k, [own, first, second]] = main, main * a, main * b
-            slope[k, 0, [own, first, second]] = 1, a, b
-            slope[k, 1, first] = slope[k, 2, second] = main
-        return power, slope
-
-    def lights(self, powers: np.ndarray | None = None) -> LightsSpec:
-        """The light file, with these powers or other ones (L, 3)."""
-        leds = []
-        for led, row, w in zip(self.template.leds, self.leds, self.powers()[0] if powers is None else powers, strict=True):
+    def lights(self, sensor: SensorSpec) -> LightsSpec:
+        """The light file, for the coat and exposure of ``sensor``."""
+        leds, scale = [], full_scale(sensor)
+        for led, row, power, layer in zip(self.template.leds, self.leds, self.power, self.layer, strict=True):
             flat, azimuth = np.cos(row[4]), row[3]
-            axis = (float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4])))
-            place, power = (row[0] / 1e3, row[1] / 1e3, row[2] / 1e3), (float(w[0]), float(w[1]), float(w[2]))
-            leds.append(dataclasses.replace(led, position=tuple(map(float, place)), axis=axis, lobe=float(row[5]), power=power))
+            leds.append(
+                dataclasses.replace(
+                    led,
+                    position=(float(row[0] / 1e3), float(row[1] / 1e3), float(row[2] / 1e3)),
+                    axis=(float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4]))),
+                    lobe=float(row[5]),
+                    power=tuple(map(float, power / scale)),
+                    glow=float(self.glow[layer] / _GLOW),
+                )
+            )
         return LightsSpec(tuple(leds))
 
-    def bounds(self, sensor: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest parameters: an LED stays at its wall and looks at most 75 degrees aside of straight across."""
-        low, high = [], []
-        half = 5e2 * np.array(sensor.case.size)
-        for led, row in zip(self.template.leds, self.leds, strict=True):
-            out = np.array(SIDES[led.layer])
-            across = np.arctan2(-out[1], -out[0])
-            across += 2 * np.pi * np.round((row[3] - across) / (2 * np.pi))
-            low.append([*np.where(out > 0, 0.6 * half, 0.1 - half), -24.0, across - 1.31, -1.2, 1.0])
-            high.append([*np.where(out < 0, -0.6 * half, half - 0.1), CEILING, across + 1.31, 1.0, 15.0])
-        shares = np.tile([0.0, 0.0, 0.0], len(low)), np.tile([1.0, 0.5, 0.5], len(low))
-        return (
-            np.r_[np.ravel(low), shares[0], 1.0, np.zeros(3), -2.0, 0.0],
-            np.r_[np.ravel(high), shares[1], 2.4, np.full(3, DARKEST), 0.0, 1.2],
-        )
+
+_GLOW = np.pi * REFERENCE_DISTANCE**2
+"""An even radiance G all over the hemisphere irradiates with π G; an LED of intensity I at the distance d with I / d²."""
+
+
+def full_scale(sensor: SensorSpec) -> np.ndarray:
+    """Full scales that a coat at ``REFERENCE_DISTANCE`` shows of an LED of 1 W/sr by its diffuse lobe, by channel (3,)."""
+    coat, response = sensor.coat, sensor.response
+    diffuse = (1 - coat.specular) * np.array(coat.reflectance) / np.pi
+    return response.exposure * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
+
+
+def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
+    """The sensor with fitted lights and response; ``background`` [levels] as for ``LightParameters.of``. Not checked."""
+    gamma, *stray, a1, a2 = map(float, p.response)
+    black = np.array(stray) * darkest(background, gamma)
+    response = dataclasses.replace(sensor.response, gamma=gamma, black_level=tuple(map(float, black)), vignetting=(a1, a2, 0.0))
+    return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 
 def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
@@ -111,7 +108,7 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
-    """A start for a fit: LEDs along the walls, near the gel's height, aimed across the pad and away from it.
+    """A start for a fit: LEDs along the walls, near the gel's height, aimed across the pad and towards the camera.
 
     Raises:
         InputError: other than three whole numbers >= 1 joined by commas.
@@ -133,15 +130,9 @@ def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
                     layer=layer,
                     position=(float(place[0]), float(place[1]), -7.0e-3),
                     axis=tuple(map(float, axis / np.linalg.norm(axis))),  # type: ignore[arg-type]
-                    size=(1.5e-3, 2.4e-3),
+                    size=(2.0e-3, 1.0e-3),
                     lobe=2.5,
                     power=tuple(map(float, 5e-5 / count * own)),  # type: ignore[arg-type]
                 )
             )
     return LightsSpec(tuple(leds))
-
-
-def channels(led: LedSpec) -> tuple[int, int, int]:
-    """The LED's own channel, then the other two."""
-    own = CHANNELS.index(led.layer)
-    return own, *(c for c in range(3) if c != own)  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""Photographs of ball presses, and the gel surfaces that belong to their contact circles."""
+"""Photographs of ball presses, as floats in 8-bit levels, and what those levels mean in linear light."""
 
 from __future__ import annotations
 
@@ -8,30 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
-from raytac.calibrate.presses import read_presses
+from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.errors import InputError
-from raytac.gel.elastic import PYRAMID_SIGMAS, ElasticSurround
-from raytac.gel.object_height import object_height
-from raytac.gel.pad import rest_height
-from raytac.gel.part import primitive
-from raytac.gel.surface import GelSurface, PadGrid
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Photographs", "decode", "encode", "press_balls", "read_photographs"]
+__all__ = ["Photographs", "decode", "encode", "photographs_of", "read_photographs"]
 
 
 @dataclass(frozen=True)
 class Photographs:
     """Images in 8-bit levels, as floats: ``background`` (H, W, 3), ``presses`` (N, H, W, 3); ``circles`` (N, 3): x, y, radius [px] at the
-    sensor's resolution; ``radius``: of the ball [m]."""
+    sensor's resolution; ``radius`` (N,): of the balls [m]."""
 
     background: np.ndarray
     presses: np.ndarray
     circles: np.ndarray
-    radius: float
+    radius: np.ndarray
 
     def take(self, index: np.ndarray) -> Photographs:
-        return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index])
+        return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
 
     def shrunk(self, factor: int) -> Photographs:
         """Mean of every ``factor`` × ``factor`` pixels."""
@@ -60,49 +55,33 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
     return (levels / 255) ** gamma
 
 
-def read_photographs(folder: Path, sensor: SensorSpec) -> Photographs:
-    """The fully visible presses of a data set that labels its circles, at the sensor's own resolution.
+def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
+    """The fully visible presses, at the sensor's own resolution.
 
     Raises:
-        InputError: no such data set, images of another size than the sensor's, more than one ball, or no fully visible press.
-        CalibrationError: a missing or malformed file.
+        InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
     """
-    presses = read_presses(folder)
-    presses = presses.take(presses.fully_visible)
-    balls = sorted({f"{2e3 * radius:.4g} mm" for radius in presses.ball_radius})
-    if len(balls) != 1:
-        raise InputError("data", value=balls, rule="must hold fully visible presses of one ball")
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
         raise InputError("data", value=presses.resolution, rule=rule)
+    presses = presses.take(presses.fully_visible)
+    if not len(presses):
+        raise InputError("data", value="0 presses", rule="must hold a press whose contact circle lies in the image")
+    widest = presses.circles[:, 2] * sensor.camera.pixel_pitch[0] / presses.ball_radius
+    if (widest >= 1).any():
+        k = int(np.argmax(widest))
+        across, ball = (2e3 * length for length in (widest[k] * presses.ball_radius[k], presses.ball_radius[k]))
+        rule = f"must be smaller than the ball, which has {ball:.4g} mm"
+        raise InputError(f"circle of press {presses.names[k]}", value=f"{across:.4g} mm across", rule=rule)
     background, images = (image.astype(np.float32) for image in (presses.background, presses.images))
-    return Photographs(background, images, presses.circles, float(presses.ball_radius[0]))
+    return Photographs(background, images, presses.circles, presses.ball_radius)
 
 
-def press_balls(
-    sensor: SensorSpec, grid: PadGrid, shots: Photographs, depth_factor: float = 1.0, scale: float = 1.0
-) -> GelSurface:
-    """The pad at rest (first environment) and pressed by the ball at each labelled circle.
+def read_photographs(data: Path, sensor: SensorSpec) -> Photographs:
+    """``photographs_of`` the presses of a data set that labels its circles.
 
-    A ball of radius R overlaps a dome of radius R_d in a circle of radius a at depth a² (1/R + 1/R_d) / 2 and higher orders; that depth,
-    times ``depth_factor``, is taken along the normal of the dome under the circle's centre. ``scale``: widths of the elastic surround
-    over Taxim's.
+    Raises:
+        InputError: no such data set, or as ``photographs_of``.
+        CalibrationError: a missing or malformed file.
     """
-    camera, pad = sensor.camera, sensor.gelpad
-    distance, (px, py) = -camera.position[2], camera.pixel_pitch
-    poses = np.tile(np.eye(4), (len(shots.circles) + 1, 1, 1))
-    poses[0, 2, 3] = 1.0  # far above: no contact
-    for pose, (u, v, r) in zip(poses[1:], shots.circles, strict=True):
-        z, eps = 0.0, 1e-5
-        for _ in range(5):  # the pixel's ray meets the dome
-            x = camera.position[0] + (u - camera.principal_point[0]) * px * (1 + z / distance)
-            y = camera.position[1] + (v - camera.principal_point[1]) * py * (1 + z / distance)
-            around = rest_height(pad, x + eps * np.array([0, 1, -1, 0, 0]), y + eps * np.array([0, 0, 0, 1, -1]))
-            z = float(around[0])
-        normal = np.array([around[2] - around[1], around[4] - around[3], 2 * eps])
-        a = r * px * (1 + z / distance)
-        dome = np.mean([1 / pad.dome_radius[0], 1 / pad.dome_radius[1]])
-        depth = depth_factor * (shots.radius - np.sqrt(shots.radius**2 - a * a) + 0.5 * a * a * dome)
-        pose[:3, 3] = np.array([x, y, z]) + normal / np.linalg.norm(normal) * (shots.radius - depth)
-    surround = ElasticSurround(grid, sigmas=tuple(scale * s for s in PYRAMID_SIGMAS))
-    return surround.surface(object_height([primitive("sphere", (shots.radius,))], poses, grid.x, grid.y), poses)
+    return photographs_of(read_presses(data), sensor)

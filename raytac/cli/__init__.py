@@ -12,6 +12,7 @@ from raytac import __version__
 from raytac.cli.bake import BakeArgs
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare import CompareArgs
+from raytac.cli.compare_real import CompareRealArgs
 from raytac.cli.doctor import DoctorArgs
 from raytac.cli.press import PressArgs
 from raytac.cli.view import ViewArgs
@@ -24,6 +25,7 @@ _Command = (
     | Annotated[BakeArgs, tyro.conf.subcommand("bake")]
     | Annotated[CalibrateArgs, tyro.conf.subcommand("calibrate")]
     | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
+    | Annotated[CompareRealArgs, tyro.conf.subcommand("compare-real")]
     | Annotated[ViewArgs, tyro.conf.subcommand("view")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )

@@ -1,4 +1,4 @@
-"""``raytac calibrate``: constants of cheap models, fitted to the simulated pad."""
+"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the simulated pad."""
 
 from __future__ import annotations
 
@@ -21,16 +21,34 @@ __all__ = ["CalibrateArgs"]
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateArgs(SolverOptions):
-    """Fit the marker motion of a sensor's pad: press the simulated pad, fit FOTS and the force field to how its surface moves.
+    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the simulated pad.
 
-    Writes marker_motion.toml (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model
-    against surface tracking on presses that the fit did not see) and metrics.json. Without --out the folder is
-    runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error or Ctrl-C leaves these files as they were; presses that are
-    finished stay in presses/, and the same command goes on from there.
+    With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
+    --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
+    out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
+
+    With `markers`: press the simulated pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
+    sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model against surface tracking on presses that
+    the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error
+    or Ctrl-C leaves these files as they were; presses that are finished stay in presses/, and the same command goes on from there.
     """
 
-    what: Annotated[Literal["markers"], tyro.conf.Positional]
-    """What to calibrate."""
+    what: Annotated[str, tyro.conf.Positional]
+    """`markers`, or a folder of photographs or a dataPack.npz."""
+    model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
+    """What a data set is fitted by; table and network take imprint and circles from a fit of the lights too."""
+    ball_diameter_mm: float | None = None
+    """Needed by a dataPack.npz, which does not say it."""
+    sides: str | None = None
+    """Numbers of red, green and blue LEDs joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    holdout: int = 5
+    """Every so manieth press is held out and scored; 0 holds out none."""
+    shadows: bool = False
+    """Whether the ray tracer casts shadows on the coat while it is fitted."""
+    starts: int = 3
+    """Places that a fit of direct light starts from; the best goes on."""
+    rounds: int = 3
+    """Rounds with the ray tracer after direct light."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
@@ -40,6 +58,8 @@ class CalibrateArgs(SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
+        if self.what != "markers":
+            return self._optics(start)
         if self.pad not in PADS:
             raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         sensor = load_sensor(self.sensor)
@@ -56,5 +76,33 @@ class CalibrateArgs(SolverOptions):
             )
             return 130
         for path in written:
+            print(path)
+        return 0
+
+    def _optics(self, start: float) -> int:
+        from raytac.cli.real_data import read_data
+        from raytac.report.real_calibration import run_calibrate_optics
+
+        if self.holdout < 0 or self.holdout == 1:
+            raise InputError("holdout", value=self.holdout, rule="must be 0 or a whole number >= 2")
+        sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides)
+        out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
+        for name in doubtful:
+            print(f"the circle of press {name} is doubtful")
+        for path in run_calibrate_optics(
+            sensor,
+            shots,
+            presses.names,
+            out,
+            model=self.model,
+            data=Path(self.what).name,
+            holdout=self.holdout,
+            starts=self.starts,
+            rounds=self.rounds,
+            shadows=self.shadows,
+            device=self.device,
+            seed=self.seed,
+            start=start,
+        ):
             print(path)
         return 0

@@ -108,9 +108,12 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
     actors = [Worker.options(scheduling_strategy="SPREAD").remote(told) for _ in range(count)]
     # One before the others: it may bake a table, which those on its machine then find.
     for some in (actors[:1], actors[1:]) if waiting else ():
-        for error in ray.get([actor.prepare.remote(waiting[0]) for actor in some]):
-            if error:
-                raise BackendError(f"a worker cannot render: {error}")
+        try:
+            errors = ray.get([actor.prepare.remote(waiting[0]) for actor in some])
+        except ray.exceptions.RayActorError as error:
+            raise BackendError(f"a worker died before its first shard ({error})") from error
+        for error in filter(None, errors):
+            raise BackendError(f"a worker cannot render: {error}")
     waiting.reverse()
     begun: dict[int, int] = {}
     running: dict[Any, tuple[Any, int | None]] = {}

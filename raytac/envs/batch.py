@@ -15,7 +15,7 @@ from raytac.envs.task import Situation, Task
 from raytac.errors import InputError
 from raytac.gel.batch import rounded_envs
 from raytac.gel.pad import COARSEST_PITCH
-from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver
+from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
 from raytac.robots.pose import pose_error
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld
@@ -101,6 +101,7 @@ class TaskBatch:
         self.randomization = Randomization() if randomization is None else randomization
         probe = TactileObserver(loaded.robot.sensor, settings, num_envs=num_envs, randomization=randomization, seed=seed)
         loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
+        loaded = randomised_bodies(loaded, self.randomization, seed)
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
         if settings is not None:
             options = probe.world_options()

@@ -33,7 +33,13 @@ class PushCube(Task):
         cube = now.body[:, :3, 3]
         top = cube + np.array([0.0, 0.0, 0.02])
         reach, rest = far(now.tool[:, :3, 3], top), far(cube[:, :2], now.goal[:, :2])
-        terms = {"reaching": near(reach, 0.1), "target": 4.0 * near(rest, 0.1), "target_fine": 4.0 * near(rest, 0.02)}
+        force = -now.wrench["sensor"][:, 2]
+        terms = {
+            "reaching": near(reach, 0.1),
+            "touching": 1.0 * ((force > 0.5) & (force < 10.0)),
+            "target": 4.0 * near(rest, 0.1),
+            "target_fine": 4.0 * near(rest, 0.02),
+        }
         terminated = far(now.tool[:, :3, 3], cube) > 1.0
         return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.01)
 
@@ -62,6 +68,7 @@ class PushCubeEnv(TactileEnv):
     | term | value | source |
     | --- | --- | --- |
     | `reaching` | 1 − tanh(d(pad, middle of the cube's top) / 0.1) | form of the TacEx thesis, width of Isaac Lab's lift task |
+    | `touching` | 1 if the pad is pressed with 0.5 to 10 N | form of TacEx's ball rolling; constants ours |
     | `target` | 4 (1 − tanh(d_xy(cube, goal) / 0.1)) | form of the TacEx thesis; constants ours |
     | `target_fine` | 4 (1 − tanh(d_xy(cube, goal) / 0.02)) | ours |
     | `action_rate` | −1e-4 \|a − a₋₁\|² | Isaac Lab's lift task |

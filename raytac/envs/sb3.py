@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
@@ -16,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from raytac.envs.environments import TactileVectorEnv
+from raytac.envs.serving import serve
 from raytac.errors import InputError
 
 __all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
@@ -98,14 +97,7 @@ class TactileVecEnv(_DictVecEnv):
 
     def step_wait(self) -> Answer:
         """Raises ``InputError`` for actions that are not finite or out of bounds; it names the environment."""
-        observation, reward, terminated, truncated, told = self.env.step(self._actions)
-        infos: list[dict[str, Any]] = [
-            {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut)}
-            for success, failed, cut in zip(told["success"], told["failed"], truncated, strict=True)
-        ]
-        for b in np.flatnonzero(terminated | truncated):
-            infos[b]["terminal_observation"] = told["final_obs"][b]
-        return observation, reward.astype(np.float32), terminated | truncated, infos
+        return _answer(*self.env.step(self._actions))
 
 
 class ProcessVecEnv(_DictVecEnv):
@@ -138,7 +130,7 @@ class ProcessVecEnv(_DictVecEnv):
             for k in range(processes):
                 mine, theirs = context.Pipe()
                 arguments = theirs, kind, each, {**options, "seed": seed + k}
-                worker = context.Process(target=_work, args=arguments, daemon=True, name=f"raytac-envs-{k}")
+                worker = context.Process(target=serve, args=arguments, daemon=True, name=f"raytac-envs-{k}")
                 worker.start()
                 theirs.close()
                 self._workers.append((worker, mine))
@@ -152,7 +144,7 @@ class ProcessVecEnv(_DictVecEnv):
             pipe.send(("reset", self._seeds[k * self._each : (k + 1) * self._each]))
         self._reset_seeds()
         self._reset_options()
-        return _joined(self._answers())
+        return _joined([observation for observation, _ in self._answers()])
 
     def step_async(self, actions: np.ndarray) -> None:
         """Set all processes going. Raises ``InputError`` for actions that are not finite; it names the environment."""
@@ -165,7 +157,7 @@ class ProcessVecEnv(_DictVecEnv):
 
     def step_wait(self) -> Answer:
         """Raises as ``TactileVecEnv.step_wait``; the message names the process and which environments it has."""
-        observations, rewards, dones, infos = zip(*self._answers(), strict=True)
+        observations, rewards, dones, infos = zip(*(_answer(*told) for told in self._answers()), strict=True)
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
 
     def close(self) -> None:
@@ -197,31 +189,14 @@ def _joined(parts: Sequence[Observations]) -> Observations:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _work(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
-    """A process: makes its vector, then answers until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        env = TactileVecEnv(kind(num_envs, **options))
-        pipe.send((True, (env.observation_space, env.action_space), ""))
-    except Exception as error:
-        pipe.send((False, error, traceback.format_exc()))
-        return
-    orders: dict[str, Callable[[Any], Any]] = {"reset": lambda seeds: _reset(env, seeds), "step": env.step}
-    while True:
-        try:
-            order, value = pipe.recv()
-        except (EOFError, ConnectionResetError):
-            return
-        try:
-            answer = True, orders[order](value), ""
-        except Exception as error:
-            answer = False, error, traceback.format_exc()
-        try:
-            pipe.send(answer)
-        except (BrokenPipeError, ConnectionResetError):
-            return
-
-
-def _reset(env: TactileVecEnv, seeds: Sequence[int | None]) -> Observations:
-    env._seeds = list(seeds)
-    return env.reset()
+def _answer(
+    observation: Observations, reward: np.ndarray, terminated: np.ndarray, truncated: np.ndarray, told: dict[str, Any]
+) -> Answer:
+    """A vector's step as a ``VecEnv`` tells it."""
+    infos: list[dict[str, Any]] = [
+        {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut)}
+        for success, failed, cut in zip(told["success"], told["failed"], truncated, strict=True)
+    ]
+    for b in np.flatnonzero(terminated | truncated):
+        infos[b]["terminal_observation"] = told["final_obs"][b]
+    return observation, reward.astype(np.float32), terminated | truncated, infos

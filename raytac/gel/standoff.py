@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from raytac.gel.coat_surface import CoatPlaces, CoatSurface
 from raytac.gel.product import sandwich
 from raytac.gel.spline import hat_matrix
 
-__all__ = ["ContactFit", "StandOff"]
+__all__ = ["StandOff"]
 
-_ROUNDS = 3
-"""Passes of the local correction; each leaves about a fifth of what the one before left."""
-_COVERED = 0.5
-"""Share of a vertex's surroundings that must be in contact for the whole local correction; with less, it fades to none."""
 _SAG = 3.0
 """Allowance for a facet's sag on a convex object, in units of how far the object lies below its own mean over a cell: for curvature κ
 that is κ cell²/6, and a vertex was seen to lie up to 0.35 κ cell² below the facets around it (ball of 3.2 mm on cells of 1 mm)."""
@@ -25,30 +19,17 @@ _CUT = 0.5e-3
 """Height above the object's lowest point [m] up to which its underside counts in that mean; beyond the object it counts as so high."""
 
 
-@dataclass(frozen=True)
-class ContactFit:
-    """How one coat lies against its object."""
-
-    clearance: float
-    """Mean clearance, weighted by pressure [m]: the object has to be brought down by so much to touch. NaN out of contact."""
-    shift: np.ndarray
-    """What the coat's vertices are then moved up by [m], shape (V,)."""
-
-
 class StandOff:
     """Takes the barrier's clearance out of a contact, one pad at a time.
 
     The barrier holds the coat's facets a little off the object, and where the coat wraps a curved object its vertices lie deeper than
-    its facets. Both are artefacts of the discretisation: a real coat touches. Let c = underside of the object − smooth coat.
+    its facets. Both are artefacts of the discretisation: a real coat touches. Let c = underside of the object − smooth coat. Over samples
+    that bear pressure and where c is no more than barrier and sag explain (more is a recess of the object; and facets sag only where the
+    object is convex, so lower than its own mean over a cell), the clearance of the press is the mean of c weighted by pressure. The
+    object is taken to be that much lower than the solver has it, and a press to a depth drives it that much higher: the coat, not the
+    barrier's shell, is at the commanded depth.
 
-    1. *Mean* (``fit``): over samples that bear pressure and where c is no more than barrier and sag explain (more is a recess of the
-       object; and facets sag only where the object is convex, so lower than its own mean over a cell), the clearance of the press is the
-       mean of c weighted by pressure. The object is taken to be that much lower than the solver has it, and a press to a depth drives
-       it that much higher: the coat, not the barrier's shell, is at the commanded depth.
-    2. *Vertices* (``fit``): each vertex in contact moves by the mean of what is left of c around it, in three passes, fading out at
-       the rim. Vertices out of contact stay where the solver put them.
-
-    The height that is shown in and around the contact comes from ``FineContact``; these two say where the object is, and move the mesh.
+    The coat that is shown in and around the contact comes from ``FineContact``; this says where the object is.
     """
 
     def __init__(self, surface: CoatSurface, rest: np.ndarray, x: np.ndarray, y: np.ndarray, d_hat: float) -> None:
@@ -68,8 +49,8 @@ class StandOff:
         """Coat over the samples [m], (Ny, Nx), from the lattice of ``CoatSurface.rise``."""
         return self.rest + sandwich(self._rows, rise, self._columns)
 
-    def fit(self, places: CoatPlaces, upwards: np.ndarray, pressure: np.ndarray, underside: np.ndarray) -> ContactFit:
-        """Clearance and local shifts of one pad.
+    def clearance(self, places: CoatPlaces, upwards: np.ndarray, pressure: np.ndarray, underside: np.ndarray) -> float:
+        """Mean clearance of one pad, weighted by pressure [m]: the object has to be brought down by so much to touch. NaN out of contact.
 
         Args:
             places: material points of the coat (see ``CoatSurface.places``).
@@ -77,28 +58,14 @@ class StandOff:
             pressure: on its vertices [Pa], shape (V,), 0 out of contact.
             underside: z of the object over the samples [m], shape (Ny, Nx), not finite where it is not.
         """
-        shape = self._surface.mesh.shape
-        borne = sandwich(self._hat_y, np.maximum(pressure, 0.0).reshape(shape), self._hat_x.T)
-        shift = np.zeros(len(upwards))
+        borne = sandwich(self._hat_y, np.maximum(pressure, 0.0).reshape(self._surface.mesh.shape), self._hat_x.T)
         there = np.isfinite(underside)
         if not (there.any() and borne.any()):
-            return ContactFit(float("nan"), shift)
+            return float("nan")
         gap = np.where(there, underside, 0.0) - self.heights(self._surface.rise(places, upwards))
         near = there & (borne > 0.0) & (gap < self._reach + _SAG * self._bulge(underside, there))
         weight = np.where(near, borne, 0.0)
-        if not weight.sum() > 0.0:
-            return ContactFit(float("nan"), shift)
-        clearance = float((weight * gap).sum() / weight.sum())
-        gap = gap - clearance
-        for again in range(_ROUNDS):
-            if again:
-                moved = self._surface.rise(places, upwards + shift)
-                gap = np.where(there, underside, 0.0) - clearance - self.heights(moved)
-            counted = (near | (there & (gap < 0.0))).astype(np.float32)
-            share = sandwich(self._hat_y.T, counted, self._hat_x)
-            mean = sandwich(self._hat_y.T, counted * gap, self._hat_x) / np.maximum(share, 1e-6)
-            shift += (np.clip(share / np.maximum(self._everywhere, 1e-6) / _COVERED, 0.0, 1.0) * mean).ravel()
-        return ContactFit(clearance, shift)
+        return float((weight * gap).sum() / weight.sum()) if weight.sum() > 0.0 else float("nan")
 
     def _bulge(self, underside: np.ndarray, there: np.ndarray) -> np.ndarray:
         """How far the object lies below its mean over a cell around [m], (Ny, Nx), 0 where it lies above."""

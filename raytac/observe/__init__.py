@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from raytac.observe.observer import TactileObserver
-from raytac.observe.randomization import Randomization, randomised_sensor
+from raytac.observe.randomization import Randomization, randomised_bodies, randomised_sensor
 from raytac.observe.settings import MODALITIES, SCALES, ObservationSettings
 from raytac.observe.spaces import ArraySpec, gymnasium_space
 from raytac.observe.tensors import as_tensors
@@ -17,5 +17,6 @@ __all__ = [
     "TactileObserver",
     "as_tensors",
     "gymnasium_space",
+    "randomised_bodies",
     "randomised_sensor",
 ]

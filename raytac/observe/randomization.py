@@ -10,8 +10,9 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.specs.sensor import SensorSpec
+from raytac.specs.task import TaskScene
 
-__all__ = ["CameraDrift", "Randomization", "randomised_sensor"]
+__all__ = ["CameraDrift", "Randomization", "randomised_bodies", "randomised_sensor"]
 
 
 @dataclass(frozen=True)
@@ -20,8 +21,9 @@ class Randomization:
 
     *Each environment, at every reset* (``CameraDrift`` and the marker tracker): ``exposure``, ``white_balance``, ``gamma`` and the pattern
     of ``markers``. *Each frame*: ``noise``, and noise and losses of ``markers``. *Once a world*, in the sensor that all its environments
-    share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``. A table of ``taxim``
-    is baked anew for every such sensor, the ray tracer is not: vary seeds over processes.
+    share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``; and in its bodies
+    (``randomised_bodies``): ``body_mass``, ``body_friction``. A table of ``taxim`` is baked anew for every such sensor, the ray tracer is
+    not: vary seeds over processes.
     """
 
     led_power: float = 0.0
@@ -34,6 +36,10 @@ class Randomization:
     """Of the gel."""
     friction: float = 0.0
     """Of the gel."""
+    body_mass: float = 0.0
+    """Of every free body by itself."""
+    body_friction: float = 0.0
+    """Of every body by itself, where the scene gives it a coefficient; against gel and all else alike."""
     exposure: float = 0.0
     """Gain of the camera, all channels, in linear light."""
     white_balance: float = 0.0
@@ -91,6 +97,24 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
         coat=replace(sensor.coat, reflectance=tuple(float(v) for v in reflectance)),
         gelpad=gelpad,
     )
+
+
+def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:
+    """The scene with the bodies that a seed draws; the one given where nothing of them is drawn."""
+    r = randomization
+    if not (r.body_mass or r.body_friction):
+        return scene
+    rng = np.random.default_rng((seed, 0xB0D1))
+    bodies = []
+    for body in scene.bodies:
+        mass, friction = 1.0 + np.array([r.body_mass, r.body_friction]) * rng.uniform(-1.0, 1.0, 2)
+        if body.dynamics == "free":
+            given = body.mass is not None
+            body = replace(body, mass=float(body.mass * mass)) if given else replace(body, density=float(body.density * mass))
+        own = {name: getattr(body, name) for name in ("friction", "gel_friction")}
+        body = replace(body, **{name: float(value * friction) for name, value in own.items() if value is not None})
+        bodies.append(body)
+    return replace(scene, bodies=tuple(bodies))
 
 
 class CameraDrift:

@@ -22,6 +22,9 @@ class AddTactile(gymnasium.Wrapper):
     .. code-block:: python
 
         env = AddTactile(MyEnv(world), {"sensor": observer}, world.observe)
+
+    ``reset(seed=…)`` seeds the observers' cameras too. Noise of markers is drawn by the sensor that gives the frames: seed that in the
+    environment's own ``reset``.
     """
 
     def __init__(
@@ -52,8 +55,15 @@ class AddTactile(gymnasium.Wrapper):
         self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reset the environment and begin anew in every observer.
+
+        Raises:
+            InputError: an observer whose frame is not given; in ``step`` too.
+        """
         observation, info = self.env.reset(seed=seed, options=options)
         for observer in self.observers.values():
+            if seed is not None:
+                observer.reseed([0], [seed])
             observer.reset()
         return self._joined(observation), info
 
@@ -65,5 +75,7 @@ class AddTactile(gymnasium.Wrapper):
         made = dict(observation) if isinstance(observation, Mapping) else {"observation": observation}
         frames = self._frames()
         for name, observer in self.observers.items():
+            if name not in frames:
+                raise InputError("observers", value=name, rule="must be names of frames that are given", choices=tuple(frames))
             made[name] = {key: np.asarray(value[0]) for key, value in observer.observe(frames[name]).items()}
         return made

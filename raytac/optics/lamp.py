@@ -15,7 +15,8 @@ __all__ = ["Lamp", "LampTable"]
 
 @dataclass(frozen=True)
 class Lamp:
-    """Dr.Jit arrays of one LED: centre [m], unit axis, half edges [m], lobe exponent n, on-axis intensity (linear RGB) [W/sr].
+    """Dr.Jit arrays of one LED: centre [m], unit axis, half edges [m], lobe exponent n, on-axis intensity (linear RGB) [W/sr], and the
+    even radiance of the case that goes with it (linear RGB) [W/(m² sr)], None if there is none.
 
     Intensity is I(θ) = power · cosⁿ θ for the whole rectangle, so a small one is a point light of that intensity.
     """
@@ -26,6 +27,7 @@ class Lamp:
     half_v: Any
     lobe: Any
     power: Any
+    glow: Any = None
 
     @classmethod
     def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
@@ -38,9 +40,10 @@ class Lamp:
             half_v=mi.Vector3f((0.5 * unit * led.size[1] * v).tolist()),
             lobe=mi.Float(led.lobe),
             power=mi.Color3f([unit**2 * p for p in led.power]),
+            glow=mi.Color3f([led.glow * p for p in led.power]) if led.glow else None,
         )
         # Opaque values keep one kernel for every LED file and let a fit change them without recompiling.
-        dr.make_opaque(lamp.centre, lamp.axis, lamp.half_u, lamp.half_v, lamp.lobe, lamp.power)
+        dr.make_opaque(lamp.centre, lamp.axis, lamp.half_u, lamp.half_v, lamp.lobe, lamp.power, lamp.glow)
         return lamp
 
     def sample(self, square: Any) -> Any:

@@ -145,6 +145,18 @@ def trace(
         w, arriving = connect(mi, scene, sampler, si.p, si.n, lamp, active & deeper)
         return add(radiance, weight * scene.reflect(si, si.to_local(w)) * arriving, group)
 
+    glow = [(k, lamp.glow) for lamp, k in zip(lamps, groups, strict=True) if lamp.glow is not None]
+
+    def shine(si: Any, beta: Any, radiance: list[Any], active: Any) -> list[Any]:
+        """The case's even glow where the path meets it."""
+        if not glow:
+            return radiance
+        radiance, met = list(radiance), active & scene.on_case(si)
+        for group, even in glow:
+            for c in range(3):
+                radiance[3 * group + c] = radiance[3 * group + c] + dr.select(met, beta[c] * even[c], 0)
+        return radiance
+
     def scatter(sampler: Any, si: Any, beta: Any, active: Any) -> tuple[Any, Any, Any]:
         wo, weight = scene.sample_reflection(si, sampler.next_1d(active), sampler.next_2d(active))
         beta = beta * weight
@@ -183,6 +195,7 @@ def trace(
             gactive, gbeta = ghost & gsi.is_valid(), mi.Color3f(share / GHOST)
             for k, (lamp, group) in enumerate(zip(lamps, groups, strict=True)):
                 radiance = add(radiance, dr.select(gactive, gbeta * scene.led_radiance(gsi, k, lamp), 0), mi.UInt32(group))
+            radiance = shine(gsi, gbeta, radiance, gactive)
             radiance = vertex(sampler, gsi, gbeta, radiance, mi.Bool(max_depth != 1), gactive, mi.Bool(True))
             if max_depth == 1:
                 return radiance
@@ -201,6 +214,7 @@ def trace(
         active = active & si.is_valid()
         depth = depth + 1
         deeper = mi.Bool(True) if max_depth < 0 else depth < max_depth
+        radiance = shine(si, beta, radiance, active)
         radiance = vertex(sampler, si, beta, radiance, deeper, active, mirrored)
         ray, beta, active = scatter(sampler, si, beta, active & deeper)
         return sampler, ray, beta, radiance, depth, active

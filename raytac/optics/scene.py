@@ -22,7 +22,10 @@ UNIT = 1e3
 """Scene units per metre. Mitsuba starts secondary rays 9e-5 scene units off a surface (``offset_p``): in metres that is 0.09 mm, more
 than a pixel on the pad, so the scene is built in millimetres."""
 
-__all__ = ["UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
+PLATES = ("wall_left", "wall_right", "wall_top", "wall_bottom", "floor")
+"""The rectangles of the case."""
+
+__all__ = ["PLATES", "UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
 
 
 def coat_bsdf(coat: CoatSpec, *, dotted: bool = False) -> dict[str, Any]:
@@ -65,6 +68,7 @@ class SensorScene:
         self._xy = (UNIT * np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
         scene: dict[str, Any] = {"type": "scene", "coat": self._coat_mesh(grid_faces(nx, ny))}
         self.slab = Slab.from_spec(sensor, UNIT)
+        self._glowing = any(led.glow for led in sensor.lights.leds)
         scene.update(self._case())
         if glass and self.slab is not None:
             scene["glass"] = self._glass(self.slab)
@@ -106,7 +110,10 @@ class SensorScene:
         def plate(origin: Sequence[float], normal: Sequence[float], half: Sequence[float], up: Sequence[float]) -> dict[str, Any]:
             target = [o + n for o, n in zip(origin, normal, strict=True)]
             frame = T().look_at(origin=list(origin), target=target, up=list(up))
-            return {"type": "rectangle", "to_world": frame @ T().scale([half[0], half[1], 1]), "bsdf": bsdf}
+            rectangle = {"type": "rectangle", "to_world": frame @ T().scale([half[0], half[1], 1]), "bsdf": bsdf}
+            if self._glowing:  # for Mitsuba's own integrators; ours take it from the lamps
+                rectangle["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": self._glow(None)}}
+            return rectangle
 
         z = -depth / 2
         return {
@@ -138,6 +145,11 @@ class SensorScene:
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
             "emitter": {"type": led_plugin.PLUGIN, "radiance": [p / area for p in led.power], "lobe": led.lobe},
         }
+
+    def _glow(self, leds: Sequence[str] | None) -> list[float]:
+        """Even radiance of walls and floor (RGB) while the LEDs of these names (None: all) are lit."""
+        lit = [led for led in self.sensor.lights.leds if leds is None or led.name in leds]
+        return [float(sum(led.glow * led.power[c] for led in lit)) for c in range(3)]
 
     def _vertices(self, height: np.ndarray) -> np.ndarray:
         z = UNIT * np.asarray(height, dtype=np.float32).reshape(-1, 1)
@@ -171,6 +183,9 @@ class SensorScene:
             lit = leds is None or led.name in leds
             area = led.size[0] * led.size[1]
             self.params[f"led_{k}.emitter.radiance"] = self.mi.Color3f([p / area if lit else 0.0 for p in led.power])
+        if self._glowing:
+            for plate in PLATES:
+                self.params[f"{plate}.emitter.radiance.value"] = self.mi.Color3f(self._glow(leds))
         self.params.update()
 
     def reflect(self, si: Any, wo: Any) -> Any:
@@ -201,6 +216,13 @@ class SensorScene:
 
     def on_coat(self, si: Any) -> Any:
         return si.shape == self._coat
+
+    def on_case(self, si: Any) -> Any:
+        """Whether ``si`` lies on a wall or the floor, its inner side."""
+        case = si.is_valid() & (si.wi.z > 0)
+        for other in (self._coat, *self._leds):
+            case &= si.shape != other
+        return case
 
     def case_albedo(self, si: Any) -> Any:
         """Albedo of wall or floor at ``si``; 0 on the coat and on LEDs."""

@@ -167,9 +167,8 @@ class SoftPad:
 
     def wrench(self, state: ContactState) -> np.ndarray:
         """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
-        surface, forces = self.surface(state), self._reading(state).forces
-        assert surface.coat is not None
-        torque = np.cross(surface.coat.positions, forces).sum(axis=1)
+        forces = self._reading(state).forces
+        torque = np.cross(self._reading(state).vertices, forces).sum(axis=1)
         return np.concatenate([forces.sum(axis=1), torque], axis=1)
 
     def traction(self, state: ContactState) -> np.ndarray:
@@ -217,7 +216,9 @@ class SoftPad:
             rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
             coat = DeformedCoat(self.mesh.coat, np.repeat(self.mesh.coat.rest[None], batch, axis=0))
             surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
-            reading = SoftReading(surface, np.zeros_like(coat.positions), np.full(batch, np.nan), (), np.full(rest.shape, np.inf))
+            none = np.full(batch, np.nan)
+            still = coat.positions, np.zeros_like(coat.positions)
+            reading = SoftReading(surface, *still, none, (), np.full(rest.shape, np.inf), none)
             failed = np.zeros(batch, bool)
             return SoftState(
                 stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
@@ -227,9 +228,8 @@ class SoftPad:
         self._last = reading
         self._drive.read(reading.clearance)
         surface, forces = reading.surface, reading.forces
-        assert surface.coat is not None
         total = forces.sum(axis=1)
-        arm = surface.coat.positions[:, :, :2] - np.nan_to_num(surface.contact_centre)[:, None]
+        arm = reading.vertices[:, :, :2] - np.nan_to_num(surface.contact_centre)[:, None]
         torque = (arm[:, :, 0] * forces[:, :, 1] - arm[:, :, 1] * forces[:, :, 0]).sum(axis=1)
         cell = self.grid.pitch[0] * self.grid.pitch[1]
         area = np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)

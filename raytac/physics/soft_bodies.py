@@ -12,6 +12,7 @@ from raytac.errors import InputError
 from raytac.gel.part import Part
 from raytac.physics.part_surface import SAG, enclosed_volume, object_surface
 from raytac.physics.soft_mesh import PadMesh
+from raytac.physics.soft_skin import SoftSkin
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec
 
@@ -31,9 +32,11 @@ class SceneBody:
 
     solid: ipc.KinematicBody | ipc.AffineBody | ipc.SoftBody | ipc.HalfSpace
     parts: tuple[Part, ...] = ()
-    """Exact shape of a rigid one, body frame: what a pad in contact is shown to touch. A soft one is shown as its surface is."""
+    """Exact shape of a rigid one, body frame: what a pad in contact is shown to touch."""
     friction: float | None = None
     """μ against pads and bodies; None: each pad's own against pads."""
+    skin: SoftSkin | None = None
+    """Surface of a soft one, as a pad in contact is shown to touch it; None: the faces of its tetrahedra."""
 
     @property
     def name(self) -> str:
@@ -101,7 +104,8 @@ def scene_body(
                 raise InputError("parts", value=[part.kind for part in parts], rule=rule)
             return SceneBody(ipc.HalfSpace(name), parts or (Part("plane"),), friction)
         if kind == "soft":
-            return SceneBody(_soft(name, parts, density, youngs_modulus, poisson_ratio, cell, held), (), friction)
+            solid = _soft(name, parts, density, youngs_modulus, poisson_ratio, cell, held)
+            return SceneBody(solid, (), friction, SoftSkin(parts, solid.mesh))
         surface = object_surface(parts, sag)
         if kind == "affine":
             return SceneBody(ipc.AffineBody(name, surface, ipc.Stiff(density=density)), parts, friction)
@@ -187,7 +191,7 @@ def object_body(
             height = tets.vertices @ rotations[0, 2]
             held = np.flatnonzero(height >= height.max() - _HELD * np.ptp(height))
             material = ipc.Material(young=spec.youngs_modulus, poisson=spec.poisson_ratio)
-            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=held))
+            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=held), skin=SoftSkin(parts, tets))
     except ipc.IpcError as error:
         raise InputError("object.dynamics", value=spec.dynamics, rule=f"cannot be made from this object: {error}") from error
     raise InputError("object.dynamics", value=spec.dynamics, rule="must be a known kind of body", choices=DYNAMICS)

@@ -132,5 +132,5 @@ class SoftContact:
         """What a reader needs; ``driven``: ``pad_from_object`` (B, 4, 4) of an object that is not free."""
         free = not self.body.is_driven
         pose = inverse(self._world_from_pad) @ self.scene.pose(OBJECT) if free else driven
-        surface = self.scene.mesh(OBJECT, PAD) if self.body.is_soft else None
+        surface = self.scene.skin(OBJECT, PAD) if self.body.is_soft else None
         return SeenPad(self.scene.coat(PAD), self.forces(), (SeenObject(self.body.parts, pose, surface),))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,16 +12,20 @@ from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.coat_surface import CoatPlaces, CoatSurface
 from raytac.gel.fine_contact import FineContact, FineGrid
 from raytac.gel.object_height import object_height
-from raytac.gel.pad import make_grid
+from raytac.gel.pad import make_grid, rest_height
 from raytac.gel.part import Part, mesh_part
 from raytac.gel.product import sandwich
-from raytac.gel.standoff import ContactFit, StandOff
+from raytac.gel.skin_motion import SkinMotion, sampled
+from raytac.gel.standoff import StandOff
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.physics.pad_compliance import coat_compliance
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["SeenObject", "SeenPad", "SoftReader", "SoftReading"]
+__all__ = ["UNSOLVED", "SeenObject", "SeenPad", "SoftReader", "SoftReading", "UnsolvedContactWarning"]
+
+UNSOLVED = 5e-6
+"""A contact whose residual is larger is warned of [m]."""
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
@@ -28,6 +33,10 @@ _FINE = 0.1e-3
 """Spacing of the grid on which the contact is found [m]."""
 _BEHIND = 1e-3
 """An underside so far below the coat [m] is that of an object beside or behind the pad: no contact overlaps by that much."""
+
+
+class UnsolvedContactWarning(UserWarning):
+    """The search for the contact below the size of a cell ended before it was found."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,9 @@ class SoftReading:
     """B pads as they are shown; pad frame."""
 
     surface: GelSurface
+    """Its ``coat`` lies on the height that is shown: the solver's vertices with the contact that was found below the size of a cell."""
+    vertices: np.ndarray
+    """The solver's own vertices of the coat [m], shape (B, V, 3): where ``forces`` act."""
     forces: np.ndarray
     """On each vertex of the coat [N], shape (B, V, 3)."""
     clearance: np.ndarray
@@ -80,6 +92,9 @@ class SoftReading:
     underside: np.ndarray
     """Underside of the objects there over the grid [m], shape (B, Ny, Nx), inf where there is none. Of a rigid object, what lies
     wholly above the pad's highest point may be left out; of a soft one, all is there, in contact or not."""
+    residual: np.ndarray
+    """Deepest overlap or widest gap under pressure [m], (B,), that the search for the contact below the size of a cell left, before the
+    coat was laid on the object; NaN out of contact."""
 
 
 class SoftReader:
@@ -92,7 +107,8 @@ class SoftReader:
         self._rest = grid.rest.astype(np.float32)
         self._gelpad = gelpad
         self._fine_pad = grid if min(grid.pitch) > 0.9 * _FINE else make_grid(gelpad, _FINE)
-        self._fine: tuple[FineContact, FineGrid] | None = None
+        self._fine: tuple[FineContact, FineGrid, SkinMotion] | None = None
+        self._warned = False
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._stand_off = StandOff(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
         corners = mesh.coat.rest[mesh.coat.faces]
@@ -101,54 +117,59 @@ class SoftReader:
 
     def clearance(self, seen: SeenPad) -> np.ndarray:
         """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact."""
-        return np.array([self._fit(seen, b)[1].clearance for b in range(len(seen.coat))])
+        return np.array([self._fit(seen, b)[1] for b in range(len(seen.coat))])
 
     def read(self, seen: SeenPad, failed: np.ndarray) -> SoftReading:
         """All that is shown of every pad; NaN for those that ``failed``, (B,)."""
-        coat, forces = seen.coat.copy(), seen.forces.copy()
+        coat, vertices, forces = seen.coat.copy(), seen.coat.copy(), seen.forces.copy()
         poses = tuple(thing.poses.copy() for thing in seen.objects)
         batch = len(coat)
-        clearance = np.full(batch, np.nan)
+        clearance, residual = np.full(batch, np.nan), np.full(batch, np.nan)
         height = np.empty((batch, *self.grid.shape), np.float32)
         touched = np.zeros(height.shape, bool)
         centre, undersides = np.full((batch, 2), np.nan), np.full(height.shape, np.inf)
+        rest = self.mesh.coat.rest
         for b in range(batch):
             if failed[b]:
-                coat[b] = forces[b] = height[b] = np.nan
+                coat[b] = vertices[b] = forces[b] = height[b] = np.nan
                 for pose in poses:
                     pose[b] = np.nan
                 continue
-            places, fit = self._fit(seen, b)
-            coat[b, :, 2] += fit.shift
-            height[b] = self._heights(places, coat[b])
-            if not np.isfinite(fit.clearance):
+            places, kept = self._fit(seen, b)
+            upwards = vertices[b, :, 2] - rest[:, 2]
+            height[b] = self._rest + sandwich(self._rows, self._surface.rise(places, upwards), self._columns)
+            if not np.isfinite(kept):
                 undersides[b] = self._underside(seen, b, self.grid)
                 continue
-            clearance[b] = fit.clearance
+            clearance[b] = kept
             for pose in poses:
-                pose[b, 2, 3] -= fit.clearance
+                pose[b, 2, 3] -= kept
             load = np.maximum(-forces[b, :, 2], 0.0)
-            fine, to_grid = self._fine_contact()
-            upwards = seen.coat[b, :, 2] - self.mesh.coat.rest[:, 2]
+            fine, to_grid, skin = self._fine_contact()
             smooth = None
             if len(seen.objects) > 1:
                 smooth = self._fine_pad.rest + fine.here.lattice(self._surface.rise(places, upwards))
-            near = self._underside(seen, b, self._fine_pad, fit.clearance, smooth)
+            near = self._underside(seen, b, self._fine_pad, kept, smooth)
             shape = fine.solve(places, upwards, load, near - self._fine_pad.rest)
+            residual[b] = shape.residual
             same = self._fine_pad is self.grid
-            under = undersides[b] = near if same else self._underside(seen, b, self.grid, fit.clearance, height[b])
+            under = undersides[b] = near if same else self._underside(seen, b, self.grid, kept, height[b])
             height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
-            centre[b] = load @ coat[b, :, :2] / load.sum()
+            coat[b, :, :2] = rest[:, :2] + skin.sideways(shape, vertices[b] - rest, fine.touching(load))
+            coat[b, :, 2] = self._on_surface(height[b], coat[b, :, :2])
+            centre[b] = load @ vertices[b, :, :2] / load.sum()
+        self._tell(residual)
         deformed = DeformedCoat(self.mesh.coat, coat)
         surface = GelSurface(self.grid, height, touched, centre, _touched_pose(seen, poses), deformed)
-        return SoftReading(surface, forces, clearance, poses, undersides)
+        return SoftReading(surface, vertices, forces, clearance, poses, undersides, residual)
 
-    def _fit(self, seen: SeenPad, b: int) -> tuple[CoatPlaces, ContactFit]:
+    def _fit(self, seen: SeenPad, b: int) -> tuple[CoatPlaces, float]:
+        """Material points of one coat under the lattice, and the clearance [m]."""
         coat, forces = seen.coat[b], seen.forces[b]
         moved = coat - self.mesh.coat.rest
         places = self._surface.places(moved)
         if not (forces[:, 2] < 0.0).any():
-            return places, ContactFit(float("nan"), np.zeros(len(coat)))
+            return places, float("nan")
         below = float(self.grid.rest.max()) + 10.0 * self.mesh.d_hat
         under = np.full((len(self._stand_off.y), len(self._stand_off.x)), np.inf)
         for thing in seen.objects:
@@ -159,18 +180,32 @@ class SoftReader:
         if len(seen.objects) > 1:
             smooth = self._stand_off.heights(self._surface.rise(places, moved[:, 2]))
             under[under < smooth - _BEHIND] = np.inf
-        return places, self._stand_off.fit(places, moved[:, 2], -forces[:, 2] / self._vertex_area, under)
+        return places, self._stand_off.clearance(places, moved[:, 2], -forces[:, 2] / self._vertex_area, under)
 
-    def _heights(self, places: CoatPlaces, coat: np.ndarray) -> np.ndarray:
-        rise = self._surface.rise(places, coat[:, 2] - self.mesh.coat.rest[:, 2])
-        return self._rest + sandwich(self._rows, rise, self._columns)
+    def _on_surface(self, height: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """z of a shown ``height`` (Ny, Nx) [m] at places (V, 2); what is beyond the pad's edge is at the height of the edge."""
+        x, y = (np.clip(place[:, k], line[0], line[-1]) for k, line in enumerate((self.grid.x, self.grid.y)))
+        return rest_height(self._gelpad, x, y) + sampled(height - self._rest, self.grid.x, self.grid.y, x, y)
 
-    def _fine_contact(self) -> tuple[FineContact, FineGrid]:
-        """What finds the contact, and what takes it to the grid; made at the first contact, since the mesh's compliance takes a while."""
+    def _tell(self, residual: np.ndarray) -> None:
+        """Warn once if a contact was left unsolved."""
+        worst = float(np.nanmax(residual, initial=0.0))
+        if worst > UNSOLVED and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the contact below the size of a cell was left {1e6 * worst:.1f} µm from its solution, more than "
+                f"{1e6 * UNSOLVED:g} µm: the shown coat is laid on the object where it touches, and off by about so much around it",
+                UnsolvedContactWarning,
+                stacklevel=2,
+            )
+
+    def _fine_contact(self) -> tuple[FineContact, FineGrid, SkinMotion]:
+        """What finds the contact and takes it to grid and vertices; made at the first contact: the mesh's compliance takes a while."""
         if self._fine is None:
             found, continued = (coat_compliance(self.mesh, self._gelpad, rollers=rollers) for rollers in (False, True))
-            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found, continued)
-            self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y)
+            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found[2], continued[2])
+            motion = SkinMotion(fine, self._gelpad, found, continued)
+            self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y), motion
         return self._fine
 
     def _underside(

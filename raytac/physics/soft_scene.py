@@ -264,6 +264,13 @@ class SoftScene:
             at = at[:, vertices]
         return (at if seen_from is None else self._into(seen_from, at)), faces
 
+    def skin(self, name: str, seen_from: str) -> tuple[np.ndarray, np.ndarray]:
+        """Surface of a soft body, or of another pad, without facets if it has a ``SoftSkin``; as ``mesh``."""
+        skin = None if name in self.pads else self._cast.body(name).skin
+        if skin is None:
+            return self.mesh(name, seen_from)
+        return skin.carried(self._into(seen_from, self.world.positions(name))), skin.faces
+
     def coat(self, pad: str) -> np.ndarray:
         """Vertices of a pad's coat [m], pad frame, shape (B, V, 3): as the solver has them, with the barrier's clearance."""
         return self.world.positions(pad, frame="body")[:, self._cast.pad(pad).mesh.coat_vertices]
@@ -296,7 +303,7 @@ class SoftScene:
             if body is not None and not body.is_soft:
                 objects.append(SeenObject(body.parts, frame @ self.pose(name), None, near))
             elif name != pad:
-                objects.append(SeenObject((), frame @ self.pose(name), self.mesh(name, pad), near))
+                objects.append(SeenObject((), frame @ self.pose(name), self.skin(name, pad), near))
         return SeenPad(self.coat(pad), self.coat_forces(pad), tuple(objects))
 
     # --- state -----------------------------------------------------------------------------------------------------------------

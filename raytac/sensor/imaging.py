@@ -74,6 +74,8 @@ class Imaging:
             settings = {name: settings[name] for name in ("resolution", "outputs", "device")}
             if self._optics == "taxim":
                 from raytac.optics.taxim import TaximMode as Mode
+            elif self._optics == "mlp":
+                from raytac.optics.mlp import MlpMode as Mode
             else:
                 from raytac.optics.phong import PhongMode as Mode
         known = [name for name in inspect.signature(Mode).parameters if name != "sensor" and name not in settings]

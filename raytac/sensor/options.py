@@ -37,7 +37,7 @@ __all__ = [
     "warn_of_other_shape",
 ]
 
-OPTICS = ("raytrace", "taxim", "phong")
+OPTICS = ("raytrace", "taxim", "phong", "mlp")
 """Names that ``optics=`` accepts."""
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""

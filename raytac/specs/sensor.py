@@ -175,6 +175,8 @@ class LedSpec:
     """Lobe exponent n >= 1; 1 is a Lambertian emitter."""
     power: Vec3
     """Intensity on the axis per camera channel (linear R, G, B) [W/sr, relative]: point-light equivalent at n and size."""
+    glow: float = 0.0
+    """Even radiance of the case's walls and floor over ``power`` [1/m²]: light of this LED that gel and housing scattered many times."""
 
     @property
     def edges(self) -> tuple[Vec3, Vec3]:

@@ -98,6 +98,7 @@ LED_SCHEMA: Final[Schema] = {
     "size_mm": Number("(0, 50]", length=2),
     "lobe": Number("[1, 1000]"),
     "power_w_per_sr": Number("[0, 1e6]", length=3),
+    "glow_per_m2": Number("[0, 1e6]", default=0.0),
 }
 """Keys of one ``[[led]]`` table."""
 

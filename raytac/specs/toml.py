@@ -29,6 +29,7 @@ _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "per_mm": (1e3, 1.0, "1/mm"),
     "per_mm2": (1e6, 1.0, "1/mm²"),
     "per_mm3": (1e9, 1.0, "1/mm³"),
+    "per_m2": (1.0, 1.0, "1/m²"),
     "w_per_sr": (1.0, 1.0, "W/sr"),
     "kg_m3": (1.0, 1.0, "kg/m³"),
     "m_s2": (1.0, 1.0, "m/s²"),

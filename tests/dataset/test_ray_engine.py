@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from raytac.dataset import DatasetPlan, PressDataset, RenderJob, ShardResult, render_dataset, verify_dataset
+from raytac.dataset import DatasetPlan, PressDataset, Presses, RenderJob, ShardResult, render_dataset, verify_dataset
 from raytac.dataset.ray_engine import render_on_ray
 from raytac.dataset.shard import ShardRecord, ShardStore
 from raytac.errors import BackendError, InputError
@@ -61,6 +61,23 @@ def test_a_killed_worker_loses_and_doubles_no_press(sweep: SweepSpec, tmp_path: 
         if (tmp_path / "local" / name).is_file():
             assert (tmp_path / "local" / name).read_bytes() == (tmp_path / "ray" / name).read_bytes(), name
     assert PressDataset(tmp_path / "ray").manifest["index"].to_pylist() == list(range(24))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("local_ray")
+@pytest.mark.filterwarnings("ignore:the worker of shard")
+def test_a_shard_that_kills_every_worker_is_named_after_all_others(sweep: SweepSpec) -> None:
+    class Killer(DatasetPlan):
+        def presses(self, shard: int) -> Presses:
+            if shard == 1:
+                os._exit(1)
+            return super().presses(shard)
+
+    results = render_on_ray(RenderJob(Killer(replace(sweep, count=16)), "cpu", batch=4), range(4), workers=2)
+    found: list[int] = []
+    with pytest.raises(BackendError, match=r"shards \[1\]: their workers died 3 times"):
+        found.extend(result.shard for result in results)
+    assert sorted(found) == [0, 2, 3]
 
 
 @pytest.mark.usefixtures("local_ray")

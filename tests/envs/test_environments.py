@@ -290,3 +290,20 @@ def test_the_wrench_alone_is_the_wrench_that_is_seen_beside_markers() -> None:
     assert pressed
     with pytest.raises(InputError, match="alone"):
         both.batch.observers["sensor"].observe_wrench(np.zeros((2, 6)), np.zeros(2, bool), np.ones(2, bool))
+
+
+def test_bodies_are_drawn_once_a_world() -> None:
+    def cube(seed: int, **widths: float) -> tuple[float, float, float]:
+        batch = TaskBatch(PushCube(), tactile=None, seed=seed, randomization=Randomization(**widths))  # type: ignore[arg-type]
+        body = batch.world.composed.bodies["cube"]
+        friction = batch.world.model.geom_friction[batch.world.model.body_geomadr[body.index], 0]
+        return float(batch.world.model.body_mass[body.index]), float(friction), float(body.spec.friction_on_gel or 0.0)
+
+    plain = cube(0)
+    assert plain == pytest.approx((0.05, 0.2, 1.0))
+    drawn = np.array([cube(seed, body_mass=0.3, body_friction=0.2) for seed in range(4)])
+    shares = drawn / plain
+    assert np.ptp(shares, axis=0).min() > 0.05 and (np.abs(shares - 1.0) <= [0.3 + 1e-9, 0.2 + 1e-9, 0.2 + 1e-9]).all()
+    np.testing.assert_allclose(shares[:, 1], shares[:, 2])
+    assert cube(2, body_mass=0.3, body_friction=0.2) == tuple(drawn[2])
+    assert cube(1, body_mass=0.3)[1:] == plain[1:]

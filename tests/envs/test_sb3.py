@@ -14,7 +14,9 @@ from raytac.errors import InputError
 
 pytest.importorskip("stable_baselines3")
 
-from experiments.ppo_training import Checkpoint, Learner, Recipe, Training, evaluate, tactile_settings
+from experiments.imitation import imitate, regress
+from experiments.ppo_learner import Checkpoint, Learner, Recipe, evaluate, tactile_settings
+from experiments.ppo_training import Training
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
 
 
@@ -130,6 +132,28 @@ def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path) -> No
     for name in ("wrong.pt", "missing.pt"):
         with pytest.raises(InputError, match="checkpoint"):
             Checkpoint.load(tmp_path / name)
+
+
+def test_a_pupil_learns_what_it_is_shown_and_in_the_same_way_each_time() -> None:
+    recipe = replace(RECIPE, teacher_steps=64, steps=64, epochs=20, hidden=32, learning_rate=3e-3)
+    one, two = Learner(recipe), Learner(recipe)
+    for learner in (one, two):
+        learner.normaliser.seed(1)
+        imitate(learner)
+    assert one.model.num_timesteps == 32
+    for a, b in zip(one.model.policy.parameters(), two.model.policy.parameters(), strict=True):
+        assert np.array_equal(a.detach(), b.detach())
+    rng = np.random.default_rng(0)
+    space = one.normaliser.observation_space
+    seen = {name: rng.standard_normal((200, *box.shape)).astype(np.float32) for name, box in space.spaces.items()}  # type: ignore[attr-defined]
+    wanted = np.tanh(seen["goal"][:, :3])
+    errors = []
+    for _ in range(12):
+        errors.append(np.square(one.predict(seen) - wanted).mean())
+        regress(one, seen, wanted, rng)
+    assert errors[-1] < 0.2 * errors[0], errors
+    with pytest.raises(InputError, match="while a scripted policy teaches"):
+        Learner(replace(recipe, processes=2))
 
 
 def test_modalities_by_name() -> None:

@@ -52,3 +52,19 @@ def test_an_unknown_level_is_named(physics_sheet, tmp_path):
 
     with pytest.raises(InputError, match=r"pad.*'huge'.*coarse"):
         physics_sheet.Args(out=tmp_path, pad="huge").run()
+
+
+def test_levels_against_a_finer_one(physics_sheet, tmp_path):
+    assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere", against="medium").run() == 0
+    read = read_metrics(tmp_path / "metrics.json")
+    found = {key: float(value) for key, value in read.items() if key.startswith("sphere")}
+    assert found["sphere.coarse.contact_um"] < 2.0 < found["sphere.coarse.near_um"] < 20.0
+    assert found["sphere.coarse.ring_um"] < 20.0
+    assert found["sphere.coarse.force_n"] > found["sphere.medium.force_n"] > 1.5
+
+
+def test_the_coarsest_level_has_none_below_it(physics_sheet, tmp_path):
+    from raytac.errors import InputError
+
+    with pytest.raises(InputError, match=r"against.*'coarse'.*medium"):
+        physics_sheet.Args(out=tmp_path, against="coarse").run()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from raytac.errors import InputError
@@ -15,7 +17,7 @@ from raytac.io.metrics import read_metrics
 pytest.importorskip("stable_baselines3")
 
 from experiments.play import Args, main
-from experiments.ppo_training import Learner, Recipe
+from experiments.ppo_learner import Checkpoint, Learner, Recipe
 from experiments.training_curves import draw_curves
 
 
@@ -27,6 +29,16 @@ def test_the_rate_of_a_scripted_policy_and_of_a_checkpoint(tmp_path: Path) -> No
     found = main(Args(policy=str(tmp_path / "policy.pt"), episodes=2, num_envs=2, film=False, out=tmp_path / "trained"))
     assert found["task"] == "RollBall" and 0.0 <= found["success"] <= 1.0  # type: ignore[operator]
     assert read_metrics(tmp_path / "trained" / "metrics.json")["episodes"] == 2
+
+
+def test_policies_that_are_shipped_fit_their_environments() -> None:
+    shipped = sorted((Path(__file__).parents[2] / "experiments" / "policies").glob("*.pt"))
+    assert shipped
+    for path in shipped:
+        saved = Checkpoint.load(path)
+        learner = Learner(replace(saved.recipe, num_envs=1, processes=1))
+        learner.restore(saved)
+        assert path.stat().st_size < 2e6 and np.isfinite(learner.predict(learner.normaliser.reset())).all()  # type: ignore[arg-type]
 
 
 def test_what_is_shown_in_a_film_is_hidden_from_the_policy() -> None:

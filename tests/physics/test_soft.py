@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
@@ -15,6 +16,7 @@ from raytac.physics.rigid import RigidPad
 from raytac.physics.soft import SoftPad
 from raytac.physics.soft_contact import SoftContact
 from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.soft_reading import UNSOLVED, UnsolvedContactWarning
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
@@ -109,6 +111,50 @@ def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
     assert np.abs(moved - moved[:, ::-1] * [-1.0, 1.0, 1.0]).max() < 2e-7
 
 
+def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
+    pad, states = pressed
+    for state in states:
+        surface, reading = pad.surface(state), state.reading
+        assert surface.coat is not None and reading is not None
+        x, y, z = surface.coat.positions[0].T
+        inside = (np.abs(x) < 8e-3) & (np.abs(y) < 6e-3)
+        node = [np.interp(at[inside], line, np.arange(len(line))) for at, line in ((y, pad.grid.y), (x, pad.grid.x))]
+        shown = map_coordinates(surface.height[0].astype(float), node, order=1)
+        assert np.abs(z[inside] - shown).max() < (
+            0.3e-6 if surface.contact.any() else 2e-6
+        )  # bilinear on a dome, or a spline's own nodes
+    touching = reached(states).reading
+    assert np.abs(touching.surface.coat.positions - touching.vertices).max() > 20e-6  # the mesh alone is not there
+
+
+def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
+    """What touches sticks: on cells as wide as the contact the mesh spreads by 30 µm, markers may not.
+
+    The area of contact is that of a pad with cells of 0.25 mm, 4.39 mm² (``experiments/bench_coat.py --shapes ball``), within 3 %.
+    """
+    pad = SoftPad(SENSOR, press(indent(0.3e-3)), pitch=0.1e-3)
+    reading = pad.peak(pad.run()).reading
+    assert reading is not None and reading.surface.coat is not None
+    assert reading.surface.contact.sum() * np.prod(pad.grid.pitch) == pytest.approx(4.39e-6, rel=0.03)
+    rest = reading.surface.coat.mesh.rest
+    under = np.hypot(*rest[:, :2].T) < 1.2e-3
+    mesh, skin = (np.linalg.norm((at - rest)[0, under, :2], axis=1) for at in (reading.vertices, reading.surface.coat.positions))
+    assert under.sum() == 5 and mesh.max() > 25e-6 and skin.max() < 6e-6
+
+
+def test_a_contact_that_is_not_found_is_told_of_once(monkeypatch):
+    from raytac.gel import fine_contact
+
+    pad = soft(press(indent(0.3e-3)))
+    state = pad.peak(pad.run())
+    assert state.reading is not None and state.reading.residual[0] < 1e-6
+    monkeypatch.setattr(fine_contact, "_ROUNDS", 2)
+    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as told:
+        states = list(pad.run(2))
+    left = [state.reading.residual[0] for state in states if state.reading is not None]
+    assert len(told) == 1 and np.isnan(left[0]) and left[-1] > UNSOLVED
+
+
 def test_a_release_leaves_the_pad_at_rest(pressed):
     pad, states = pressed
     last = states[-1]
@@ -162,8 +208,10 @@ def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
     one, two = rigid.surface(state), pad.surface(reached(states))
     both = one.contact[0] & two.contact[0]
     assert both.sum() > 20 and np.abs(one.height[0] - two.height[0])[both].max() < 10e-6
-    areas = [surface.contact.sum() * PITCH**2 for surface in (one, two)]
-    assert areas[1] == pytest.approx(areas[0], rel=0.35)  # coarse cells of 1 mm
+    # What the rigid pad touches, about π R δ as on a half-space, the simulated one touches too, and more, as a layer does, but not 2 π R δ.
+    assert one.contact[0].sum() * PITCH**2 == pytest.approx(math.pi * RADIUS * 0.6e-3, rel=0.06)
+    assert two.contact[0][one.contact[0]].mean() > 0.99
+    assert 1.1 < two.contact[0].sum() * PITCH**2 / (math.pi * RADIUS * 0.6e-3) < 1.6
     # The gel hardly changes its volume: pressed down in one place it comes up around it, which Gaussians cannot.
     assert two.indentation.min() < -5e-6 and one.indentation.min() > -1e-7
     rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
@@ -382,20 +430,22 @@ def test_the_rigid_pad_refuses_a_soft_object():
 
 
 def test_force_against_depth_is_the_bonded_layers():
-    """Without friction, small strain: Dimitriadis' law of a sphere on a bonded layer, which LoadLaw is held to, within 5 %."""
+    """Without friction, small strain, cells of 0.4 mm in the middle: Dimitriadis' law of a sphere on a bonded layer, as in LoadLaw.
+
+    The exponent of force over depth is met within 5 %. The force itself is up to 12 % too large, since the contact's radius has 2.5 cells;
+    with five it is within 5 % (tests/ipc/test_statics.py).
+    """
     fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
     scene = press(indent(0.15e-3), indent(0.3e-3))
     pad = soft(scene, FRICTIONLESS, pad=pad_mesh(SENSOR.gelpad, fine))
     force = [state.normal_force[0] for state in pad.run()][1:]
-    grid = pad.grid
     x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
     gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)
     law = LoadLaw(gap + SENSOR.gelpad.sag(x, y), 1e-5**2, SENSOR.gelpad)
     slope = math.log(force[1] / force[0]) / math.log(2.0)
     expected = math.log(law.force(0.3e-3) / law.force(0.15e-3)) / math.log(2.0)
     assert slope == pytest.approx(expected, rel=0.05)
-    assert force[1] == pytest.approx(law.force(0.3e-3), rel=0.12)
-    assert len(grid.x) > 10
+    assert law.force(0.3e-3) < force[1] < 1.12 * law.force(0.3e-3)
 
 
 def test_an_untouched_pad_needs_no_solver():

@@ -48,6 +48,23 @@ def test_a_soft_ball_leaves_a_symmetric_imprint_shallower_than_its_way(soft):
     assert np.abs(state.shear_force[0]).max() < 0.01 * state.normal_force[0]
 
 
+def test_a_soft_balls_imprint_has_no_facets(soft):
+    """Ripple in contact, what a polynomial of degree 8 leaves: less than a third of that of the ball's own triangles."""
+    pad, _ = soft
+    assert pad.solver is not None
+    seen = pad.solver.seen(pad._drive.poses())
+    facets = replace(seen.objects[0], surface=pad.solver.scene.mesh("object", "pad"))
+    x, y = (a / 3e-3 for a in np.meshgrid(pad.grid.x, pad.grid.y))
+    inside = np.hypot(x, y) < 0.3
+    powers = np.stack([x[inside] ** i * y[inside] ** j for i in range(9) for j in range(9 - i)], axis=1)
+    ripple = []
+    for objects in (seen.objects, (facets,)):
+        height = pad._reader.read(replace(seen, objects=objects), np.zeros(1, bool)).surface.height[0].astype(float)[inside]
+        left = height - powers @ np.linalg.lstsq(powers, height, rcond=None)[0]
+        ripple.append(float(np.sqrt((left**2).mean())))
+    assert ripple[0] < 0.3 * ripple[1] and ripple[1] > 0.4e-6, f"ripple {ripple}"
+
+
 def test_what_drives_a_soft_ball_is_what_the_case_feels(soft):
     pad, state = soft
     assert pad.solver is not None

@@ -66,6 +66,39 @@ def test_reset_restores(resting: TactileWorld) -> None:
     np.testing.assert_allclose(again.wrench["sensor"], first.wrench["sensor"], atol=1e-6)
 
 
+def test_reset_restores_links_bodies_gels_and_the_coupling() -> None:
+    """A gripper of servos closes on a cube of MuJoCo's, two-way, in one of two environments that is then reset and does the same again."""
+    cube = BodySpec("cube", "box", {"length": 0.01, "width": 0.01, "height": 0.01}, dynamics="free", owner="mujoco", mass=0.02)
+    gripper = RobotSpec("floating_gripper", opening=0.0102)
+    scene = TaskScene("grip", gripper, (cube,), physics="ipc", timestep=0.002, gravity=(0.0, 0.0, 0.0))
+    world = TactileWorld(scene, outputs=("wrench",), num_envs=2)
+    opening = world.composed.opening
+    assert opening is not None
+    begin, gels = world.state(), {name: world.mesh(name)[0] for name in world.sensor_names}
+
+    def close(data: mujoco.MjData, time: float) -> None:
+        data.ctrl[:] = world.composed.ctrl
+        data.ctrl[opening] -= min(0.02 * time, 4e-4)
+
+    first = [world.step(close) for _ in range(4)]
+    assert np.linalg.norm(first[-1].wrench["left"][1]) > 0.05 and world.data[1].xfrc_applied.any()
+    at = world.reset([1])
+    for field in ("time", "joints"):
+        np.testing.assert_array_equal(getattr(at, field)[1], getattr(begin, field)[1])
+    for name in world.sensor_names:
+        np.testing.assert_array_equal(at.world_from_pad[name][1], begin.world_from_pad[name][1])
+        np.testing.assert_array_equal(at.wrench[name][1], 0.0)
+        np.testing.assert_array_equal(world.mesh(name)[0][1], gels[name][1])
+    np.testing.assert_array_equal(at.world_from_body["cube"][1], begin.world_from_body["cube"][1])
+    assert not world.data[1].xfrc_applied.any() and not world.data[1].qvel.any()
+    np.testing.assert_array_equal(at.world_from_body["cube"][0], first[-1].world_from_body["cube"][0])
+    again = [world.step(close) for _ in range(4)]
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_allclose(other.world_from_body["cube"][1], one.world_from_body["cube"][1], atol=1e-9)
+        for name in world.sensor_names:
+            np.testing.assert_allclose(other.wrench[name][1], one.wrench[name][1], atol=1e-6)
+
+
 def test_a_start_that_overlaps_is_refused() -> None:
     with pytest.raises(OverlapError, match="overlap where they start"):
         TactileWorld(replace(UP, bodies=(replace(BALL, position=(0.0, 0.0, 0.0047)),)))

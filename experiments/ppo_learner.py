@@ -1,0 +1,301 @@
+"""What is trained and what it is trained in: recipes, networks, environments with their normaliser, checkpoints, evaluation."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
+
+from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
+from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
+from raytac.errors import InputError
+from raytac.observe import ObservationSettings
+from raytac.report.proportion import wilson_interval
+
+__all__ = ["HELD_OUT", "KINDS", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
+
+KINDS: Mapping[str, type[TactileVectorEnv]] = {
+    "PushCube": PushCubeVectorEnv,
+    "BalancePole": BalancePoleVectorEnv,
+    "LiftCube": LiftCubeVectorEnv,
+    "RollBall": RollBallVectorEnv,
+}
+HELD_OUT = 2**31
+"""Seeds of evaluation start here; those of training are below."""
+_SMALL = 64
+"""Observations of up to so many numbers go into the network as they are."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that decides what is trained; a checkpoint holds it."""
+
+    task: str
+    tactile: str
+    """``task``: as the environment has it; ``none``; or modalities joined by ``+``."""
+    seed: int
+    steps: int
+    """Environment steps of the whole training; the learning rate falls to a tenth over them."""
+    num_envs: int = 16
+    processes: int = 1
+    history: int = 1
+    """Last observations that the policy is given."""
+    rollout: int = 64
+    """Steps of each environment between two updates."""
+    segment: int = 20
+    """Rollouts between two checkpoints."""
+    epochs: int = 10
+    minibatch: int = 256
+    learning_rate: float = 1e-3
+    gamma: float = 0.98
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    log_std: float = -0.5
+    """Logarithm of the first standard deviation of an action."""
+    entropy: float = 0.0
+    hidden: int = 64
+    teacher_steps: int = 0
+    """Of the steps, so many at first imitate the scripted policy, which knows the state; 0 is PPO alone."""
+    device: str = "cpu"
+    """Of the network and of the sensors."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes of the deterministic policy on held-out seeds; success is that of an episode's last step."""
+
+    episodes: int
+    successes: int
+    mean_return: float
+    mean_length: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the success rate."""
+        return wilson_interval(self.successes, self.episodes)
+
+
+def tactile_settings(name: str) -> ObservationSettings | str | None:
+    """What ``TaskBatch`` takes for a name such as ``none``, ``markers`` or ``markers+wrench``; images are 32 x 32."""
+    if name == "none":
+        return None
+    if name == "task":
+        return "task"
+    return ObservationSettings(tuple(name.split("+")), resolution=(32, 32) if "rgb" in name.split("+") else None)
+
+
+class KeyedExtractor(BaseFeaturesExtractor):
+    """Features of a dictionary: few numbers as they are, many through one layer to 32, images through DQN's convolutions to 64.
+
+    Without it a thousand numbers of markers would drown the dozen of the arm in the first layer.
+    """
+
+    def __init__(self, observation_space: spaces.Dict) -> None:
+        ways: dict[str, torch.nn.Module] = {}
+        size = 0
+        for name, space in observation_space.spaces.items():
+            assert isinstance(space, spaces.Box)
+            count = int(np.prod(space.shape))
+            if space.dtype == np.uint8:
+                ways[name], n = NatureCNN(space, 64), 64
+            elif count <= _SMALL:
+                ways[name], n = torch.nn.Flatten(), count
+            else:
+                ways[name], n = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(count, 32), torch.nn.Tanh()), 32
+            size += n
+        super().__init__(observation_space, size)
+        self.ways = torch.nn.ModuleDict(ways)
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        return torch.cat([way(observations[name]) for name, way in self.ways.items()], dim=1)
+
+
+class _Without(VecEnvWrapper):
+    """Takes modalities away from what is observed."""
+
+    def __init__(self, venv: VecEnv, hidden: Sequence[str]) -> None:
+        assert isinstance(venv.observation_space, spaces.Dict)
+        self._kept = [name for name in venv.observation_space.spaces if not name.endswith(tuple(f"_{m}" for m in hidden))]
+        super().__init__(venv, spaces.Dict({name: venv.observation_space[name] for name in self._kept}))
+
+    def reset(self) -> dict[str, np.ndarray]:
+        return self._cut(self.venv.reset())
+
+    def step_wait(self) -> Any:
+        observation, reward, done, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = self._cut(info["terminal_observation"])
+        return self._cut(observation), reward, done, infos
+
+    def _cut(self, observation: Any) -> dict[str, np.ndarray]:
+        return {name: observation[name] for name in self._kept}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A recipe, how far it is, and every number that training changes. On disk: tensors, numbers and names, no code."""
+
+    recipe: Recipe
+    steps: int
+    policy: dict[str, Any]
+    optimizer: dict[str, Any]
+    normaliser: dict[str, Any]
+
+    def save(self, path: Path, *, resumable: bool = True) -> None:
+        """Write it; never half. Without the optimiser's state (``resumable=False``) it is a third as large and good for playing."""
+        part = path.with_name(path.name + ".partial")
+        values = {
+            "recipe": asdict(self.recipe),
+            "steps": self.steps,
+            "policy": self.policy,
+            "optimizer": self.optimizer if resumable else {},
+            "normaliser": self.normaliser,
+        }
+        torch.save(values, part)
+        os.replace(part, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Checkpoint:
+        """Raises ``InputError`` for a file that is none."""
+        try:
+            values = torch.load(path, map_location="cpu", weights_only=True)
+            return cls(Recipe(**values["recipe"]), *(values[name] for name in ("steps", "policy", "optimizer", "normaliser")))
+        except FileNotFoundError as error:
+            raise InputError("checkpoint", value=path, rule="must be a file that exists") from error
+        except Exception as error:
+            raise InputError("checkpoint", value=path, rule=f"must be a checkpoint of train_ppo ({error})") from error
+
+
+class Learner:
+    """Environments, their normaliser and PPO's networks, by a recipe."""
+
+    def __init__(self, recipe: Recipe, *, hidden: Sequence[str] = (), **overrides: Any) -> None:
+        """Make all.
+
+        Args:
+            recipe: what is trained.
+            hidden: modalities that ``overrides`` make the environments observe for a picture, but that the policy is not given.
+            overrides: options of ``TactileVectorEnv`` in place of those of the recipe.
+
+        Raises:
+            InputError: an unknown task or modality, or several processes while a scripted policy teaches.
+        """
+        if recipe.task not in KINDS:
+            raise InputError("task", value=recipe.task, rule="must be a known task", choices=tuple(KINDS))
+        if recipe.teacher_steps and recipe.processes > 1:
+            rule = "must be 1 while a scripted policy teaches: it sees the state, which other processes keep"
+            raise InputError("processes", value=recipe.processes, rule=rule)
+        self.recipe = recipe
+        options: dict[str, Any] = {"tactile": tactile_settings(recipe.tactile), "device": recipe.device, **overrides}
+        kind, count = KINDS[recipe.task], recipe.num_envs
+        self.base: TactileVecEnv | ProcessVecEnv
+        if recipe.processes > 1:
+            self.base = ProcessVecEnv(kind, num_envs=count, processes=recipe.processes, seed=recipe.seed, **options)
+        else:
+            self.base = TactileVecEnv(kind(count, seed=recipe.seed, **options))
+        seen: VecEnv = _Without(self.base, hidden) if hidden else self.base
+        stacked: VecEnv = VecFrameStack(seen, recipe.history) if recipe.history > 1 else seen
+        space = stacked.observation_space
+        assert isinstance(space, spaces.Dict)
+        numbers = [name for name, box in space.spaces.items() if box.dtype == np.float32]
+        watched = VecMonitor(stacked, info_keywords=("success",))
+        self.normaliser = VecNormalize(watched, gamma=recipe.gamma, norm_obs_keys=numbers)
+        torch.manual_seed(recipe.seed)
+        self.model = PPO(
+            "MultiInputPolicy",
+            self.normaliser,
+            learning_rate=self._rate,
+            n_steps=recipe.rollout,
+            batch_size=min(recipe.minibatch, recipe.rollout * count),
+            n_epochs=recipe.epochs,
+            gamma=recipe.gamma,
+            gae_lambda=recipe.gae_lambda,
+            clip_range=recipe.clip_range,
+            ent_coef=recipe.entropy,
+            policy_kwargs={
+                "log_std_init": recipe.log_std,
+                "net_arch": [recipe.hidden, recipe.hidden],
+                "features_extractor_class": KeyedExtractor,
+            },
+            device=recipe.device,
+        )
+
+    def _rate(self, _: float) -> float:
+        done = self.model.num_timesteps if hasattr(self, "model") else 0
+        return self.recipe.learning_rate * max(0.1, 1.0 - done / self.recipe.steps)
+
+    def checkpoint(self) -> Checkpoint:
+        """As it is now."""
+        obs, ret = self.normaliser.obs_rms, self.normaliser.ret_rms
+        assert isinstance(obs, dict)
+        normaliser = {"return": _moments(ret), "observation": {name: _moments(rms) for name, rms in obs.items()}}
+        policy, optimizer = self.model.policy.state_dict(), self.model.policy.optimizer.state_dict()
+        return Checkpoint(self.recipe, self.model.num_timesteps, policy, optimizer, normaliser)
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint of the same recipe (but for how the environments are spread).
+
+        Raises ``InputError`` for a network of another shape.
+        """
+        try:
+            self.model.policy.load_state_dict(saved.policy)
+        except RuntimeError as error:
+            raise InputError(
+                "checkpoint", value=saved.recipe, rule=f"must be of this task and these observations ({error})"
+            ) from error
+        if saved.optimizer:
+            self.model.policy.optimizer.load_state_dict(saved.optimizer)
+        assert isinstance(self.normaliser.obs_rms, dict)
+        _set_moments(self.normaliser.ret_rms, saved.normaliser["return"])
+        for name, rms in self.normaliser.obs_rms.items():
+            _set_moments(rms, saved.normaliser["observation"][name])
+        self.model.num_timesteps = saved.steps
+
+    def predict(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The deterministic policy's actions for observations that the normaliser has seen."""
+        return self.model.predict(dict(observation), deterministic=True)[0]
+
+    def close(self) -> None:
+        """End what runs beside."""
+        self.base.close()
+
+
+def _moments(rms: RunningMeanStd) -> dict[str, Any]:
+    return {"mean": torch.as_tensor(np.asarray(rms.mean)), "var": torch.as_tensor(np.asarray(rms.var)), "count": float(rms.count)}
+
+
+def _set_moments(rms: RunningMeanStd, saved: Mapping[str, Any]) -> None:
+    rms.mean, rms.var, rms.count = saved["mean"].numpy().copy(), saved["var"].numpy().copy(), saved["count"]
+
+
+def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluation:
+    """The first episode of each environment from held-out seeds ``first_seed``, …, in rounds; at least ``episodes`` of them."""
+    env = learner.model.get_env()
+    assert env is not None
+    learner.normaliser.training = False
+    returns, lengths, successes = [], [], 0
+    try:
+        while len(returns) < episodes:
+            env.seed(HELD_OUT + first_seed + len(returns))
+            observation, running = env.reset(), np.ones(env.num_envs, bool)
+            while running.any():
+                observation, _, done, infos = env.step(learner.predict(observation))  # type: ignore[arg-type]
+                for b in np.flatnonzero(running & done):
+                    returns.append(infos[b]["episode"]["r"])
+                    lengths.append(infos[b]["episode"]["l"])
+                    successes += infos[b]["success"]
+                running &= ~done
+    finally:
+        learner.normaliser.training = True
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))

@@ -1,0 +1,389 @@
+"""Lights, response, imprint and contact circles fitted at once to photographs of ball presses, with direct light as forward model.
+
+Residuals are those of the presses with the real background B as flat field, and of the image at rest,
+
+    I = encode((decode(B) − b) · L(pressed) / L(rest) + b),
+
+solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks (shadows, inter-reflection, the size
+of LEDs) can be given as ``extra`` light of every LED (``ray_fit``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.calibrate.direct_light import LedLight, case_light, led_light
+from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
+from raytac.calibrate.light_parameters import CEILING, DARKEST, REFERENCE_DISTANCE, LightParameters, darkest
+from raytac.calibrate.photographs import Photographs, decode, encode
+from raytac.specs import LightsSpec, SensorSpec
+
+__all__ = ["DirectFit", "FitSettings", "FitState", "Light"]
+
+SIGMA = {
+    "place": 4.0,
+    "aim": 0.6,
+    "lobe": 2.0,
+    "power": 2.0,
+    "glow": 0.5,
+    "gamma": 0.5,
+    "stray": 0.5,
+    "vignette": 0.5,
+    "slope": 0.15,
+}
+"""How far a parameter is believed to be from its start: mm, rad, 1, full scales (own channel), …"""
+CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5])
+"""How far [px] a contact circle is believed to be from its label: x, y, radius."""
+PRIOR = 30.0
+"""Squared residual [levels²] that a deviation of one sigma is worth."""
+CIRCLE_PRIOR = 300.0
+"""The same of a circle."""
+ACTIVE = 6
+"""Most times that a step is solved for with more parameters at their bounds."""
+STEP = 1e-5
+"""Step of the derivatives by response and imprint."""
+REST_FACTOR = 8
+"""The image at rest is fitted as means of so many pixels squared."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a fit does."""
+
+    reach: float = 2.2
+    """Pixels up to this many radii from a circle's centre count."""
+    ring_weight: float = 0.5
+    """Weight of a residual outside the labelled circle."""
+    rest_weight: float = 0.3
+    """Weight of the whole image at rest over that of the presses."""
+    huber: float = 6.0
+    """Residual [levels] from which on it counts linearly."""
+    samples: tuple[int, int] = (150, 90)
+    """Pixels of every press that count, drawn at random inside the labelled circle and outside."""
+    circles: bool = True
+    """Whether circles are fitted."""
+    fixed: tuple[str, ...] = ()
+    """Blocks of parameters that stay: names of ``SIGMA``."""
+
+
+@dataclass(frozen=True)
+class FitState:
+    """Where a fit stands: lights and response, s of the imprint at its inner knots, circles (N, 3) [px]."""
+
+    p: LightParameters
+    slopes: np.ndarray
+    circles: np.ndarray
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light of every LED at power 1 by channel, each (L, M, 3): in the pixels of presses, in the same at rest, over the image at rest."""
+
+    pressed: np.ndarray
+    flat: np.ndarray
+    rest: np.ndarray
+
+
+class DirectFit:
+    """The least-squares problem. Pixels are those near the circles of ``shots``, which also are the prior of the circles."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        shots: Photographs,
+        start: FitState,
+        settings: FitSettings,
+        *,
+        factor: int = 2,
+        extra: Light | None = None,
+        seed: int = 0,
+    ) -> None:
+        """``factor``: images are means of factor × factor pixels; ``start`` is the prior of lights and imprint."""
+        self.sensor, self.shots, self.start, self.settings = sensor, shots, start, settings
+        small, coarse = shots.shrunk(factor), shots.shrunk(REST_FACTOR)
+        height, width = small.background.shape[:2]
+        rho = small.distance(sensor)
+        self.press, self.row, self.column = _draw(rho, settings, seed)
+        self.inside = rho[self.press, self.row, self.column] < 1
+        self.u, self.v = factor * (self.column + 0.5), factor * (self.row + 0.5)
+        self.real = small.presses[self.press, self.row, self.column].astype(float)
+        self.behind = small.background[self.row, self.column].astype(float)
+        rest_v, rest_u = REST_FACTOR * (np.mgrid[: coarse.background.shape[0], : coarse.background.shape[1]] + 0.5)
+        self.rest_u, self.rest_v = rest_u.ravel(), rest_v.ravel()
+        self.rest_real = coarse.background.reshape(-1, 3).astype(float)
+        self.share = np.where(self.inside, 1.0, settings.ring_weight)[:, None]
+        self.rest_share = settings.rest_weight * np.sqrt(len(self.press) / len(self.rest_u))
+        native, (cx, cy) = sensor.camera.resolution, sensor.camera.principal_point
+        self.r2 = (((self.rest_u - cx) ** 2 + (self.rest_v - cy) ** 2) / (native[0] ** 2 + native[1] ** 2) * 4)[:, None]
+        self.darkest = darkest(shots.background, 1.0)
+        coat = sensor.coat
+        diffuse = (1 - coat.specular) * np.array(coat.reflectance)
+        self.even_gain = (diffuse + coat.specular) / diffuse
+        self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
+        self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
+        self.extra, self.shape = extra, (height, width)
+
+    # ------------------------------------------------------------------ forward model
+
+    def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
+        return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
+
+    def geometry(self, state: FitState) -> PixelGeometry:
+        """What the pixels of presses see."""
+        return self._geometry(state, self.u, self.v, self.press)
+
+    def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
+        """Light at what ``seen`` gives, at the same pixels at rest and over the image at rest."""
+        geometries = (seen, self.flat_geometry, self.rest_geometry)
+        return Light(
+            *(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE).light for led in p.leds]) for g in geometries)
+        )
+
+    def _led_layers(self, p: LightParameters, seen: PixelGeometry, direct: list[np.ndarray]) -> np.ndarray:
+        """(L, M, 3): direct light of every LED and the even glow that goes with it."""
+        even = case_light(seen)[:, None] * self.even_gain
+        return np.stack([light[:, None] + p.glow[k] * even for light, k in zip(direct, p.layer, strict=True)])
+
+    def total(self, p: LightParameters, light: Light) -> list[np.ndarray]:
+        """Linear light (M, 3) in the pixels of presses, in the same at rest, over the image at rest."""
+        parts = self._with_extra(light)
+        return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in parts]
+
+    def _with_extra(self, light: Light) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if self.extra is None:
+            return light.pressed, light.flat, light.rest
+        return light.pressed + self.extra.pressed, light.flat + self.extra.flat, light.rest + self.extra.rest
+
+    def images(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Levels of the presses' pixels (M, 3) and of the image at rest (K, 3)."""
+        gamma, *stray, a1, a2 = p.response
+        black = np.array(stray) * self.darkest**gamma
+        pressed, flat, rest = total
+        image = encode((decode(self.behind, gamma) - black) * pressed / flat + black, gamma)
+        return image, encode(rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, gamma)
+
+    # ------------------------------------------------------------------ parameters as one vector
+
+    def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
+        """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
+        per_led = [("place", 3), ("aim", 2), ("lobe", 1)] * len(p.leds)
+        slopes = len(self.start.slopes)
+        rest = [("power", p.power.size), ("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", slopes)]
+        return per_led + rest
+
+    def sigma(self, p: LightParameters) -> np.ndarray:
+        return np.concatenate([np.full(n, SIGMA[name]) for name, n in self.blocks(p)])
+
+    def free(self, p: LightParameters) -> np.ndarray:
+        return np.concatenate([np.full(n, name not in self.settings.fixed) for name, n in self.blocks(p)])
+
+    def flat(self, state: FitState) -> np.ndarray:
+        p = state.p
+        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, state.slopes])
+
+    def at(self, x: np.ndarray, circles: np.ndarray) -> FitState:
+        p = self.start.p
+        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6])
+        leds, power, glow, response, slopes = np.split(x, cuts)
+        changed = dataclasses.replace(p, leds=leds.reshape(-1, 6), power=power.reshape(-1, 3), glow=glow, response=response)
+        return FitState(changed, slopes, circles)
+
+    def inside_bounds(self, state: FitState) -> FitState:
+        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], nothing negative."""
+        p, half = state.p, 5e2 * np.array(self.sensor.case.size)
+        leds, response = p.leds.copy(), p.response.copy()
+        leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
+        reach = 0.02 + _reach(p.template, leds)
+        floor = 1e3 * self.sensor.case.floor_z
+        leds[:, :3] = np.clip(leds[:, :3], reach + np.array([-half[0], -half[1], floor]), np.array([*half, CEILING]) - reach)
+        response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
+        a1 = np.clip(response[4], -2.0, 0.5)
+        response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
+        changed = dataclasses.replace(p, leds=leds, power=np.maximum(p.power, 0), glow=np.maximum(p.glow, 0), response=response)
+        circles = state.circles.copy()
+        circles[:, 2] = np.clip(circles[:, 2], 3, None)
+        return FitState(changed, state.slopes, circles)
+
+    # ------------------------------------------------------------------ least squares
+
+    def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
+        """Levels by which the presses' pixels (M, 3) and the image at rest (K, 3) are off, not weighted."""
+        image, rest = self.images(state.p, self.total(state.p, self.light(state.p, self.geometry(state))))
+        return image - self.real, rest - self.rest_real
+
+    def weights(self, off: np.ndarray, limit: float) -> np.ndarray:
+        """Huber's weights of residuals: 1 up to ``limit``, then falling."""
+        return np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-9))
+
+    def cost(self, state: FitState, off: tuple[np.ndarray, np.ndarray]) -> float:
+        h = self.settings.huber
+        robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in off]
+        x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
+        c = (state.circles - self.shots.circles) / CIRCLE_SIGMA
+        images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
+        return float(images + PRIOR * (x @ x) + CIRCLE_PRIOR * (c * c).sum())
+
+    def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Slopes of the presses' pixels (3M, G) and of the image at rest (3K, G) by the vector, of the first by their own press's circle
+        (3M, 3), and the two images."""
+        p, seen = state.p, self.geometry(state)
+        geometries = (seen, self.flat_geometry, self.rest_geometry)
+        leds = [[led_light(g, led, REFERENCE_DISTANCE) for led in p.leds] for g in geometries]
+        light = Light(*(self._led_layers(p, g, [one.light for one in part]) for g, part in zip(geometries, leds, strict=True)))
+        total = self.total(p, light)
+        image, rest = self.images(p, total)
+        gains = self._gains(p, image, rest, total)
+        count, slopes = len(p.leds), len(state.slopes)
+        jac = np.empty((9 * count + 9 + slopes, image.size), np.float32)
+        rest_jac = np.zeros((len(jac), rest.size), np.float32)
+
+        def column(k: int, pressed: np.ndarray, flat: np.ndarray, still: np.ndarray) -> None:
+            jac[k] = (gains[0] * pressed - gains[1] * flat).ravel()
+            rest_jac[k] = (gains[2] * still).ravel()
+
+        for led in range(count):
+            for k in range(6):
+                column(6 * led + k, *(part[led].by_led[k][:, None] * p.power[led] for part in leds))
+        parts = self._with_extra(light)
+        for led in range(count):
+            for c in range(3):
+                column(6 * count + 3 * led + c, *(part[led] * np.eye(3)[c] for part in parts))
+        for k in range(3):
+            power = p.power[p.layer == k].sum(0) * self.even_gain
+            column(9 * count + k, *(case_light(g)[:, None] * power for g in geometries))
+        for k in range(6):
+            response = p.response + STEP * np.eye(6)[k]
+            other, other_rest = self.images(dataclasses.replace(p, response=response), total)
+            jac[9 * count + 3 + k] = ((other - image) / STEP).ravel()
+            rest_jac[9 * count + 3 + k] = ((other_rest - rest) / STEP).ravel()
+        by_point, by_normal = self._by_geometry(p, leds[0])
+
+        def moved(slopes: np.ndarray, circles: np.ndarray, step: float) -> np.ndarray:
+            new = self.geometry(FitState(p, slopes, circles))
+            change = np.einsum("kmc,km->mc", by_point, new.p - seen.p) + np.einsum("kmc,km->mc", by_normal, new.n - seen.n)
+            return (gains[0] * change / step).ravel()
+
+        for k in range(slopes):
+            jac[9 * count + 9 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
+        circles = np.zeros((image.size, 3), np.float32)
+        if self.settings.circles:
+            for k in range(3):
+                circles[:, k] = moved(state.slopes, state.circles + 1e-3 * np.eye(3)[k], 1e-3)
+        return jac.T, rest_jac.T, circles, (image, rest)
+
+    def _by_geometry(self, p: LightParameters, leds: list[LedLight]) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes (3, M, 3) of the linear light of presses by a pixel's point [1/m] and by its normal."""
+        by_point, by_normal = np.zeros((2, 3, len(self.press), 3))
+        for led, power, layer in zip(leds, p.power, p.layer, strict=True):
+            by_point -= 1e3 * led.by_led[:3, :, None] * power
+            by_normal += led.by_normal[:, :, None] * power
+            by_normal[2] -= 0.5 * p.glow[layer] * self.even_gain * power
+        return by_point, by_normal
+
+    def _gains(
+        self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slopes of levels by light pressed, by light at rest in the same pixels (with the sign turned), and of the rest image."""
+        gamma, *stray, _, _ = p.response
+        black = np.array(stray) * self.darkest**gamma
+
+        def slope(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            linear = np.maximum((np.maximum(levels, 0.1) / 255) ** gamma, 1e-6)
+            return levels / gamma / linear, linear
+
+        by_linear, linear = slope(image)
+        lit = by_linear * (linear - black)
+        rest_by, rest_linear = slope(rest)
+        return lit / total[0], lit / total[1], rest_by * (rest_linear - black) / total[2]
+
+    def step(self, state: FitState) -> Callable[[float], FitState]:
+        """The normal equations at ``state``; the result gives the trial state of any damping."""
+        settings, count = self.settings, len(self.shots.circles)
+        jac, rest_jac, circles, (image, rest) = self.jacobian(state)
+        off, rest_off = image - self.real, rest - self.rest_real
+        w = (self.weights(off, settings.huber) * self.share**2).ravel().astype(np.float32)
+        rest_w = (self.weights(rest_off, settings.huber) * self.rest_share**2).ravel().astype(np.float32)
+        free = self.free(state.p)
+        x, x0, sigma = self.flat(state), self.flat(self.start), self.sigma(state.p)
+        size = len(x)
+        n = size + 3 * count
+        normal, slope = np.zeros((n, n)), np.zeros(n)
+        normal[:size, :size] = (jac.T * w) @ jac + (rest_jac.T * rest_w) @ rest_jac + np.diag(PRIOR / sigma**2)
+        slope[:size] = (jac.T * w) @ off.ravel() + (rest_jac.T * rest_w) @ rest_off.ravel() + PRIOR * (x - x0) / sigma**2
+        own = np.repeat(self.press, 3)
+        first = np.searchsorted(own, np.arange(count + 1))
+        for k in range(count):
+            a, b = slice(first[k], first[k + 1]), slice(size + 3 * k, size + 3 * k + 3)
+            weighted = circles[a].T * w[a]
+            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / CIRCLE_SIGMA**2)
+            normal[b, :size] = weighted @ jac[a]
+            normal[:size, b] = normal[b, :size].T
+            slope[b] = weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / CIRCLE_SIGMA**2
+        pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
+        stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
+        movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])
+
+        def trial(damping: float) -> FitState:
+            damped = normal + np.diag(damping * np.diag(normal))
+            change, move = np.zeros(n), movable.copy()
+            # What would leave its bounds is put there, and the others are solved for once more: a cut step alone is no step downhill.
+            for _ in range(ACTIVE):
+                fixed = damped[np.ix_(move, ~move)] @ change[~move]
+                change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move] - fixed)
+                wanted = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
+                allowed = self.inside_bounds(wanted)
+                over = move[:size] & (np.abs(self.flat(allowed) - self.flat(wanted)) > 1e-12)
+                if not over.any():
+                    break
+                change[:size][over] = (self.flat(allowed) - x)[over]
+                move[:size] &= ~over
+            return self.inside_bounds(self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3)))
+
+        return trial
+
+    def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
+        """Levenberg and Marquardt's method from ``state``; ``tick`` is told every accepted state and its cost."""
+        damping, state, slow = 1e-2, self.inside_bounds(state), 0
+        cost = self.cost(state, self.residuals(state))
+        for _ in range(iterations):
+            trial = self.step(state)
+            while True:
+                new = trial(damping)
+                after = self.cost(new, self.residuals(new))
+                if after < cost or damping > 1e7:
+                    break
+                damping *= 4
+            if not after < cost:
+                break
+            slow = slow + 1 if cost - after < 1e-4 * cost else 0
+            state, cost, damping = new, after, max(damping / 5, 1e-7)
+            if tick is not None:
+                tick(state, cost)
+            if slow == 4:
+                break
+        return state
+
+
+def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii. All where there are fewer than wanted."""
+    rng, found = np.random.default_rng(seed), []
+    for k, one in enumerate(rho):
+        for low, high, wanted in zip((0.0, 1.0), (1.0, settings.reach), settings.samples, strict=True):
+            row, column = np.nonzero((one >= low) & (one < high))
+            chosen = np.sort(rng.permutation(len(row))[:wanted])
+            found.append(np.stack([np.full(len(chosen), k), row[chosen], column[chosen]]))
+    press, row, column = np.concatenate(found, axis=1)
+    return press, row, column
+
+
+def _reach(lights: LightsSpec, leds: np.ndarray) -> np.ndarray:
+    """How far [mm] every LED's rectangle goes from its centre along x, y and z, (L, 3)."""
+    (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(leds[:, k]), np.cos(leds[:, k])) for k in (3, 4))
+    u = np.stack([-sin_a, cos_a, np.zeros(len(leds))], axis=1)
+    v = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
+    size = 5e2 * np.array([led.size for led in lights.leds])
+    return size[:, :1] * np.abs(u) + size[:, 1:] * np.abs(v)

@@ -1,0 +1,70 @@
+"""Direct light of point LEDs on a Lambertian coat, in NumPy, with its derivatives: what a fit can afford thousands of times.
+
+It is the diffuse part of the ray tracer's own sum (``raytac.optics.fast``) with one point an LED and no visibility:
+
+    D = c^n · cos θ · d₀² / r²,  c = −w · a,  cos θ = w · n_p,  w = (l − p) / r,
+
+for an LED at l with axis a and lobe n, a point p with normal n_p, and the distance d₀ at which power 1 is full scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.calibrate.imprint import PixelGeometry
+
+__all__ = ["LedLight", "case_light", "led_light"]
+
+_BEHIND = 1e-3
+"""Least cosine of an LED's lobe: keeps a power of it differentiable behind the LED, where it is next to nothing."""
+_SOFT = 1e-2
+"""Softness of the terminator: cosine over which a coat that turns away from an LED goes dark."""
+
+
+@dataclass(frozen=True)
+class LedLight:
+    """Light of one LED at M points, and its derivatives."""
+
+    light: np.ndarray
+    """D, (M,)."""
+    by_led: np.ndarray
+    """By a row of ``LightParameters.leds``, (6, M): position [1/mm], azimuth and elevation [1/rad], lobe."""
+    by_normal: np.ndarray
+    """By the point's normal, (3, M). By the point itself it is minus that by the LED's position."""
+
+
+def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLight:
+    """``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
+    azimuth, elevation, lobe = led[3:]
+    (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
+    axis, by_azimuth, by_elevation = np.array([[ce * ca, ce * sa, se], [-ce * sa, ce * ca, 0], [-se * ca, -se * sa, ce]])
+    d = 1e-3 * led[:3, None] - seen.p
+    inverse = 1 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    w = d * inverse
+    towards = -(axis @ w)
+    ahead = towards > _BEHIND
+    c = np.where(ahead, towards, _BEHIND)
+    log_c = np.log(c)
+    cosine = w[0] * seen.n[0] + w[1] * seen.n[1] + w[2] * seen.n[2]
+    root = np.sqrt(cosine * cosine + _SOFT**2)
+    soft = 0.5 * (cosine + root)
+    arriving = np.exp(lobe * log_c) * (reference * inverse) ** 2
+    light = arriving * soft
+    by_normal = arriving * (0.5 * (1 + cosine / root)) * w
+    steep = np.where(ahead, lobe / c, 0) * light
+    by_led = np.empty((6, len(light)))
+    # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
+    turned = by_normal[0] * w[0] + by_normal[1] * w[1] + by_normal[2] * w[2]
+    slope = arriving * (0.5 * (1 + cosine / root))
+    for k in range(3):
+        by_led[k] = -steep * (axis[k] + c * w[k]) + slope * seen.n[k] - (turned * cosine + 2 * light) * w[k]
+    by_led[:3] *= 1e-3 * inverse
+    by_led[3], by_led[4], by_led[5] = -steep * (by_azimuth @ w), -steep * (by_elevation @ w), light * log_c
+    return LedLight(light, by_led, by_normal)
+
+
+def case_light(seen: PixelGeometry) -> np.ndarray:
+    """Irradiance (M,) of a case of even radiance 1 / π on the coat: the share of the hemisphere that lies below the pad, (1 − n_z) / 2."""
+    return 0.5 * (1 - seen.n[2])

@@ -1,0 +1,144 @@
+"""The imprint of a ball as calibration sees it: one radial profile of slopes, shared by all presses, about each contact circle.
+
+Real photographs tell where a ball touched but not how the gel gave way around it. So the slope of the coat is a free function of the
+distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
+
+    sin θ(t) = s(t) · a / R,  s linear between ``KNOTS``,
+
+with R the ball's radius. A gel that wraps a rigid ball has s = t up to the rim, t = 1; beyond it s falls to 0. Heights are those slopes
+integrated inwards from where the gel is at rest, h(ρ) = a ∫ tan θ dt, added to the pad's dome.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.pad import rest_height
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["KNOTS", "RIGID_PAD", "WIDEST", "PixelGeometry", "circles_on_pad", "pixel_geometry", "press_surface"]
+
+KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4])
+"""Distances from the axis, over the contact radius, between which the slope is linear; it is 0 at the first and the last."""
+RIGID_PAD = np.array([0.3, 0.6, 0.69, 0.76, 0.72, 0.58, 0.46, 0.36, 0.24, 0.15, 0.06, 0.02])
+"""s at the inner knots, about as the rigid pad has it (docs/rigid-pad.md): where a fit starts."""
+WIDEST = 0.95
+"""Largest sine of a slope."""
+_TABLE = np.linspace(0, KNOTS[-1], 601)
+
+
+@dataclass(frozen=True)
+class PixelGeometry:
+    """What pixels see of the coat: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
+
+    p: np.ndarray
+    n: np.ndarray
+
+
+def _slope(slopes: np.ndarray, t: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """tan θ at ``t`` for a/R = ``share``; shapes broadcast."""
+    sine = np.clip(np.interp(t, KNOTS, np.concatenate([[0], slopes, [0]])) * share, -WIDEST, WIDEST)
+    return sine / np.sqrt(1 - sine * sine)
+
+
+def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """h over a at the places of ``_TABLE`` for every a/R, (N, T)."""
+    tan = _slope(slopes, _TABLE[None, :], share[:, None])
+    steps = 0.5 * (tan[:, 1:] + tan[:, :-1]) * (_TABLE[1] - _TABLE[0])
+    total = np.concatenate([np.zeros((len(share), 1)), np.cumsum(steps, axis=1)], axis=1)
+    return total[:, -1:] - total
+
+
+def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
+    """x, y and radius [m] in the pad frame of circles x, y, radius [px of the sensor's resolution], (N, 3).
+
+    A circle in the image is that of the rim, which lies about a² / 2R nearer to the camera than the pad at rest.
+    """
+    camera = sensor.camera
+    (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
+    u, v, r = np.asarray(circles, dtype=float).T
+    deep = 0.5 * (r * px) ** 2 / ball_radius
+    z = -deep
+    x, y = z, z
+    for _ in range(5):  # the pixel's ray meets the dome, moved by that depth
+        x = camera.position[0] + (u - cx) * px * (1 + z / distance)
+        y = camera.position[1] + (v - cy) * py * (1 + z / distance)
+        z = -sensor.gelpad.sag(x, y) - deep
+    return np.stack([x, y, r * px * (1 + z / distance)], axis=1)
+
+
+def pixel_geometry(
+    sensor: SensorSpec,
+    u: np.ndarray,
+    v: np.ndarray,
+    press: np.ndarray,
+    circles: np.ndarray,
+    ball_radius: np.ndarray,
+    slopes: np.ndarray,
+) -> PixelGeometry:
+    """What the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses with index ``press`` (M,) see.
+
+    ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
+    The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.
+    """
+    camera, (rx, ry) = sensor.camera, sensor.gelpad.dome_radius
+    (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
+    flat_x, flat_y = (u - cx) * px, (v - cy) * py
+    pressed = press >= 0
+    if len(circles):
+        on_pad = circles_on_pad(sensor, circles, ball_radius)
+        share = on_pad[:, 2] / ball_radius
+        heights, own = _heights(slopes, share), np.where(pressed, press, 0)
+        at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
+    else:
+        heights, own, at, a, a_share = (
+            np.zeros((1, len(_TABLE))),
+            np.zeros(len(u), int),
+            np.zeros((len(u), 2)),
+            np.ones(len(u)),
+            np.zeros(len(u)),
+        )
+    z = np.zeros(len(u))
+    x, y, dx, dy, t = flat_x, flat_y, z, z, z
+    for _ in range(6):
+        x, y = camera.position[0] + flat_x * (1 + z / distance), camera.position[1] + flat_y * (1 + z / distance)
+        dx, dy = x - at[:, 0], y - at[:, 1]
+        t = np.where(pressed, np.hypot(dx, dy) / a, KNOTS[-1])
+        place = np.minimum(t / (_TABLE[1] - _TABLE[0]), len(_TABLE) - 1.001)
+        k = place.astype(int)
+        part = place - k
+        height = heights[own, k] * (1 - part) + heights[own, k + 1] * part
+        z = -sensor.gelpad.sag(x, y) - a * height
+    tan = np.where(pressed, _slope(slopes, t, a_share), 0)
+    rho = np.maximum(np.hypot(dx, dy), 1e-9)
+    zx = -x / np.sqrt(rx * rx - x * x) if np.isfinite(rx) else 0 * x
+    zy = -y / np.sqrt(ry * ry - y * y) if np.isfinite(ry) else 0 * y
+    n = np.stack([zx + tan * dx / rho, zy + tan * dy / rho, -np.ones_like(x)])
+    return PixelGeometry(np.stack([x, y, z]), n / np.linalg.norm(n, axis=0))
+
+
+def press_surface(
+    sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
+) -> GelSurface:
+    """The pad under every ball as a batch of surfaces on ``grid``; arguments as for ``pixel_geometry``.
+
+    Raises:
+        InputError: a contact circle as wide as its ball.
+    """
+    on_pad = circles_on_pad(sensor, circles, ball_radius)
+    share = on_pad[:, 2] / ball_radius
+    if (share >= 1).any():
+        k = int(np.argmax(share))
+        rule = f"must be smaller than the ball, which has {2e3 * ball_radius[k]:.4g} mm"
+        raise InputError("circle", value=f"{2e3 * on_pad[k, 2]:.4g} mm across", rule=rule)
+    heights, contact = [], []
+    rest = rest_height(sensor.gelpad, *np.meshgrid(grid.x, grid.y))
+    for (x, y, a), profile in zip(on_pad, _heights(slopes, share), strict=True):
+        rho = np.hypot(grid.x[None, :] - x, grid.y[:, None] - y)
+        heights.append(rest - a * np.interp(rho / a, _TABLE, profile))
+        contact.append(rho < a)
+    return GelSurface(grid, np.array(heights, dtype=np.float32), np.array(contact), on_pad[:, :2])

@@ -1,0 +1,169 @@
+"""Lights fitted with the ray tracer as forward model, by defect correction.
+
+The ray tracer's image is direct light of points plus what that leaves out: shadows, the size of LEDs, inter-reflection, a specular coat.
+The rest is small and changes slowly, so that a few rounds suffice of: render once with every LED in a layer of its own, take the
+ray tracer's light minus the direct light, hold it, and fit again with it added (``direct_fit``). Where the rounds stop changing, the fit is
+that of the ray tracer itself, but for the rest's own derivatives.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState, Light
+from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.light_parameters import LightParameters, with_parameters
+from raytac.calibrate.photographs import Photographs, decode
+from raytac.errors import InputError
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.raytrace import RayTracer
+from raytac.specs import SensorSpec
+
+__all__ = ["Fitted", "brightened", "defect", "fit_lights", "refine_circles"]
+
+GRID_PITCH = 0.12e-3
+"""Spacing of the pad's nodes [m] while fitting."""
+FACTOR = 2
+"""Presses are fitted as means of so many pixels squared, which is also what the ray tracer renders."""
+FIRST, LATER = 100, 30
+"""Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
+START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5])
+"""How far starts lie apart: mm, rad, lobe exponent."""
+ENVS = 16
+"""Presses in one call of the ray tracer."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a fit found."""
+
+    sensor: SensorSpec
+    """The sensor with its new lights and response."""
+    state: FitState
+    costs: tuple[float, ...]
+    """Cost of the least-squares problem after every round, the first with direct light alone."""
+
+
+def brightened(problem: DirectFit, state: FitState) -> FitState:
+    """The same with powers that give the image at rest its mean in every channel."""
+    rest = np.einsum("lmc,lc->mc", problem.light(state.p, problem.geometry(state)).rest, state.p.power).mean(0)
+    gain = decode(problem.rest_real, state.p.response[0]).mean(0) / np.maximum(rest, 1e-9)
+    return dataclasses.replace(state, p=dataclasses.replace(state.p, power=state.p.power * gain))
+
+
+def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any]) -> Light:
+    """Light of every LED at power 1 that the ray tracer, with these further ``options``, has over direct light, at ``problem``'s pixels."""
+    sensor, p = problem.sensor, state.p
+    unit = dataclasses.replace(p, power=np.ones_like(p.power))
+    lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
+    height, width = problem.shape
+    tracer = RayTracer(lit, resolution=(width, height), outputs=("layers",), layers="led", device=device, **options)
+    # A light file gives power by channel, and the coat's albedo with it: at power 1 a layer shows full scales.
+    scale = sensor.response.exposure * np.array(sensor.response.white_balance)
+
+    def layers(surface: GelSurface) -> np.ndarray:
+        return scale * np.stack(list(tracer.render_layers(surface).values())).astype(float)
+
+    count, pressed = len(state.circles), np.empty((len(p.leds), len(problem.press), 3))
+    for first in range(0, count, ENVS):
+        own = np.arange(first, min(first + ENVS, count))
+        surface = press_surface(sensor, grid, state.circles[own], problem.shots.radius[own], state.slopes)
+        here = np.isin(problem.press, own)
+        pressed[:, here] = layers(surface)[:, problem.press[here] - first, problem.row[here], problem.column[here]]
+    still = layers(GelSurface.at_rest(grid))[:, 0]
+    by = REST_FACTOR * height // problem.shots.background.shape[0]
+    rest = still.reshape(len(still), height // by, by, width // by, by, 3).mean((2, 4)).reshape(len(still), -1, 3)
+    direct = problem.light(p, problem.geometry(state))
+    return Light(pressed - direct.pressed, still[:, problem.row, problem.column] - direct.flat, rest - direct.rest)
+
+
+def fit_lights(
+    sensor: SensorSpec,
+    shots: Photographs,
+    *,
+    settings: FitSettings | None = None,
+    start: FitState | None = None,
+    rounds: int = 3,
+    starts: int = 3,
+    device: str = "auto",
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+    tick: Callable[[str, float], None] | None = None,
+) -> Fitted:
+    """Fit ``sensor``'s LEDs, glow, response, imprint and the circles of ``shots``.
+
+    ``start``: where the fit begins; None is the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles.
+    ``rounds`` of defect correction follow the fit of direct light; 0 leaves it at that. Direct light is fitted from ``starts`` places, the
+    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``options`` of the ray tracer, such as
+    ``bounce``. ``tick`` is told the stage and the cost after every step.
+
+    Raises:
+        InputError: refraction, LEDs of no colour, or fewer values than parameters.
+        BackendError: the ray tracer cannot run on ``device``.
+    """
+    settings = FitSettings() if settings is None else settings
+    if sensor.refraction.model != "none":
+        raise InputError("refraction.model", value=sensor.refraction.model, rule="cannot be fitted", choices=("none",))
+    begin = start or FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
+    problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
+    unknown, known = len(problem.flat(begin)) + 3 * len(shots.circles), 3 * len(problem.press)
+    if known < 10 * unknown or len(shots.circles) < 4:
+        rule = f"are too few for {unknown} parameters ({known} values): take at least 4, and 10 values a parameter"
+        raise InputError("presses", value=len(shots.circles), rule=rule)
+    if start is None:
+        begin = brightened(problem, begin)
+        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
+
+    def told(stage: str) -> Callable[[FitState, float], None]:
+        return lambda _, cost: tick(stage, cost) if tick is not None else None
+
+    rng, found = np.random.default_rng(seed), []
+    for k in range(starts):
+        first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
+        here = problem.solve(first, FIRST, told(f"direct light, start {k + 1} of {starts}"))
+        found.append((problem.cost(here, problem.residuals(here)), here))
+    cost, state = min(found, key=lambda pair: pair[0])
+    costs = [cost]
+    grid = make_grid(sensor.gelpad, GRID_PITCH)
+    for k in range(rounds):
+        extra = defect(problem, state, grid, device, options or {})
+        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
+        state = problem.solve(state, LATER, told(f"all light, round {k + 1} of {rounds}"))
+        costs.append(problem.cost(state, problem.residuals(state)))
+    return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs))
+
+
+def _perturbed(problem: DirectFit, state: FitState, rng: np.random.Generator) -> FitState:
+    """The same with every LED elsewhere: by 1.5 mm, 0.2 rad and half a lobe's exponent (standard deviations)."""
+    leds = state.p.leds + rng.normal(size=state.p.leds.shape) * START_SPREAD
+    return problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)))
+
+
+def refine_circles(
+    sensor: SensorSpec,
+    shots: Photographs,
+    state: FitState,
+    *,
+    rounds: int = 1,
+    device: str = "auto",
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+) -> np.ndarray:
+    """Circles (N, 3) [px] of presses that lights were not fitted to, moved from their labels by the finished lights, which stay."""
+    held = FitSettings(fixed=tuple(SIGMA))
+    own = FitState(state.p, state.slopes, shots.circles.copy())
+    problem = DirectFit(sensor, shots, own, held, factor=FACTOR, seed=seed)
+    own, grid = problem.solve(own, 8), make_grid(sensor.gelpad, GRID_PITCH)
+    for _ in range(rounds):
+        problem = DirectFit(
+            sensor, shots, own, held, factor=FACTOR, extra=defect(problem, own, grid, device, options or {}), seed=seed
+        )
+        # The prior is the label, not where direct light put the circle: DirectFit takes it from the photographs.
+        own = problem.solve(own, 8)
+    return own.circles

@@ -1,0 +1,37 @@
+"""A Taxim table from real presses of balls: the polynomial of every slope bin, as for a baked table, from photographs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.calibrate.press_samples import PressSamples
+from raytac.optics.bake_fit import BinSums
+from raytac.optics.table import PolyTable, TaximConstants, slope_bins
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["N_BINS", "fit_table"]
+
+N_BINS = 60
+"""Bins of the slope's magnitude, and of its direction. Upstream has 125; with 20 presses of a Mini half as many leave out fewer places."""
+NEIGHBOURS, RIDGE = 1.0, 1e-4
+"""As in ``BakeSettings``, but the eight bins around count as much as the bin itself: photographs are few."""
+_PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+
+
+def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples, *, n_bins: int = N_BINS) -> PolyTable:
+    """The table of ``samples`` over the real ``background`` (H, W, 3) [levels]; no shadows: balls alone tell too little of them."""
+    height, width = background.shape[:2]
+    sums = BinSums(n_bins, (width, height))
+    i, j = slope_bins(samples.slope_x, samples.slope_y, n_bins)
+    sums.add(i, j, samples.column, samples.row, samples.difference.astype(np.float32))
+    fit = sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE)
+    return PolyTable(
+        gradients=fit.gradients,
+        covered=fit.covered,
+        background=background.astype(np.float32),
+        pixel_pitch=sensor.camera.pitch_at((width, height)),
+        slopes_of="displacement",
+        rest_image=np.clip(np.rint(background), 0, 255).astype(np.uint8),
+        constants=_PLAIN,
+        provenance={"source": "real presses of balls", "sensor": sensor.name, "presses": str(len(np.unique(samples.press)))},
+    )

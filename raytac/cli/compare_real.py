@@ -1,0 +1,68 @@
+"""``raytac compare-real``: every optical mode against photographs of a real sensor that it was not fitted to."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from raytac.cli.real_data import read_data
+from raytac.io.options import CommonOptions
+
+__all__ = ["CompareRealArgs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareRealArgs(CommonOptions):
+    """Fit ray tracer, table and network to the same real presses of balls and test them, and Phong's model, on the others.
+
+    Writes real.md (tables), real.png (photographs, every mode, signed errors) and metrics.json. Without --out the folder is
+    runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as it was.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Folder of photographs or dataPack.npz (docs/real-images.md)."""
+    sensor: str = "gelsight_mini"
+    """Name of a shipped sensor, or path of a sensor file; its lights are where the fits start."""
+    folds: int = 5
+    """Every so manieth press is held out in turn."""
+    ball_diameter_mm: float | None = None
+    """Needed by a dataPack.npz, which does not say it."""
+    sides: str | None = None
+    """Numbers of red, green and blue LEDs joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    regions: bool = True
+    """Also fit to one half of the pad and to shallow presses, and test on the others."""
+    ablations: bool = True
+    """Also fit the ray tracer with one thing after another left out."""
+    shadows: bool = False
+    """Whether the ray tracer casts shadows on the coat: photographs of a GelSight Mini show next to none (docs/accuracy.md)."""
+    starts: int = 3
+    """Places that a fit of direct light starts from; the best goes on."""
+    rounds: int = 3
+    """Rounds with the ray tracer after direct light."""
+
+    def run(self) -> int:
+        began = time.perf_counter()
+        from raytac.report.real import RealSettings, check_folds, compare_real
+
+        sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides)
+        check_folds(presses, self.folds)
+        settings = RealSettings(
+            folds=self.folds,
+            regions=self.regions,
+            ablations=self.ablations,
+            starts=self.starts,
+            rounds=self.rounds,
+            shadows=self.shadows,
+            device=self.device,
+            seed=self.seed,
+        )
+        out = self.out if self.out is not None else Path("runs") / "compare-real" / sensor.name
+        for name in doubtful:
+            print(f"the circle of press {name} is doubtful")
+        for path in compare_real(sensor, presses, shots, out, settings, began=began):
+            print(path)
+        return 0

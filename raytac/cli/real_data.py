@@ -1,0 +1,30 @@
+"""Sensor and presses that ``calibrate`` and ``compare-real`` start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from raytac.calibrate.circles import with_found_circles
+from raytac.calibrate.light_parameters import leds_at_walls
+from raytac.calibrate.photographs import Photographs, photographs_of
+from raytac.calibrate.presses import RealPresses, read_presses
+from raytac.specs import SensorSpec, load_sensor, with_lights
+
+__all__ = ["read_data"]
+
+
+def read_data(
+    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str | None
+) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
+    """The sensor, its fully visible presses as read and as floats, and the names of those whose circles were found but are doubtful.
+
+    Raises:
+        SpecError, InputError, CalibrationError: as the readers say.
+    """
+    sensor = load_sensor(sensor_name)
+    if sides is not None:
+        sensor = with_lights(sensor, leds_at_walls(sensor, sides))
+    presses = read_presses(data, ball_diameter=None if ball_diameter_mm is None else ball_diameter_mm / 1e3)
+    presses, doubtful = with_found_circles(presses, sensor.camera.pixel_pitch[0])
+    names = [name for name, bad in zip(presses.names, doubtful, strict=True) if bad]
+    return sensor, presses.take(presses.fully_visible), photographs_of(presses, sensor), names

@@ -1,0 +1,197 @@
+"""``raytac compare-real``: every optical mode against real photographs of presses that it was not fitted to."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.presses import RealPresses
+from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
+from raytac.errors import InputError
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.report.real_models import MODES, Models, fit_models, images_of, mode_times
+from raytac.report.real_score import noise_floor, press_scores, summary
+from raytac.specs import SensorSpec
+
+__all__ = ["ABLATIONS", "Ablation", "RealSettings", "compare_real"]
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One thing left out of the ray tracer, fitted anew without it."""
+
+    sensor: Callable[[SensorSpec], SensorSpec] = lambda sensor: sensor
+    fixed: tuple[str, ...] = ()
+    """Blocks of parameters that stay at their start."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the ray tracer."""
+    other_shadows: bool = False
+    """Cast shadows where the comparison has none, and none where it has."""
+
+
+def _leds(sensor: SensorSpec, **changes: Any) -> SensorSpec:
+    leds = tuple(dataclasses.replace(led, **changes) for led in sensor.lights.leds)
+    return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=leds))
+
+
+def _one_a_colour(sensor: SensorSpec) -> SensorSpec:
+    first = [next(led for led in sensor.lights.leds if led.layer == layer) for layer in sensor.lights.layers]
+    return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=tuple(first)))
+
+
+def _linear(sensor: SensorSpec) -> SensorSpec:
+    response = dataclasses.replace(sensor.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))
+    return dataclasses.replace(sensor, response=response)
+
+
+def _flat(sensor: SensorSpec) -> SensorSpec:
+    return dataclasses.replace(sensor, gelpad=dataclasses.replace(sensor.gelpad, dome_radius=(np.inf, np.inf)))
+
+
+ABLATIONS: dict[str, Ablation] = {
+    "no_inter_reflection": Ablation(options={"bounce": False}),
+    "other_shadows": Ablation(other_shadows=True),
+    "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4))),
+    "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
+    "no_glow": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",)),
+    "flat_pad": Ablation(sensor=_flat),
+    "no_response_curve": Ablation(sensor=_linear, fixed=("stray",)),
+    "one_led_a_colour": Ablation(sensor=_one_a_colour),
+    "rigid_pad_imprint": Ablation(fixed=("slope",)),
+}
+"""By the name of their keys in ``metrics.json``."""
+
+
+@dataclass(frozen=True)
+class RealSettings:
+    """What is compared."""
+
+    folds: int = 5
+    regions: bool = True
+    """Also half of the pad to half, and shallow to deep."""
+    ablations: bool = True
+    starts: int = 3
+    rounds: int = 3
+    shadows: bool = False
+    """Whether the ray tracer casts shadows on the coat."""
+    device: str = "auto"
+    seed: int = 0
+
+
+def compare_real(
+    sensor: SensorSpec, presses: RealPresses, shots: Photographs, out: Path, settings: RealSettings, *, began: float | None = None
+) -> list[Path]:
+    """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``; ``shots`` are the fully visible ``presses``.
+
+    Raises:
+        InputError: a split that leaves too few presses.
+    """
+    began = time.perf_counter() if began is None else began
+    splits: list[tuple[str, Split]] = [("press", split) for split in by_press(len(presses), settings.folds)]
+    if settings.regions:
+        splits += [("left_right", by_half(presses)[0]), ("right_left", by_half(presses)[1])]
+        splits += [("shallow_deep", shallow_to_deep(presses))]
+    ablations = list(ABLATIONS) if settings.ablations else []
+    scores: dict[str, dict[str, list[dict[str, float]]]] = {}
+    metrics: dict[str, Metric] = {}
+    images: dict[int, dict[str, np.ndarray]] = {}
+    with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
+        for number, (kind, (train, test)) in enumerate(splits):
+            models = _fitted(sensor, shots.take(train), settings, bar)
+            seen, labelled = _tested(models, sensor, shots.take(test))
+            for where, found in (("", seen), ("labelled_", labelled)):
+                for mode, stack in found.items():
+                    of = scores.setdefault(where + kind, {}).setdefault(mode, [])
+                    of += press_scores(sensor, stack, shots.take(test))
+            if kind == "press":
+                images |= {int(k): {mode: stack[i] for mode, stack in seen.items()} for i, k in enumerate(test)}
+            if number == 0:
+                own = shots.take(test)
+                metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, own, own.circles).items()}
+                device = models.modes["raytrace"].device
+            bar.update()
+        train, test = splits[0][1]
+        for name in ablations:
+            one = ABLATIONS[name]
+            changed = one.sensor(sensor)
+            options = {"shadows": settings.shadows != one.other_shadows, **one.options}
+            models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), fixed=one.fixed, options=options)
+            seen, _ = _tested(models, changed, shots.take(test))
+            for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
+                metrics[f"ablation.{name}.{key}"] = value
+            bar.update()
+        for key, value in summary(scores["press"]["raytrace"][: len(test)]).items():
+            metrics[f"ablation.nothing.{key}"] = value
+    for kind, by_mode in scores.items():
+        prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
+        for mode, of in by_mode.items():
+            metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
+    metrics["noise_floor"] = noise_floor(sensor, shots)
+    head: dict[str, Metric] = {"command": "compare-real", "device": device, "seed": settings.seed, "sensor": sensor.name}
+    head |= {
+        "presses": len(shots.presses),
+        "folds": settings.folds,
+        "shadows": int(settings.shadows),
+        "leds": len(sensor.lights.leds),
+        **versions(),
+    }
+    from raytac.report.real_figure import draw, table_text
+
+    with result_folder(out) as folder:
+        (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
+        shown = sorted(images)[:: max(1, len(images) // 6)][:6]
+        draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")
+        write_metrics(folder / "metrics.json", head | metrics | {"wall_s": time.perf_counter() - began})
+    return [out / name for name in ("real.md", "real.png", "metrics.json")]
+
+
+def _fitted(
+    sensor: SensorSpec,
+    shots: Photographs,
+    settings: RealSettings,
+    bar: Any,
+    *,
+    modes: tuple[str, ...] = MODES,
+    fixed: tuple[str, ...] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Models:
+    return fit_models(
+        sensor,
+        shots,
+        settings=FitSettings(fixed=("gamma", *fixed)),
+        modes=modes,
+        device=settings.device,
+        seed=settings.seed,
+        starts=settings.starts,
+        rounds=settings.rounds,
+        options={"shadows": settings.shadows} if options is None else options,
+        tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
+    )
+
+
+def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Images of every mode and of the background alone at refined circles, and at the labelled ones."""
+    refined, slopes = models.circles(shots), models.fitted.state.slopes
+    nothing = np.broadcast_to(shots.background, shots.presses.shape)
+    found = []
+    for circles in (refined, shots.circles):
+        own = {name: images_of(mode, sensor, shots, circles, slopes) for name, mode in models.modes.items()}
+        found.append(own | {"background": nothing})
+    return found[0], found[1]
+
+
+def check_folds(presses: RealPresses, folds: int) -> None:
+    """Raises ``InputError`` for folds that leave too few presses to fit to."""
+    if len(presses) - -(-len(presses) // max(folds, 1)) < 4:
+        raise InputError("presses", value=len(presses), rule=f"are too few for {folds} folds: 4 must be left to fit to")

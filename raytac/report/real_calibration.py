@@ -1,0 +1,135 @@
+"""``raytac calibrate DATASET``: one optical mode fitted to real presses, its errors on others, and its files."""
+
+from __future__ import annotations
+
+import datetime
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.ray_fit import Fitted
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
+from raytac.optics.mlp import MlpMode
+from raytac.optics.mlp_weights import save_mlp
+from raytac.optics.taxim import TaximMode
+from raytac.report.real_models import fit_models, images_of
+from raytac.report.real_score import press_scores, summary
+from raytac.specs import SensorSpec
+from raytac.specs.lights_text import lights_text
+
+__all__ = ["OUTLIER", "run_calibrate_optics", "sensor_text"]
+
+OUTLIER = 2.0
+"""A press whose contact error is so many times the median is reported as an outlier."""
+FILES = (*CALIBRATION_FILES, "mlp.npz", "lights.toml", "sensor.toml", "circles.csv", "metrics.json")
+
+
+def run_calibrate_optics(
+    sensor: SensorSpec,
+    shots: Photographs,
+    names: tuple[str, ...],
+    out: Path,
+    *,
+    model: str,
+    data: str,
+    holdout: int,
+    starts: int,
+    rounds: int,
+    shadows: bool,
+    device: str,
+    seed: int,
+    start: float,
+) -> list[Path]:
+    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
+
+    Raises:
+        InputError: too few presses, or a folder that cannot be written.
+        BackendError: the ray tracer cannot run on ``device``.
+    """
+    index = np.arange(len(shots.presses))
+    held = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
+    train, test = shots.take(index[~held]), shots.take(index[held])
+    with tqdm(desc=f"calibrate {model}", unit="step", disable=None, file=sys.stderr) as bar:
+
+        def tick(stage: str, cost: float) -> None:
+            bar.update()
+            bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
+
+        settings = FitSettings(fixed=("gamma",))
+        models = fit_models(
+            sensor,
+            train,
+            settings=settings,
+            modes=(model,),
+            device=device,
+            seed=seed,
+            starts=starts,
+            rounds=rounds,
+            options={"shadows": shadows},
+            tick=tick,
+        )
+    mode, fitted = models.modes[model], models.fitted
+    metrics: dict[str, Metric] = {"command": "calibrate", "model": model, "device": mode.device, "seed": seed}
+    metrics |= {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "data": data, "sensor": sensor.name}
+    metrics |= {
+        "holdout": holdout,
+        "shadows": int(shadows),
+        "presses.fitted": int((~held).sum()),
+        "presses.held_out": int(held.sum()),
+        **versions(),
+    }
+    circles = shots.circles.copy()
+    circles[~held] = fitted.state.circles
+    own = press_scores(sensor, images_of(mode, sensor, train, circles[~held], fitted.state.slopes), train)
+    metrics |= {f"fitted.{key}": value for key, value in summary(own).items()}
+    if held.any():
+        circles[held] = models.circles(test)
+        tested = press_scores(sensor, images_of(mode, sensor, test, circles[held], fitted.state.slopes), test)
+        metrics |= {f"held_out.{key}": value for key, value in summary(tested).items()}
+    metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
+    errors = np.array([score["contact_mae"] for score in own])
+    bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
+    metrics["outliers"] = ", ".join(bad)
+    for name in bad:
+        print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
+    with result_folder(out, FILES) as folder:
+        if model == "raytrace":
+            error = f"{metrics.get('held_out.contact_mae', metrics['fitted.contact_mae']):.2f}"
+            what = "on held-out presses" if held.any() else "on the fitted presses"
+            comment = (
+                f"Fitted to {int((~held).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
+            )
+            (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
+            (folder / "sensor.toml").write_text(sensor_text(sensor, fitted), "utf-8")
+        elif isinstance(mode, TaximMode):
+            save_calibration(mode.table, folder)
+        elif isinstance(mode, MlpMode):
+            save_mlp(mode.weights, folder / "mlp.npz")
+        rows = ["press,held_out,cx_px,cy_px,r_px"]
+        rows += [f"{name},{int(h)},{x:.3f},{y:.3f},{r:.3f}" for name, h, (x, y, r) in zip(names, held, circles, strict=True)]
+        (folder / "circles.csv").write_text("\n".join(rows) + "\n", "utf-8")
+        write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
+        written = sorted(path.name for path in folder.iterdir())
+    return [out / name for name in written]
+
+
+def sensor_text(sensor: SensorSpec, fitted: Fitted) -> str:
+    """A sensor file on the base of ``sensor`` with the fitted response and lights.toml beside it."""
+    response = fitted.sensor.response
+    base = sensor.name if sensor.source is None or sensor.source.parent.name == "sensors" else str(sensor.source.resolve())
+
+    def row(values: tuple[float, ...]) -> str:
+        return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
+
+    return (
+        f'base = "{base}"\nlights = "lights.toml"\n\n[response]\nexposure = {response.exposure:.6g}\n'
+        f"white_balance = {row(response.white_balance)}\ngamma = {response.gamma:.6g}\nblack_level = {row(response.black_level)}\n"
+        f"vignetting = {row(response.vignetting)}\n"
+    )

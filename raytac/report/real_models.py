@@ -1,0 +1,116 @@
+"""Every optical mode fitted to the same real presses, and its images of others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.imprint import press_surface
+from raytac.calibrate.mlp_fit import fit_mlp
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.press_samples import press_samples
+from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
+from raytac.calibrate.table_fit import fit_table
+from raytac.gel.pad import make_grid
+from raytac.optics.base import OpticalMode
+from raytac.optics.mlp import MlpMode
+from raytac.optics.phong import PhongMode
+from raytac.optics.raytrace import RayTracer
+from raytac.optics.taxim import TaximMode
+from raytac.specs import SensorSpec
+
+__all__ = ["MODES", "Models", "fit_models", "images_of", "mode_times", "raytrace_mode"]
+
+MODES = ("raytrace", "taxim", "mlp", "phong")
+"""Modes that are compared, beside the background alone."""
+GRID_PITCH = 0.06e-3
+"""Spacing of the pad's nodes [m], about a pixel's."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
+
+    fitted: Fitted
+    modes: dict[str, OpticalMode]
+    device: str
+    options: Mapping[str, Any]
+    """Further options of the ray tracer."""
+
+    def circles(self, shots: Photographs) -> np.ndarray:
+        """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
+        return refine_circles(self.fitted.sensor, shots, self.fitted.state, device=self.device, options=self.options)
+
+
+def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
+    """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
+    height, width = background.shape[:2]
+    field = background.astype(np.uint8)
+    return RayTracer(sensor, resolution=(width, height), device=device, flat_field=field, **options)
+
+
+def fit_models(
+    sensor: SensorSpec,
+    shots: Photographs,
+    *,
+    settings: FitSettings | None = None,
+    modes: tuple[str, ...] = MODES,
+    device: str = "auto",
+    seed: int = 0,
+    starts: int = 3,
+    rounds: int = 3,
+    options: Mapping[str, Any] | None = None,
+    tick: Callable[[str, float], None] | None = None,
+) -> Models:
+    """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
+
+    Raises as ``fit_lights``.
+    """
+    options = {} if options is None else options
+    fitted = fit_lights(
+        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
+    )
+    state, background, built = fitted.state, shots.background, {}
+    if {"taxim", "mlp"} & set(modes):
+        samples = press_samples(sensor, shots, state.circles, state.slopes, device=device)
+    for name in modes:
+        if name == "raytrace":
+            built[name] = raytrace_mode(fitted.sensor, background, device, options)
+        elif name == "taxim":
+            built[name] = TaximMode(sensor, calibration=fit_table(sensor, background, samples), device=device)
+        elif name == "mlp":
+            built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
+        else:
+            built[name] = PhongMode(sensor, background=background.astype(np.uint8), device=device)
+    return Models(fitted, built, device, options)
+
+
+def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """8-bit images (N, H, W, 3) of balls pressed at ``circles`` (N, 3) [px] with the imprint ``slopes``."""
+    grid, images = make_grid(sensor.gelpad, GRID_PITCH), []
+    for k in range(len(circles)):
+        surface = press_surface(sensor, grid, circles[k : k + 1], shots.radius[k : k + 1], slopes)
+        rgb = mode.render(surface).rgb
+        assert rgb is not None
+        images.append(rgb[0])
+    return np.array(images)
+
+
+def mode_times(models: Models, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, repeats: int = 9) -> dict[str, float]:
+    """Median time [ms] of every mode for one image, everything compiled, the image on the host."""
+    grid = make_grid(sensor.gelpad, GRID_PITCH)
+    surface = press_surface(sensor, grid, circles[:1], shots.radius[:1], models.fitted.state.slopes)
+    times = {}
+    for name, mode in models.modes.items():
+        taken = []
+        for _ in range(repeats + 2):
+            began = time.perf_counter()
+            mode.render(surface)
+            taken.append(time.perf_counter() - began)
+        times[name] = 1e3 * float(np.median(taken[2:]))
+    return times

@@ -1,0 +1,71 @@
+"""Table and network from presses: what a known colour law shows, they show."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.mlp_fit import fit_mlp
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.press_samples import PressSamples, press_samples
+from raytac.calibrate.table_fit import fit_table
+from raytac.gel.pad import make_grid
+from raytac.optics.mlp import MlpMode
+from raytac.optics.taxim import TaximMode
+from raytac.specs import load_sensor
+
+RADIUS = 3.155e-3
+SENSOR = load_sensor("gelsight_mini")
+GAIN = np.array([[60.0, 0.0], [-30.0, 50.0], [20.0, -70.0]])
+"""Levels by slope along x and y, of each channel."""
+
+
+def presses(count: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(70, 250, count), rng.uniform(60, 180, count), rng.uniform(26, 33, count)])
+
+
+@pytest.fixture(scope="module")
+def samples() -> PressSamples:
+    """Of 30 presses whose colour changes by ``GAIN`` times the slope."""
+    at = presses(30, 0)
+    blank = Photographs(np.full((240, 320, 3), 90.0), np.full((30, 240, 320, 3), 90.0), at, np.full(30, RADIUS))
+    found = press_samples(SENSOR, blank, at, RIGID_PAD, device="cpu")
+    assert len(found.row) > 50_000 and np.abs(found.slope_x).max() > 0.3
+    return PressSamples(
+        found.press, found.row, found.column, found.slope_x, found.slope_y, np.stack([found.slope_x, found.slope_y], 1) @ GAIN.T
+    )
+
+
+def every(samples: PressSamples, step: int) -> PressSamples:
+    """Every ``step``-th sample."""
+    return PressSamples(*(getattr(samples, field.name)[::step] for field in dataclasses.fields(samples)))
+
+
+@pytest.mark.parametrize("kind", ["table", "network"])
+def test_a_known_law_of_slopes_is_found(samples: PressSamples, kind: str) -> None:
+    background = np.full((240, 320, 3), 90.0)
+    if kind == "table":
+        mode = TaximMode(SENSOR, calibration=fit_table(SENSOR, background, samples), device="cpu")
+    else:
+        mode = MlpMode(SENSOR, calibration=fit_mlp(SENSOR, background, every(samples, 5)), device="cpu")
+    at = presses(2, 1)
+    surface = press_surface(SENSOR, make_grid(SENSOR.gelpad, 0.06e-3), at, np.full(2, RADIUS), RIGID_PAD)
+    levels = mode.render_levels(surface)
+    _, moved = mode.image_heights(surface)
+    sy, sx = np.gradient(moved.astype(float), axis=(1, 2))
+    expected = 90 + np.stack([sx, sy], axis=-1) @ GAIN.T
+    pressed = moved > 0.5
+    change, off = np.abs(expected - 90)[pressed].mean(), np.abs(levels - expected)[pressed].mean()
+    assert off < 0.12 * change, f"{off:.2f} levels off where the press changes {change:.2f}"
+
+
+def test_the_same_seed_gives_the_same_network(samples: PressSamples) -> None:
+    few = every(samples, 50)
+    background = np.full((240, 320, 3), 90.0)
+    a, b, c = (fit_mlp(SENSOR, background, few, seed=seed).matrices[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 0.1

@@ -1,0 +1,49 @@
+"""The bench of the shown coat, small: an edge and a light ball against truths that are coarse themselves."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from raytac.errors import InputError
+from raytac.io.metrics import read_metrics
+
+
+@pytest.fixture
+def bench_coat(monkeypatch):
+    path = Path(__file__).parents[2] / "experiments" / "bench_coat.py"
+    spec = importlib.util.spec_from_file_location("bench_coat", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "bench_coat", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_the_shown_coat_is_nearer_than_the_mesh(bench_coat, tmp_path):
+    assert bench_coat.Args(out=tmp_path, levels="coarse", shapes="edge", cell_um=190.0).run() == 0
+    found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("edge")}
+    assert found["edge.coarse.near_um"] < 0.25 * found["edge.coarse.mesh_near_um"]
+    assert found["edge.coarse.ring_um"] < 0.25 * found["edge.coarse.mesh_ring_um"]
+    assert found["edge.coarse.force_n"] > found["edge.truth_force_n"] > 2.0
+
+
+def test_markers_are_nearer_than_the_mesh(bench_coat, tmp_path):
+    assert bench_coat.Args(out=tmp_path, levels="coarse", shapes="ball", cell_um=150.0).run() == 0
+    found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("ball")}
+    for load in ("force", "depth"):
+        start = f"ball.{load}.coarse"
+        assert found[f"{start}.markers_most_um"] < 0.5 * found[f"{start}.mesh_markers_most_um"]
+        assert found[f"{start}.markers_um"] < found[f"{start}.mesh_markers_um"]
+    assert found["ball.force.coarse.force_n"] == pytest.approx(0.33, rel=0.01)
+    assert found["ball.depth.coarse.force_n"] > found["ball.depth.truth.force_n"] > 0.3
+    assert found["ball.depth.coarse.contact_mm2"] == pytest.approx(found["ball.depth.truth.contact_mm2"], rel=0.03)
+
+
+def test_an_unknown_shape_is_named(bench_coat, tmp_path):
+    with pytest.raises(InputError, match=r"shapes.*'cone'.*ball"):
+        bench_coat.Args(out=tmp_path, shapes="cone").run()

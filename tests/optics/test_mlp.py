@@ -1,0 +1,84 @@
+"""The network mode: the image at rest is the background, device and NumPy agree, files come back or are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.errors import CalibrationError, InputError
+from raytac.gel.surface import GelSurface
+from raytac.optics.mlp import MlpMode
+from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, forward, inputs, load_mlp, save_mlp, view_slope
+from raytac.sensor import TactileSensor
+from tests.conftest import make_sensor_spec
+from tests.optics.scenes import ball, grid_of, surface
+
+RESOLUTION = (80, 60)
+
+
+def network(seed: int = 0) -> MlpWeights:
+    rng = np.random.default_rng(seed)
+    sizes = (INPUTS, 8, 6, 3)
+    matrices = tuple(rng.normal(0, 0.7, (b, a)) for a, b in itertools.pairwise(sizes))
+    background = rng.uniform(60, 160, (60, 80, 3)).round().astype(np.float32)
+    return MlpWeights(matrices, tuple(rng.normal(0, 0.1, b) for b in sizes[1:]), background)
+
+
+def test_at_rest_it_shows_the_background() -> None:
+    weights, spec = network(), make_sensor_spec()
+    mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
+    rgb = mode.render(GelSurface.at_rest(grid_of(spec))).rgb
+    assert rgb is not None
+    np.testing.assert_array_equal(rgb[0], weights.background.astype(np.uint8))
+
+
+def test_a_pixels_colour_is_the_networks() -> None:
+    """Against a plain matrix product, on the slopes of the displacement that the mode itself sees."""
+    weights, spec = network(1), make_sensor_spec()
+    grid = grid_of(spec)
+    pressed = surface(grid, ball(grid)[0])
+    mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
+    levels = mode.render_levels(pressed)[0]
+    _, moved = mode.image_heights(pressed)
+    sy, sx = np.gradient(moved[0].astype(float))
+    sy *= mode.pitch[0] / mode.pitch[1]
+    width, height = RESOLUTION
+    u, v = np.meshgrid((np.arange(width) + 0.5) * 2 / width - 1, (np.arange(height) + 0.5) * 2 / height - 1)
+
+    def net(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
+        x = np.stack(inputs(np, slope_x, slope_y, u, v, view_slope(spec)), axis=-1)
+        for k, (matrix, offset) in enumerate(zip(weights.matrices, weights.offsets, strict=True)):
+            x = x @ matrix.T + offset
+            x = np.maximum(x, 0) if k < 2 else x
+        return x
+
+    expected = weights.background + LEVELS * (net(sx, sy) - net(0 * u, 0 * u))
+    inner = np.s_[2:-2, 2:-2]
+    assert np.abs(levels - weights.background)[inner].max() > 10, "the press must show"
+    np.testing.assert_allclose(levels[inner], expected[inner], atol=0.05)
+    own = np.stack(forward(np, weights, inputs(np, sx, sy, u, v, view_slope(spec))), axis=-1)
+    np.testing.assert_allclose(own, net(sx, sy), atol=1e-9)
+
+
+def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
+    weights = network(2)
+    save_mlp(weights, tmp_path / "mlp.npz")
+    again = load_mlp(tmp_path)
+    for old, new in zip((*weights.matrices, *weights.offsets), (*again.matrices, *again.offsets), strict=True):
+        np.testing.assert_allclose(new, old, rtol=1e-6)
+    sensor = TactileSensor(
+        "gelsight_mini", optics="mlp", optics_options={"calibration": tmp_path}, outputs=("rgb",), device="cpu"
+    )
+    assert "mlp" in sensor.label
+    with pytest.raises(CalibrationError, match="holds one"):
+        load_mlp(tmp_path / "none.npz")
+    broken = dataclasses.replace(weights, matrices=(weights.matrices[0][:, :5], *weights.matrices[1:]))
+    save_mlp(broken, tmp_path / "broken.npz")
+    with pytest.raises(CalibrationError, match="matrix_0"):
+        load_mlp(tmp_path / "broken.npz")
+    with pytest.raises(InputError, match="must name a network"):
+        MlpMode(make_sensor_spec(), device="cpu")
