@@ -40,8 +40,8 @@ class PressArgs(SolverOptions):
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
-    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or mlp (a
-    network, which a calibration must give)."""
+    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
+    mlp (a network, which a calibration must give)."""
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given. mlp: folder of
     raytac calibrate DATASET --model mlp."""
