@@ -40,9 +40,11 @@ class PressArgs(SolverOptions):
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
-    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given) or phong."""
+    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
+    mlp (a network, which a calibration must give)."""
     calibration: Path | None = None
-    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
+    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given. mlp: folder of
+    raytac calibrate DATASET --model mlp."""
     shadow: bool | None = None
     """taxim: cast shadows; where the table has them if not given."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
@@ -97,7 +99,9 @@ class PressArgs(SolverOptions):
 
     def _optics_options(self) -> dict[str, Any]:
         table = {name: value for name, value in (("calibration", self.calibration), ("shadow", self.shadow)) if value is not None}
-        if table and self.optics != "taxim":
-            rule = f"is a setting of optics='taxim', not of {self.optics!r}"
-            raise InputError(next(iter(table)), value=next(iter(table.values())), rule=rule)
+        known = {"taxim": ("calibration", "shadow"), "mlp": ("calibration",)}.get(self.optics, ())
+        for name, value in table.items():
+            if name not in known:
+                owners = "optics='taxim' and 'mlp'" if name == "calibration" else "optics='taxim'"
+                raise InputError(name, value=value, rule=f"is a setting of {owners}, not of {self.optics!r}")
         return {"progress": self.integrator != "fast"} if self.optics == "raytrace" else table

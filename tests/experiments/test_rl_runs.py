@@ -98,3 +98,5 @@ def test_a_soak_run_sees_what_is_not_finite_and_what_grows(soak: ModuleType) -> 
     found = soak.summary(blocks)
     assert found["memory_growth_mb"] == 30.0 and found["nonfinite"] == 2 and found["steps"] == 40
     assert found["env_steps_per_s"] == pytest.approx(20.0)
+    made_once = [soak.Block(0, 10, 1, 0, 0, 0.5, m) for m in (100.0, *[150.0] * 18, 151.0)]
+    assert soak.summary(made_once)["memory_growth_mb"] == 1.0

@@ -1,0 +1,81 @@
+"""``raytac compare-real`` and ``raytac calibrate DATASET``: scores of known images, and input that is refused with nothing written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.splits import by_press
+from raytac.cli import main
+from raytac.io.png import write_png
+from raytac.report.real_figure import table_text
+from raytac.report.real_score import noise_floor, press_scores, summary
+from raytac.specs import load_sensor
+
+CIRCLES = np.array([[120.0, 100.0, 30.0], [200.0, 140.0, 28.0]])
+SENSOR = load_sensor("gelsight_mini")
+
+
+def shots() -> Photographs:
+    presses = np.full((2, 240, 320, 3), 100.0)
+    return Photographs(np.full((240, 320, 3), 98.0), presses, CIRCLES, np.full(2, 3.155e-3))
+
+
+def test_errors_are_those_of_the_regions() -> None:
+    """An image that is 6 levels off in the disc, 3 in the ring, and right elsewhere."""
+    real = shots()
+    rho = real.distance(SENSOR)[..., None]
+    images = real.presses + np.where(rho < 1, 6.0, np.where(rho < 2, -3.0, 0.0))
+    first, second = press_scores(SENSOR, images, real)
+    assert (first["contact_mae"], first["contact_rmse"], first["ring_mae"]) == pytest.approx((6, 6, 3))
+    x, y, r = CIRCLES[0]
+    v, u = np.mgrid[:240, :320] + 0.5
+    box = (u > x - r - 15) & (u < x + r + 16) & (v > y - r - 15) & (v < y + r + 16)
+    square = np.mean((images - real.presses)[0][box] ** 2)
+    assert first["box_psnr"] == pytest.approx(20 * np.log10(255 / np.sqrt(square)), abs=0.2)
+    assert summary([first, second])["frame_mae"] == pytest.approx((first["frame_mae"] + second["frame_mae"]) / 2)
+    assert noise_floor(SENSOR, real) == pytest.approx(2.0)
+    text = table_text({"raytrace.contact_mae": 6.0, "noise_floor": 2.0}, ())
+    assert "| ray tracer | 6.00 |" in text and "Noise floor: 2.00" in text
+
+
+def data_set(folder: Path, count: int, radius: float = 30.0, shape: tuple[int, int] = (240, 320)) -> Path:
+    image = np.full((*shape, 3), 100, np.uint8)
+    names = ["background.png", *(f"6.310mm_{k:02d}.png" for k in range(count))]
+    for name in names:
+        write_png(folder / name, image)
+    rows = [f"6.310mm,{k},{100 + 10 * k},{100 + 5 * k},{radius}" for k in range(count)]
+    (folder / "labels.csv").write_text("\n".join(["diameter,index,cx_px,cy_px,r_px", *rows]) + "\n", "utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("command", ["calibrate", "compare-real"])
+def test_data_that_cannot_be_fitted_are_refused_with_nothing_written(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    cases = {
+        "few": (dict(count=3), "too few"),
+        "wide": (dict(count=6, radius=52.0), "smaller than the ball"),
+        "small": (dict(count=6, shape=(120, 160)), "sensor's size"),
+    }
+    for name, (how, message) in cases.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        data_set(folder, **how)  # type: ignore[arg-type]
+        assert main([command, str(folder), "--device", "cpu", "--out", str(out)]) == 2, name
+        assert message in capsys.readouterr().err, name
+    broken = tmp_path / "few" / "6.310mm_01.png"
+    broken.write_bytes(b"no image")
+    assert main([command, str(broken.parent), "--device", "cpu", "--out", str(out)]) == 2
+    assert "cannot be read as an image" in capsys.readouterr().err
+    assert main([command, str(tmp_path / "none"), "--out", str(out)]) == 2
+    assert not out.exists() and not list(tmp_path.glob("*.partial"))
+
+
+def test_folds_test_every_press_once() -> None:
+    splits = by_press(30, 5)
+    assert sorted(np.concatenate([test for _, test in splits])) == list(range(30))
