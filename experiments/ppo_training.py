@@ -74,7 +74,7 @@ class Training:
             self.learner.restore(saved)
         for name in ("progress.csv", "evaluation.csv"):
             _keep_rows(folder / name, self.steps)
-        self._wall = _last_wall(folder / "progress.csv")
+        self._wall = max(_last_wall(folder / name) for name in ("progress.csv", "evaluation.csv"))
         from stable_baselines3.common.logger import Logger, make_output_format
 
         formats = []
