@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import tyro
 
+from raytac.device import resolve_device
 from raytac.errors import RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
@@ -29,7 +30,8 @@ def recorded(args: CommonOptions, name: str) -> Iterator[tuple[Path, dict[str, M
     """
     start = time.perf_counter()
     out = args.out if args.out is not None else Path("runs") / name
-    metrics: dict[str, Metric] = {"experiment": name, "seed": args.seed, "device": args.device}
+    device = resolve_device(args.device, ray_tracing=False)  # the solver's
+    metrics: dict[str, Metric] = {"experiment": name, "seed": args.seed, "device": device}
     with result_folder(out) as folder:
         yield folder, metrics
         write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})

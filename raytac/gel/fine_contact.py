@@ -230,7 +230,10 @@ class _Window:
 
 
 def _evening(lines: np.ndarray) -> np.ndarray:
-    """Takes waves of two cells out of values on ``lines`` (n,) and leaves straight ones as they are; (n, n), the ends stay."""
+    """Takes waves of two cells out of values on ``lines`` (n,) and leaves straight ones as they are; (n, n), the ends stay.
+
+    Of a wave of λ even cells cos²(π/λ) is left: half of one of four cells, 0.85 of one of eight.
+    """
     cell, n = np.diff(lines), len(lines)
     out = np.eye(n)
     for i in range(1, n - 1):

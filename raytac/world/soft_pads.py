@@ -198,7 +198,8 @@ class SoftPads:
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
     ) -> PadReading:
         """Surface and forces of one sensor, for the environments named, one row each; None is all."""
-        reading = self.soft.reading(name, grid, failed)
+        left_out = failed if envs is None else failed | ~np.isin(np.arange(len(failed)), envs)
+        reading = self.soft.reading(name, grid, left_out)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction() -> np.ndarray:

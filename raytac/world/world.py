@@ -292,9 +292,11 @@ class TactileWorld:
         drawn for them and no history written. One that is named twice has two rows that are the same.
 
         Raises:
-            InputError: an unknown sensor or environment; as ``TactileSensor.update``.
+            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         rows = None if envs is None else chosen_envs(envs, self.num_envs)
+        if rows is not None and not rows:
+            raise InputError("envs", value=envs, rule="must name one environment or more")
         chosen = self.sensor_names if sensors is None else tuple(sensors)
         for name in chosen:
             if name not in self.sensor_names:

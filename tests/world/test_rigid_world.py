@@ -282,6 +282,8 @@ def test_wrong_arguments_are_refused() -> None:
     world = TactileWorld(UP, outputs=())
     with pytest.raises(InputError, match="must be a sensor of the scene"):
         world.observe(["left"])
+    with pytest.raises(InputError, match=r"envs.*one environment or more"):
+        world.observe(envs=[False])
     with pytest.raises(InputError, match="must be finite, of shape"):
         world.step(np.zeros(3))
     with pytest.raises(InputError, match="one for each of 1"):

@@ -53,6 +53,17 @@ def test_the_sensor_reads_the_simulated_pad(resting: TactileWorld) -> None:
     assert frame.surface.grid.shape == resting.sensors["sensor"].grid.shape
 
 
+def test_some_environments_read_as_all_of_them_do() -> None:
+    world = TactileWorld(UP, outputs=("wrench", "traction"), num_envs=2)
+    for _ in range(10):
+        world.step()
+    whole, one = world.observe()["sensor"], world.observe(envs=[1])["sensor"]
+    assert whole.surface.contact[1].any() and one.traction is not None and whole.traction is not None
+    for all_of_them, alone in ((whole.surface.height, one.surface.height), (whole.traction, one.traction)):
+        assert np.isfinite(alone).all()
+        np.testing.assert_array_equal(alone[0], all_of_them[1])
+
+
 def test_reset_restores(resting: TactileWorld) -> None:
     first = resting.state()
     resting.reset()
