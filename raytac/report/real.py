@@ -110,52 +110,52 @@ def compare_real(
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
-    with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
-        for number, (kind, (train, test)) in enumerate(splits):
-            models = _fitted(sensor, shots.take(train), settings, bar)
-            seen, labelled = _tested(models, sensor, shots.take(test))
-            for where, found in (("", seen), ("labelled_", labelled)):
-                for mode, stack in found.items():
-                    of = scores.setdefault(where + kind, {}).setdefault(mode, [])
-                    of += press_scores(sensor, stack, shots.take(test))
-            if kind == "press":
-                images |= {int(k): {mode: stack[i] for mode, stack in seen.items()} for i, k in enumerate(test)}
-            if number == 0:
-                own = shots.take(test)
-                metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, own, own.circles).items()}
-                device = models.modes["raytrace"].device
-            bar.update()
-        train, test = splits[0][1]
-        for name in ablations:
-            one = ABLATIONS[name]
-            changed = one.sensor(sensor)
-            options = {"shadows": settings.shadows != one.other_shadows, **one.options}
-            models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), fixed=one.fixed, options=options)
-            seen, _ = _tested(models, changed, shots.take(test))
-            for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
-                metrics[f"ablation.{name}.{key}"] = value
-            bar.update()
-        for key, value in summary(scores["press"]["raytrace"][: len(test)]).items():
-            metrics[f"ablation.nothing.{key}"] = value
-    for kind, by_mode in scores.items():
-        prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
-        for mode, of in by_mode.items():
-            metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
-    metrics["noise_floor"] = noise_floor(sensor, shots)
-    head: dict[str, Metric] = {"command": "compare-real", "device": device, "seed": settings.seed, "sensor": sensor.name}
-    head |= {
-        "presses": len(shots.presses),
-        "folds": settings.folds,
-        "shadows": int(settings.shadows),
-        "starts": settings.starts,
-        "rounds": settings.rounds,
-        "leds": len(sensor.lights.leds),
-        "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
-        **versions(),
-    }
-    from raytac.report.real_figure import draw, table_text
+    with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
+        with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
+            for number, (kind, (train, test)) in enumerate(splits):
+                models = _fitted(sensor, shots.take(train), settings, bar)
+                seen, labelled = _tested(models, sensor, shots.take(test))
+                for where, found in (("", seen), ("labelled_", labelled)):
+                    for mode, stack in found.items():
+                        of = scores.setdefault(where + kind, {}).setdefault(mode, [])
+                        of += press_scores(sensor, stack, shots.take(test))
+                if kind == "press":
+                    images |= {int(k): {mode: stack[i] for mode, stack in seen.items()} for i, k in enumerate(test)}
+                if number == 0:
+                    own = shots.take(test)
+                    metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, own, own.circles).items()}
+                    device = models.modes["raytrace"].device
+                bar.update()
+            train, test = splits[0][1]
+            for name in ablations:
+                one = ABLATIONS[name]
+                changed = one.sensor(sensor)
+                options = {"shadows": settings.shadows != one.other_shadows, **one.options}
+                models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), fixed=one.fixed, options=options)
+                seen, _ = _tested(models, changed, shots.take(test))
+                for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
+                    metrics[f"ablation.{name}.{key}"] = value
+                bar.update()
+            for key, value in summary(scores["press"]["raytrace"][: len(test)]).items():
+                metrics[f"ablation.nothing.{key}"] = value
+        for kind, by_mode in scores.items():
+            prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
+            for mode, of in by_mode.items():
+                metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
+        metrics["noise_floor"] = noise_floor(sensor, shots)
+        head: dict[str, Metric] = {"command": "compare-real", "device": device, "seed": settings.seed, "sensor": sensor.name}
+        head |= {
+            "presses": len(shots.presses),
+            "folds": settings.folds,
+            "shadows": int(settings.shadows),
+            "starts": settings.starts,
+            "rounds": settings.rounds,
+            "leds": len(sensor.lights.leds),
+            "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
+            **versions(),
+        }
+        from raytac.report.real_figure import draw, table_text
 
-    with result_folder(out) as folder:
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
         shown = sorted(images)[:: max(1, len(images) // 6)][:6]
         draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")

@@ -61,54 +61,54 @@ def run_calibrate_optics(
     index = np.arange(len(shots.presses))
     held = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
     train, test = shots.take(index[~held]), shots.take(index[held])
-    with tqdm(desc=f"calibrate {model}", unit="step", disable=None, file=sys.stderr) as bar:
+    with result_folder(out, FILES) as folder:  # now, so that a folder that cannot be written is told before the fit
+        with tqdm(desc=f"calibrate {model}", unit="step", disable=None, file=sys.stderr) as bar:
 
-        def tick(stage: str, cost: float) -> None:
-            bar.update()
-            bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
+            def tick(stage: str, cost: float) -> None:
+                bar.update()
+                bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
 
-        settings = FitSettings(fixed=("gamma",))
-        models = fit_models(
-            sensor,
-            train,
-            settings=settings,
-            modes=(model,),
-            device=device,
-            seed=seed,
-            starts=starts,
-            rounds=rounds,
-            options={"shadows": shadows},
-            tick=tick,
-        )
-    mode, fitted = models.modes[model], models.fitted
-    metrics: dict[str, Metric] = {"command": "calibrate", "model": model, "device": mode.device, "seed": seed}
-    metrics |= {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "data": data, "sensor": sensor.name}
-    metrics |= {
-        "holdout": holdout,
-        "shadows": int(shadows),
-        "starts": starts,
-        "rounds": rounds,
-        "leds": len(sensor.lights.leds),
-        "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
-        "presses.fitted": int((~held).sum()),
-        "presses.held_out": int(held.sum()),
-        **versions(),
-    }
-    circles = shots.circles.copy()
-    circles[~held] = fitted.state.circles
-    own = press_scores(sensor, images_of(mode, sensor, train, circles[~held], fitted.state.slopes), train)
-    metrics |= {f"fitted.{key}": value for key, value in summary(own).items()}
-    if held.any():
-        circles[held] = models.circles(test)
-        tested = press_scores(sensor, images_of(mode, sensor, test, circles[held], fitted.state.slopes), test)
-        metrics |= {f"held_out.{key}": value for key, value in summary(tested).items()}
-    metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
-    errors = np.array([score["contact_mae"] for score in own])
-    bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
-    metrics["outliers"] = ", ".join(bad)
-    for name in bad:
-        print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
-    with result_folder(out, FILES) as folder:
+            settings = FitSettings(fixed=("gamma",))
+            models = fit_models(
+                sensor,
+                train,
+                settings=settings,
+                modes=(model,),
+                device=device,
+                seed=seed,
+                starts=starts,
+                rounds=rounds,
+                options={"shadows": shadows},
+                tick=tick,
+            )
+        mode, fitted = models.modes[model], models.fitted
+        metrics: dict[str, Metric] = {"command": "calibrate", "model": model, "device": mode.device, "seed": seed}
+        metrics |= {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "data": data, "sensor": sensor.name}
+        metrics |= {
+            "holdout": holdout,
+            "shadows": int(shadows),
+            "starts": starts,
+            "rounds": rounds,
+            "leds": len(sensor.lights.leds),
+            "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
+            "presses.fitted": int((~held).sum()),
+            "presses.held_out": int(held.sum()),
+            **versions(),
+        }
+        circles = shots.circles.copy()
+        circles[~held] = fitted.state.circles
+        own = press_scores(sensor, images_of(mode, sensor, train, circles[~held], fitted.state.slopes), train)
+        metrics |= {f"fitted.{key}": value for key, value in summary(own).items()}
+        if held.any():
+            circles[held] = models.circles(test)
+            tested = press_scores(sensor, images_of(mode, sensor, test, circles[held], fitted.state.slopes), test)
+            metrics |= {f"held_out.{key}": value for key, value in summary(tested).items()}
+        metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
+        errors = np.array([score["contact_mae"] for score in own])
+        bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
+        metrics["outliers"] = ", ".join(bad)
+        for name in bad:
+            print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
         if model == "raytrace":
             error = f"{metrics.get('held_out.contact_mae', metrics['fitted.contact_mae']):.2f}"
             what = "on held-out presses" if held.any() else "on the fitted presses"
