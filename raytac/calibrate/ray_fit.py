@@ -25,7 +25,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.raytrace import RayTracer
 from raytac.specs import SensorSpec
 
-__all__ = ["Fitted", "brightened", "defect", "fit_lights", "refine_circles"]
+__all__ = ["FEWEST", "Fitted", "brightened", "defect", "fit_lights", "refine_circles"]
 
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
@@ -35,6 +35,8 @@ FIRST, LATER = 100, 30
 """Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5])
 """How far starts lie apart: mm, rad, lobe exponent."""
+FEWEST = 4
+"""Fewest presses that a fit takes."""
 ENVS = 16
 """Presses in one call of the ray tracer."""
 
@@ -113,8 +115,8 @@ def fit_lights(
     begin = start or FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
     problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
     unknown, known = len(problem.flat(begin)) + 3 * len(shots.circles), 3 * len(problem.press)
-    if known < 10 * unknown or len(shots.circles) < 4:
-        rule = f"are too few for {unknown} parameters ({known} values): take at least 4, and 10 values a parameter"
+    if known < 10 * unknown or len(shots.circles) < FEWEST:
+        rule = f"are too few for {unknown} parameters ({known} values): take at least {FEWEST}, and 10 values a parameter"
         raise InputError("presses", value=len(shots.circles), rule=rule)
     if start is None:
         begin = brightened(problem, begin)

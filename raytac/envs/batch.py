@@ -99,7 +99,9 @@ class TaskBatch:
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
-        probe = TactileObserver(loaded.robot.sensor, settings, num_envs=num_envs, randomization=randomization, seed=seed)
+        # Without touch the sensor needs no markers: the force alone is asked of the probe.
+        asked = ObservationSettings(("wrench",)) if settings is None else settings
+        probe = TactileObserver(loaded.robot.sensor, asked, num_envs=num_envs, randomization=randomization, seed=seed)
         loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
         loaded = randomised_bodies(loaded, self.randomization, seed)
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
@@ -112,7 +114,7 @@ class TaskBatch:
             quiet = replace(self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0)
             for i, name in enumerate(self.world.sensor_names):
                 self.observers[name] = TactileObserver(
-                    probe.sensor, settings, num_envs=num_envs, randomization=quiet, seed=seed + i
+                    probe.sensor, settings, num_envs=num_envs, randomization=quiet, seed=_own_seed(seed, i)
                 )
         self.steering = Steering(self.world, task.motion, action)
         self.body_seen = task.body_seen if body_seen is None else body_seen
@@ -136,9 +138,10 @@ class TaskBatch:
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
         """Start the streams of cameras and markers of environments anew; the next ``reset`` draws from them."""
         for i, (name, observer) in enumerate(self.observers.items()):
-            observer.reseed(envs, [seed + i for seed in seeds])
+            own = [_own_seed(seed, i) for seed in seeds]
+            observer.reseed(envs, own)
             if observer.settings.needs_markers:
-                self.world.sensors[name].marker_tracker.reseed(envs, [seed + i for seed in seeds])
+                self.world.sensors[name].marker_tracker.reseed(envs, own)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
         """Begin episodes in environments, each with a generator of its own; observation (B, …) of all of them."""
@@ -252,6 +255,11 @@ class TaskBatch:
             env = int(np.flatnonzero(~self._begun)[0])
             raise InputError("environment", value=env, rule="must be reset before it is stepped")
         return np.clip(values, -1.0, 1.0)
+
+
+def _own_seed(seed: int, sensor: int) -> int:
+    """Of a sensor of an environment. Environments of a vector have seeds in sequence, so a sensor's must not be the next environment's."""
+    return seed + (sensor << 64)
 
 
 def _pitch(observer: TactileObserver) -> float:

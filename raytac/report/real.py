@@ -16,6 +16,7 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses
+from raytac.calibrate.ray_fit import FEWEST
 from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
@@ -102,6 +103,9 @@ def compare_real(
     if settings.regions:
         splits += [("left_right", by_half(presses)[0]), ("right_left", by_half(presses)[1])]
         splits += [("shallow_deep", shallow_to_deep(presses))]
+    for kind, (train, _) in splits:  # now, and not after the fits before it
+        if len(train) < FEWEST:
+            raise InputError("presses", value=len(train), rule=f"are too few to fit the split {kind!r} to: at least {FEWEST}")
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}
@@ -143,7 +147,10 @@ def compare_real(
         "presses": len(shots.presses),
         "folds": settings.folds,
         "shadows": int(settings.shadows),
+        "starts": settings.starts,
+        "rounds": settings.rounds,
         "leds": len(sensor.lights.leds),
+        "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
         **versions(),
     }
     from raytac.report.real_figure import draw, table_text
@@ -193,5 +200,5 @@ def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dic
 
 def check_folds(presses: RealPresses, folds: int) -> None:
     """Raises ``InputError`` for folds that leave too few presses to fit to."""
-    if len(presses) - -(-len(presses) // max(folds, 1)) < 4:
-        raise InputError("presses", value=len(presses), rule=f"are too few for {folds} folds: 4 must be left to fit to")
+    if len(presses) - -(-len(presses) // max(folds, 1)) < FEWEST:
+        raise InputError("presses", value=len(presses), rule=f"are too few for {folds} folds: {FEWEST} must be left to fit to")

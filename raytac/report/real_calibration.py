@@ -13,6 +13,7 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.ray_fit import Fitted
+from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
@@ -22,6 +23,7 @@ from raytac.optics.taxim import TaximMode
 from raytac.report.real_models import fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
+from raytac.specs.files import available, find_file
 from raytac.specs.lights_text import lights_text
 
 __all__ = ["OUTLIER", "run_calibrate_optics", "sensor_text"]
@@ -50,9 +52,12 @@ def run_calibrate_optics(
     """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
 
     Raises:
-        InputError: too few presses, or a folder that cannot be written.
+        InputError: too few presses, fewer than ``holdout`` too, or a folder that cannot be written.
         BackendError: the ray tracer cannot run on ``device``.
     """
+    if holdout > len(shots.presses):
+        rule = f"are too few to hold out every {holdout}th: name a smaller holdout, or 0 for none"
+        raise InputError("presses", value=len(shots.presses), rule=rule)
     index = np.arange(len(shots.presses))
     held = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
     train, test = shots.take(index[~held]), shots.take(index[held])
@@ -81,6 +86,10 @@ def run_calibrate_optics(
     metrics |= {
         "holdout": holdout,
         "shadows": int(shadows),
+        "starts": starts,
+        "rounds": rounds,
+        "leds": len(sensor.lights.leds),
+        "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
         "presses.fitted": int((~held).sum()),
         "presses.held_out": int(held.sum()),
         **versions(),
@@ -120,10 +129,14 @@ def run_calibrate_optics(
     return [out / name for name in written]
 
 
+def _is_shipped(file: Path) -> bool:
+    return file.stem in available("sensor") and file.resolve() == find_file("sensor", file.stem).resolve()
+
+
 def sensor_text(sensor: SensorSpec, fitted: Fitted) -> str:
     """A sensor file on the base of ``sensor`` with the fitted response and lights.toml beside it."""
     response = fitted.sensor.response
-    base = sensor.name if sensor.source is None or sensor.source.parent.name == "sensors" else str(sensor.source.resolve())
+    base = sensor.name if sensor.source is None or _is_shipped(sensor.source) else str(sensor.source.resolve())
 
     def row(values: tuple[float, ...]) -> str:
         return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -12,7 +12,16 @@ from gymnasium.vector import AutoresetMode
 
 import raytac.envs
 import raytac.envs.lift_cube
-from raytac.envs import BalancePoleEnv, LiftCubeEnv, PushCubeEnv, PushCubeVectorEnv, RollBallEnv, RollBallVectorEnv, scripted
+from raytac.envs import (
+    BalancePoleEnv,
+    LiftCubeEnv,
+    LiftCubeVectorEnv,
+    PushCubeEnv,
+    PushCubeVectorEnv,
+    RollBallEnv,
+    RollBallVectorEnv,
+    scripted,
+)
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
@@ -93,6 +102,15 @@ def test_a_vector_does_what_single_environments_of_its_seeds_do() -> None:
             assert earned == pytest.approx(reward[b])
             assert info["reward_terms"]["reaching"] == pytest.approx(infos["reward_terms"]["reaching"][b])
     assert steps[-1][0]["sensor_markers"].any(), "nothing was touched"
+
+
+def test_no_two_sensors_of_a_vector_have_the_same_noise() -> None:
+    tactile = ObservationSettings(("rgb", "markers"), resolution=(16, 12), optics="phong")
+    disturbed = Randomization(noise=4.0, markers=MarkerPerturbation(noise_px=0.3))
+    seen, _ = LiftCubeVectorEnv(3, tactile=tactile, randomization=disturbed).reset(seed=5)
+    for modality in ("rgb", "markers"):  # of pads at rest, so that noise alone tells them apart
+        pads = np.concatenate([seen[f"{name}_{modality}"].reshape(3, -1) for name in ("left", "right")])
+        assert len(np.unique(pads, axis=0)) == 6, modality
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])

@@ -156,6 +156,14 @@ def test_a_pupil_learns_what_it_is_shown_and_in_the_same_way_each_time() -> None
         Learner(replace(recipe, processes=2))
 
 
+def test_time_of_imitation_counts_after_a_resume(tmp_path: Path) -> None:
+    recipe = replace(RECIPE, tactile="none", teacher_steps=64)
+    first = Training(recipe, tmp_path, evaluation=2, say=lambda _: None)
+    first.run_segment()
+    assert not (tmp_path / "progress.csv").exists(), "no rollout of PPO yet"
+    assert Training(recipe, tmp_path, evaluation=2).wall_s == pytest.approx(first.wall_s, abs=0.01) and first.wall_s > 0.01
+
+
 def test_modalities_by_name() -> None:
     assert tactile_settings("none") is None and tactile_settings("task") == "task"
     with pytest.raises(InputError, match="modality"):
