@@ -28,6 +28,7 @@ import numpy as np
 import ipc
 from experiments.grasp_control import GraspController, smooth
 from experiments.running import run
+from raytac.device import resolve_device
 from raytac.errors import RaytacError
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
@@ -243,7 +244,12 @@ def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: flo
     column["drift"] = np.linalg.norm(way, axis=1)
     sittings = [column["memory_mb"][column["sitting"] == k] for k in np.unique(column["sitting"])]
     growth = [float(memory[-1] - memory[0]) for memory in sittings]
-    metrics: dict[str, Metric] = {"experiment": "endurance", "device": args.device, "seed": args.seed, "wall_s": spent}
+    metrics: dict[str, Metric] = {
+        "experiment": "endurance",
+        "device": resolve_device(args.device, ray_tracing=False),
+        "seed": args.seed,
+        "wall_s": spent,
+    }
     metrics |= {
         "endurance.steps": done,
         "endurance.cycles": len(rows),
