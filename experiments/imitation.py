@@ -1,5 +1,8 @@
 """A segment of imitation before reinforcement: the policy learns what a scripted one, which knows the state, would do."""
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 from collections.abc import Mapping

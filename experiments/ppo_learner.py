@@ -1,5 +1,8 @@
 """What is trained and what it is trained in: recipes, networks, environments with their normaliser, checkpoints, evaluation."""
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import os

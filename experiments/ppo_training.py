@@ -6,6 +6,9 @@ training that is interrupted and resumed ends with the same weights, bit for bit
 of processes and one version of all libraries).
 """
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import contextlib

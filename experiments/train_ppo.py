@@ -9,6 +9,9 @@ and, where TensorBoard is installed, its events. ``<out>/`` gets ``metrics.json`
 ``policy_<tactile>_seed<k>.pt`` of each training, which ``experiments/play.py`` plays.
 """
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import multiprocessing

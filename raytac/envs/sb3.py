@@ -1,5 +1,8 @@
 """Environments for stable-baselines3, which this module imports: a vector of ours as its ``VecEnv``, and several of them in processes."""
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import multiprocessing

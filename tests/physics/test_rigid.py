@@ -250,13 +250,14 @@ def test_turn_shear_and_twist_by_environment_are_those_of_scenes_of_their_own() 
     twists = np.array([0.1, -0.2, 0.05])
     own = np.array([0.9, 0.0, 0.3, 0.1])
     stages = indent(0.6e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.3)
-    scene = scene_of("torus", *stages, quaternion=tuple(own))
+    scene = scene_of("torus", *stages, quaternion=(0.9, 0.0, 0.3, 0.1))
     pad, states = press(scene, num_envs=3, rotations=turns, shears=shears, twists=twists)
     for b in range(3):
         turned = np.empty(4)
-        mujoco.mju_mulQuat(turned, turns[b], own)
+        mujoco.mju_mulQuat(turned, turns[b], own)  # pyright: ignore[reportAttributeAccessIssue]
         alone_stages = indent(0.6e-3), StageSpec("shear", shear=tuple(shears[b])), StageSpec("twist", twist=twists[b])
-        alone, single = press(scene_of("torus", *alone_stages, quaternion=tuple(turned)))
+        w, x, y, z = turned.tolist()
+        alone, single = press(scene_of("torus", *alone_stages, quaternion=(w, x, y, z)))
         for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque"):
             np.testing.assert_allclose(getattr(states[-1], name)[b], getattr(single[-1], name)[0], rtol=1e-6, atol=1e-9)
         apart = pad.surface(states[-1]).height[b] - alone.surface(single[-1]).height[0]
