@@ -15,12 +15,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipc.errors import IpcError
 from ipc.layout import Layout
 from ipc.potential import Potential
 from ipc.report import PatchMotion
 from ipc.rest_stiffness import rest_blocks
 from ipc.settings import Settings
-from ipc.substructure import choose_partition, condense
+from ipc.substructure import MAX_ENTRIES, choose_partition, condense, entries
 
 __all__ = ["RestPatches"]
 
@@ -36,10 +37,22 @@ class RestPatches:
     """Patches of one bonded soft body; making it inverts the body's rest matrix once."""
 
     def __init__(self, layout: Layout, settings: Settings, body: int) -> None:
-        """Raises ``numpy.linalg.LinAlgError`` where the matrix is too ill-conditioned for single precision."""
-        blocks = rest_blocks(layout, replace(settings, dt=_STATIC, integrator="euler"))
+        """Invert the body's rest matrix.
+
+        Raises:
+            IpcError: the body is too large for it, or the matrix too ill-conditioned for single precision.
+        """
         nodes, label = choose_partition(layout, body)
-        self._inner = condense(layout, blocks, nodes, label)
+        name, size = layout.names[body], entries(layout, nodes, label)
+        if size > MAX_ENTRIES:
+            rule = f"the inverse of its rest matrix would have {size} numbers, at most {MAX_ENTRIES}; cut it more coarsely"
+            raise IpcError(f"{name!r} has {len(nodes)} free vertices, too many to tell how stiffly it is held: {rule}")
+        blocks = rest_blocks(layout, replace(settings, dt=_STATIC, integrator="euler"))
+        try:
+            self._inner = condense(layout, blocks, nodes, label)
+        except np.linalg.LinAlgError as error:
+            rule = "its rest matrix is too ill-conditioned to be inverted in single precision"
+            raise IpcError(f"{name!r}: {rule}; cut it into better shaped cells") from error
         self._body, self._layout = body, layout
         span = np.arange(layout.node_start[body], layout.node_start[body + 1])
         self._bonded = layout.node_rest[span[layout.node_free[span] == 0]]

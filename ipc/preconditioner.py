@@ -11,12 +11,10 @@ from ipc.linear import BlockJacobi, Preconditioner
 from ipc.rest_inverse import RestInverse
 from ipc.rest_stiffness import bonded_bodies
 from ipc.settings import Settings
-from ipc.substructure import choose_partition, entries
+from ipc.substructure import MAX_ENTRIES, choose_partition, entries
 
-__all__ = ["MAX_ENTRIES", "make_preconditioner", "pays"]
+__all__ = ["make_preconditioner", "pays"]
 
-MAX_ENTRIES = 60_000_000
-"""Numbers of four bytes up to which the rest inverse of a body is built; the host needs a minute for that many, and more for more."""
 _FEW_NODES, _MANY_NODES = 700, 3000
 _NEARLY_INCOMPRESSIBLE = 1 / (1 - 2 * 0.47)
 """λ/μ of the energy at ν = 0.47."""

@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from ipc.layout import Layout
 from ipc.rest_stiffness import Floats, Ints, dense_block, free_nodes
 
-__all__ = ["Patch", "Substructure", "choose_partition", "condense", "entries", "partition"]
+__all__ = ["MAX_ENTRIES", "Patch", "Substructure", "choose_partition", "condense", "entries", "partition"]
 
 Singles = NDArray[np.float32]
 
+MAX_ENTRIES = 60_000_000
+"""Numbers of four bytes up to which the rest inverse of a body is built; the host needs a minute for that many, and more for more."""
 MAX_PATCHES = 64
 """More than that many patches leave little inside them."""
 

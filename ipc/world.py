@@ -301,7 +301,11 @@ class World:
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
         """The part of a bonded soft body that bore contact forces at the end of the last step, as if it moved as a whole.
 
-        None where nothing touches what is free of it. The first call for a body inverts its rest matrix.
+        None where nothing touches what is free of it. The first call for a body inverts its rest matrix (before any step it
+        answers None, and that is done).
+
+        Raises:
+            IpcError: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
         """
         body = self._index(name)
         if not isinstance(self.bodies[body], SoftBody) or not self.layout.framed[body]:

@@ -15,7 +15,7 @@ from raytac.specs.press import MOVES, PressScene
 from raytac.specs.press_file import STAGE_SCHEMA
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["CLEARANCE", "about_z", "check_trajectory", "peak_state", "per_environment", "rotation_matrix", "scene_parts"]
+__all__ = ["CLEARANCE", "about_z", "check_trajectory", "peak_state", "per_environment", "scene_parts"]
 
 CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before the press and after a release."""
@@ -79,21 +79,6 @@ def per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]
     if array.shape != shape:
         raise InputError(name, value=array.shape, rule=f"must have shape {shape}")
     return array
-
-
-def rotation_matrix(quaternion: tuple[float, float, float, float]) -> np.ndarray:
-    """Rotation matrix (3, 3) of a quaternion wxyz of any length > 0."""
-    q = np.asarray(quaternion, float)
-    if not np.isfinite(q).all() or np.linalg.norm(q) == 0.0:
-        raise SpecError("must be four finite numbers, not all 0", key="object.quaternion_wxyz", value=quaternion)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from raytac.errors import InputError
-from raytac.physics.press_plan import per_environment, rotation_matrix
+from raytac.errors import InputError, SpecError
+from raytac.physics.press_plan import per_environment
+from raytac.physics.rotation import rotation_of
 from raytac.specs.press import PressScene, StageSpec
 
 __all__ = ["PressTargets"]
@@ -47,6 +49,7 @@ class PressTargets:
 
         Raises:
             InputError: ``num_envs`` below 1, an argument of another shape, or a quaternion of zeros.
+            SpecError: the scene's own quaternion is not finite or of zeros.
         """
         if num_envs < 1:
             raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
@@ -64,10 +67,15 @@ class PressTargets:
         if zero.any():
             rule = f"must not be all 0, in environment {int(zero.argmax())}"
             raise InputError("rotations", value=turns[zero.argmax()].tolist(), rule=rule)
-        own = rotation_matrix(scene.object.quaternion)
+        at_rest = np.asarray(scene.object.quaternion, float)
+        if not np.isfinite(at_rest).all() or not at_rest.any():
+            rule = "must be four finite numbers, not all 0"
+            raise SpecError(rule, file=scene.source, key="object.quaternion_wxyz", value=scene.object.quaternion)
+        self._scene, self._turns = scene, turns
+        own = rotation_of(at_rest / np.linalg.norm(at_rest))
         self.rotations = own[None].repeat(num_envs, axis=0)
         if rotations is not None:
-            self.rotations = np.stack([rotation_matrix(tuple(turn)) for turn in turns]) @ own
+            self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ own
 
     def stage(self, stage: StageSpec, b: int) -> StageSpec:
         """A stage as environment ``b`` runs it."""
@@ -90,6 +98,50 @@ class PressTargets:
     def twist(self, stage: StageSpec) -> np.ndarray:
         """Where a twist ends [rad], (B,)."""
         return self._sound(np.full(len(self.lost), stage.twist) if self._twists is None else self._twists)
+
+    def start_error(self, b: int, error: InputError) -> InputError | SpecError:
+        """``error`` of environment ``b`` at its start, under what it does in its own way, or else the scene's file and key."""
+        own = self._own(b, ())
+        if own is not None:
+            return InputError(own[0], value=own[1], rule=f"in environment {b}, at the start: {error.rule}")
+        place = [float(f"{v * 1e3:.6g}") for v in self._scene.object.position[:2]]
+        return SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place)
+
+    def stage_error(self, index: int, stage: StageSpec, b: int, error: InputError) -> InputError | SpecError:
+        """``error`` of environment ``b`` in a stage, under what it does in its own way, or else the scene's file and key.
+
+        Args:
+            index: the stage's number in the scene, −1 if it is none of the scene's: then ``error`` stays as it is, if nothing is its own.
+            stage: as environment ``b`` runs it.
+            error: of a place (its ``rule`` is a sentence) or of a force (its ``name`` is "force", its rule lacks the subject).
+        """
+        trajectory = self._scene.trajectory
+        behind = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
+        own = self._own(b, [one.kind for one in reversed(behind)])
+        kept = f"the force kept here, {error.value:.4g} N, " if error.name == "force" and stage.kind != "indent" else ""
+        if own is not None:
+            subject = kept or (f"the force, {error.value:.4g} N, " if error.name == "force" else "")
+            where = f"trajectory[{index}]" if index >= 0 else f"a further {stage.kind}"
+            return InputError(own[0], value=own[1], rule=f"in environment {b}, in {where}: {subject}{error.rule}")
+        if index < 0:
+            return error
+        if stage.kind == "shear":
+            name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
+        elif stage.kind == "twist":
+            name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
+        else:
+            name, value = "force_n", error.value
+        return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
+
+    def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
+        """Name and value of what of its own took environment ``b`` where it is: in stages of ``kinds``, last first, then at the start."""
+        given = {"shear": ("shears", self._shears), "twist": ("twists", self._twists)}
+        for name, values in (given[kind] for kind in kinds if kind in given):
+            if values is not None:
+                return name, values[b].tolist()
+        if self.offsets[b].any():
+            return "offsets", self.offsets[b].tolist()
+        return ("rotations", self._turns[b].tolist()) if self._turns[b, 1:].any() else None
 
     def _sound(self, values: np.ndarray) -> np.ndarray:
         return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)

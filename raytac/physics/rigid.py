@@ -116,6 +116,7 @@ class RigidPad:
             InputError: ``steps_per_stage`` below 1.
             SpecError: a force that would press deeper than the pad, or an object that does not start over the pad or is sheared or
                 twisted off it; names the scene's file and key.
+            InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
         """
         if steps_per_stage < 1:
             raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
@@ -202,8 +203,7 @@ class RigidPad:
         try:
             touch, law = self._touch(b, x, y, 0.0)
         except InputError as error:
-            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
-            raise SpecError(error.rule, file=self.scene.source, key="object.position_mm", value=place) from error
+            raise self._targets.start_error(b, error) from error
         stiffest = float((np.diff(law.table) / np.diff(law.depth)).max())
         e = _Environment(np.array([x, y, touch]), self._rig(stiffest), shear=np.zeros(2))
         e.rig.place(e.origin, touch)
@@ -212,19 +212,6 @@ class RigidPad:
 
     def _rig(self, stiffest: float) -> PressRig:
         return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
-
-    def _stage_error(self, index: int, stage: StageSpec, error: InputError) -> InputError | SpecError:
-        """``error`` of a stage, under the file and key that asked for it, in the unit of the file; as it is if no file did."""
-        if index < 0:
-            return error
-        if stage.kind == "shear":
-            name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
-        elif stage.kind == "twist":
-            name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
-        else:
-            name, value = "force_n", error.value
-        kept = f"the force kept here, {error.value:.4g} N, " if error.name == "force" and stage.kind != "indent" else ""
-        return SpecError(kept + error.rule, file=self.scene.source, key=f"trajectory[{index}].{name}", value=value)
 
     def _touch(self, b: int, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
         """First-touch height of the object's origin and load law at a place and angle; kept, since environments share them."""
@@ -254,7 +241,7 @@ class RigidPad:
         try:
             touch, law = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], twist)
         except InputError as error:
-            raise self._stage_error(index, stage, error) from error
+            raise self._targets.stage_error(index, stage, b, error) from error
         e.shear, e.twist = shear, twist
         if stage.kind == "indent":
             e.by_force = stage.force is not None
@@ -270,7 +257,7 @@ class RigidPad:
             try:
                 law.depth_at(target)
             except InputError as error:
-                raise self._stage_error(index, stage, error) from error
+                raise self._targets.stage_error(index, stage, b, error) from error
             e.rig.joints = np.array([*e.shear, -max(e.depth, lift), e.twist])
             settled = e.rig.load(previous_force, target, stage.duration / steps, law.secant_stiffness)
             e.failed = not settled

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from raytac.errors import InputError, SpecError
+from raytac.errors import InputError
 from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.physics.first_touch import first_touch_z, gap_at_touch
@@ -28,15 +28,17 @@ class SoftPlaces:
         """Environments that are lost are put at the pad's middle.
 
         Raises:
-            SpecError: an object that does not start over the pad; names the scene's file and key.
+            SpecError: an object that does not start over the pad, or is sheared or twisted off it; names the scene's file and key.
+            InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
         """
-        self._scene, self._parts, self._gelpad, self._grid = scene, parts, gelpad, grid
+        self._targets, self._parts, self._gelpad, self._grid = targets, parts, gelpad, grid
         self._rotations = targets.rotations
         self._touches: dict[bytes, float] = {}
         start = np.asarray(scene.object.position[:2])
         places = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
         self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(places.tolist())])
         """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
+        self._check_ways(scene)
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
         """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
@@ -77,8 +79,24 @@ class SoftPlaces:
         try:
             return np.array([x, y, self._touch(b, x, y, 0.0)])
         except InputError as error:
-            place = [float(f"{v * 1e3:.6g}") for v in (x, y)]
-            raise SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place) from error
+            raise self._targets.start_error(b, error) from error
+
+    def _check_ways(self, scene: PressScene) -> None:
+        """Refuse shears and twists that end off the pad."""
+        targets, shear, twist = self._targets, np.zeros((len(self.origin), 2)), np.zeros(len(self.origin))
+        for index, stage in enumerate(scene.trajectory):
+            if stage.kind not in ("shear", "twist"):
+                continue
+            if stage.kind == "shear":
+                shear = targets.shear(stage)
+            else:
+                twist = targets.twist(stage)
+            for b in np.flatnonzero(~targets.lost).tolist():
+                x, y = self.origin[b, :2] + shear[b]
+                try:
+                    self._touch(b, x, y, twist[b])
+                except InputError as error:
+                    raise targets.stage_error(index, targets.stage(stage, b), b, error) from error
 
     def _touch(self, b: int, x: float, y: float, twist: float) -> float:
         """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""

@@ -73,7 +73,8 @@ class Touching:
     """Normal force on ``body`` that w₀ has [N], world frame, (3,): where K would make it pull, the contact opens. None: it never does."""
     wrench: np.ndarray | None = None
     """All that w₀ has of this contact, normal force and friction [N] on ``body`` and their torque about ``point`` [N m], (6,): what an open
-    contact takes with it. None: ``push`` alone."""
+    contact takes with it. None: ``push`` alone. It is taken off at the point as it has moved by then, with the torque unchanged: wrong by
+    force × way, of second order in an interval."""
 
     @property
     def released(self) -> np.ndarray:

@@ -80,7 +80,7 @@ class SoftPads:
             device: of the solver.
 
         Raises:
-            SpecError: a body that the solver cannot hold.
+            SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model = composed, composed.model
@@ -117,6 +117,7 @@ class SoftPads:
             felt = self._links + [b.index for b in self._led]
             self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._led)], felt, strict=True))
             self._coupling = Coupling(self.model, felt, len(datas))
+            self._prepare_held()
         self._last_cases = self._pad_poses(datas)
         self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
         self._traction: dict[str, CoatTraction] = {}
@@ -213,6 +214,18 @@ class SoftPads:
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """None: the solver refuses a start in which bodies overlap."""
         return []
+
+    def _prepare_held(self) -> None:
+        """Invert the stiffness of soft bodies that are held now, not in the step that first touches them (see ``soft_answers``)."""
+        scene = self.composed.scene
+        for i, body in enumerate(scene.bodies):
+            if body.held_by is None:
+                continue
+            try:
+                self.soft.world.held_patch(body.name, 0)
+            except ipc.IpcError as error:
+                cell = None if body.cell is None else float(f"{body.cell * 1e3:.6g}")
+                raise SpecError(str(error), file=scene.source, key=f"body[{i}].cell_mm", value=cell) from error
 
     def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
         """One step of MuJoCo; returns whether the state is still sound."""

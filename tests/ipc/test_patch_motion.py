@@ -74,6 +74,23 @@ def test_a_slender_column_bends_and_weighs_as_a_beam_does(found: ipc.PatchMotion
     assert np.linalg.eigvalsh(found.inertia).min() > 0.0 and not found.velocity.any()
 
 
+def test_a_body_too_large_or_too_badly_shaped_to_be_inverted_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = column(grip=False)
+    assert world.held_patch("column", 0) is None  # nothing touches it
+    world = column(grip=False)
+    with monkeypatch.context() as patched:
+        patched.setattr("ipc.patch_motion.MAX_ENTRIES", 10_000)
+        with pytest.raises(ipc.IpcError, match=r"'column' has 128 free vertices.* at most 10000"):
+            world.held_patch("column", 0)
+
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr("ipc.patch_motion.condense", singular)
+    with pytest.raises(ipc.IpcError, match=r"'column': .*ill-conditioned"):
+        world.held_patch("column", 0)
+
+
 def _of(matrix: np.ndarray) -> np.ndarray:
     w = 0.5 * np.sqrt(1.0 + np.trace(matrix))
     axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])

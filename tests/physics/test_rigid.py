@@ -354,7 +354,26 @@ def test_a_kept_force_that_would_go_through_the_pad_is_blamed_on_the_stage_that_
         press(scene_of("sphere", law_force, StageSpec("shear", shear=(11.9e-3, 0.0))))
 
 
+@pytest.mark.parametrize(
+    ("own", "value", "where"),
+    [
+        ({"shears": [[0, 0], [30e-3, 0], [0, 0]]}, [30e-3, 0.0], r"trajectory\[1\]"),
+        ({"offsets": [[0, 0], [30e-3, 0], [0, 0]]}, [30e-3, 0.0], "the start"),
+        # In reach where it begins, sheared off by the scene.
+        ({"offsets": [[0, 0], [13e-3, 0], [0, 0]]}, [13e-3, 0.0], r"trajectory\[1\]"),
+    ],
+)
+def test_what_one_environment_of_a_batch_cannot_do_is_named_with_it(own: dict, value: list[float], where: str) -> None:
+    scene = scene_of("sphere", indent(0.3e-3), StageSpec("shear", shear=(2e-3, 0.0)))
+    name = next(iter(own))
+    with pytest.raises(InputError, match=f"{name} = .*in environment 1, (in|at) {where}: no part of the object") as caught:
+        press(scene, num_envs=3, **{name: np.array(own[name], float)})
+    assert caught.value.value == value
+
+
 def test_impossible_scenes_are_refused() -> None:
+    with pytest.raises(SpecError, match=r"object\.quaternion_wxyz.*not all 0"):
+        press(scene_of("sphere", quaternion=(0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(SpecError, match="thickness"):
         press(scene_of("sphere", indent(4.1e-3)))
     with pytest.raises(InputError, match="thickness"):

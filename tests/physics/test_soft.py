@@ -455,6 +455,18 @@ def test_an_untouched_pad_needs_no_solver():
     assert not pad.wrench(state).any() and not pad.traction(state).any() and pad.object_height(pad.surface(state)) is None
 
 
+def test_where_one_environment_of_a_batch_leaves_the_pad_is_told_before_the_solver_starts():
+    sheared = press(indent(0.4e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.1))
+    with pytest.raises(InputError, match=r"shears = .*in environment 2, in trajectory\[1\]: no part of the object") as caught:
+        soft(sheared, num_envs=3, shears=np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, -40e-3]]))
+    assert caught.value.value == [0.0, -40e-3]
+    with pytest.raises(InputError, match=r"offsets = .*in environment 1, at the start: no part"):
+        soft(sheared, num_envs=2, offsets=np.array([[0.0, 0.0], [40e-3, 0.0]]))
+    far = press(indent(0.4e-3), StageSpec("shear", shear=(40e-3, 0.0)))
+    with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = \[40\.0, 0\.0\]"):
+        soft(far)
+
+
 def test_bad_input_is_named():
     with pytest.raises(InputError, match=r"pad.*'huge'.*coarse, medium, fine"):
         soft(press(indent(0.4e-3)), pad="huge")

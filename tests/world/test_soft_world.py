@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from raytac.errors import InputError, OverlapError
+from raytac.errors import InputError, OverlapError, SpecError
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
@@ -176,7 +176,7 @@ def test_a_motion_that_cannot_be_resolved_is_refused() -> None:
     assert not both.step().failed.any()
 
 
-def test_a_soft_body_is_held_where_it_touches_its_holder() -> None:
+def test_a_soft_body_is_held_where_it_touches_its_holder(monkeypatch: pytest.MonkeyPatch) -> None:
     plate = BodySpec(
         "plate", "box", {"length": 0.02, "width": 0.02, "height": 0.004}, position=(0.0, 0.0, -0.052), dynamics="fixed"
     )
@@ -190,7 +190,11 @@ def test_a_soft_body_is_held_where_it_touches_its_holder() -> None:
         cell=0.003,
         held_by="plate",
     )
-    world = TactileWorld(replace(UP, bodies=(plate, beam)))
+    with monkeypatch.context() as patched:
+        patched.setattr("ipc.patch_motion.MAX_ENTRIES", 1000)
+        with pytest.raises(SpecError, match=r"body\[1\]\.cell_mm = 3\.0: 'beam' has .* at most 1000"):
+            TactileWorld(replace(UP, coupling="two_way", bodies=(plate, beam)))
+        world = TactileWorld(replace(UP, bodies=(plate, beam)))  # one-way asks for no stiffness
     assert set(world.composed.bodies) == {"plate"}  # MuJoCo has no soft bodies
     before = world.mesh("beam")[0]
     for _ in range(5):
