@@ -117,7 +117,8 @@ class ProcessVecEnv(_DictVecEnv):
             kind: the task's vector, such as ``PushCubeVectorEnv``.
             num_envs: number of environments in all, the same number in each process.
             processes: number of processes.
-            seed: of what is drawn once a world; process k has seed + k.
+            seed: of what is drawn once a world; process k has seed + k num_envs / processes, so that an environment's streams, until
+                ``seed`` gives it others, are those of its place among all and no two have the same.
             options: of ``TaskBatch``; they must pickle.
 
         Raises:
@@ -132,7 +133,7 @@ class ProcessVecEnv(_DictVecEnv):
         with one_thread():
             for k in range(processes):
                 mine, theirs = context.Pipe()
-                arguments = theirs, kind, each, {**options, "seed": seed + k}
+                arguments = theirs, kind, each, {**options, "seed": seed + k * each}
                 worker = context.Process(target=serve, args=arguments, daemon=True, name=f"raytac-envs-{k}")
                 worker.start()
                 theirs.close()

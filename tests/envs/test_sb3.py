@@ -6,6 +6,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -57,6 +58,30 @@ def test_it_is_the_vector_and_so_are_processes_of_it() -> None:
             np.testing.assert_array_equal(seen[name], first[name])
             np.testing.assert_array_equal(seen[name], same[name])
     assert ended == 2
+
+
+class Seeds:
+    """In place of a vector: what environments see is the seed that each had when the vector was made."""
+
+    single_observation_space = gymnasium.spaces.Dict({"seed": gymnasium.spaces.Box(0, 99, (), np.int64)})
+    single_action_space = gymnasium.spaces.Box(-1, 1, (3,))
+
+    def __init__(self, num_envs: int, seed: int) -> None:
+        self.seeds = seed + np.arange(num_envs)
+
+    def reset(self, seed: list[int | None]) -> tuple[dict[str, np.ndarray], dict]:
+        return {"seed": self.seeds}, {}
+
+    def step(self, actions: np.ndarray) -> None:
+        """Never asked for."""
+
+
+def test_no_two_environments_of_processes_have_the_same_seed() -> None:
+    env = ProcessVecEnv(Seeds, num_envs=6, processes=2, seed=5)  # type: ignore[arg-type]
+    try:
+        assert env.reset()["seed"].tolist() == [5, 6, 7, 8, 9, 10]
+    finally:
+        env.close()
 
 
 def test_bad_input_comes_back_from_a_process() -> None:
