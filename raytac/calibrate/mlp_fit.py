@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from raytac.calibrate.press_samples import PressSamples
-from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_slope
+from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["fit_mlp"]
@@ -72,7 +72,7 @@ def fit_mlp(
         if tick is not None:
             tick(epoch + 1)
     provenance = {"source": "real presses of balls", "sensor": sensor.name, "seed": str(seed)}
-    return MlpWeights(tuple(values[:count]), tuple(values[count:]), background.astype(np.float32), provenance)
+    return MlpWeights(tuple(values[:count]), tuple(values[count:]), background.astype(np.float32), provenance, view_size(sensor))
 
 
 def _gradients(values: list[np.ndarray], count: int, x: np.ndarray, target: np.ndarray) -> list[np.ndarray]:

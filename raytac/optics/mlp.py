@@ -12,11 +12,14 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.optics.image_mode import ImageHeights, ImageMode
-from raytac.optics.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_slope
+from raytac.optics.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
 from raytac.optics.taxim import resized
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MlpMode"]
+
+_VIEW_TOLERANCE = 0.01
+"""By which share the view may differ from that of the sensor that a network was fitted to."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class MlpMode(ImageMode):
             device: ``auto``, ``cpu`` or ``cuda``.
 
         Raises:
-            InputError: no network, or a value out of its choices.
+            InputError: no network, one of a sensor that sees another piece of its pad, or a value out of its choices.
             CalibrationError: a file that is missing or malformed.
             BackendError: Dr.Jit cannot run on ``device``.
         """
@@ -59,6 +62,7 @@ class MlpMode(ImageMode):
             raise InputError("calibration", value=calibration, rule=rule)
         super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
         self.weights = calibration if isinstance(calibration, MlpWeights) else load_mlp(calibration)
+        _check_view(self.weights, sensor)
         self._view = view_slope(sensor)
 
     def _place(self, ops: Any, column: Any, row: Any) -> tuple[Any, Any]:
@@ -85,3 +89,17 @@ class MlpMode(ImageMode):
 
     def _floats_per_pixel(self) -> float:
         return 4
+
+
+def _check_view(weights: MlpWeights, sensor: SensorSpec) -> None:
+    """Places are inputs of a network, so it holds for its own view alone."""
+    if weights.view is None:
+        return
+    own = view_size(sensor)
+    if max(abs(a / b - 1) for a, b in zip(own, weights.view, strict=True)) > _VIEW_TOLERANCE:
+        theirs, mine = (f"{1e3 * w:.2f} mm x {1e3 * h:.2f} mm" for w, h in (weights.view, own))
+        name = weights.provenance.get("sensor", "unknown")
+        rule = (
+            f"was fitted to the sensor {name!r}, which sees {theirs}: {sensor.name!r} sees {mine} and needs a network of its own"
+        )
+        raise InputError("calibration", value="mlp", rule=rule)

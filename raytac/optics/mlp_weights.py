@@ -12,6 +12,7 @@ says of a pixel that has not moved is taken off, so that the image at rest is th
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from raytac.errors import CalibrationError
 from raytac.optics.npy_file import check_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_slope"]
+__all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_size", "view_slope"]
 
 INPUTS = 15
 LEVELS = 100.0
@@ -39,6 +40,15 @@ class MlpWeights:
     offsets: tuple[np.ndarray, ...]
     background: np.ndarray
     provenance: dict[str, str] = field(default_factory=dict)
+    """``sensor`` names the sensor that it was fitted to."""
+    view: tuple[float, float] | None = None
+    """Width and height of the pad in that sensor's view [m]; None where it is not known, as in files that do not hold it."""
+
+
+def view_size(sensor: SensorSpec) -> tuple[float, float]:
+    """Width and height of the pad in a sensor's view [m]."""
+    width, height = (n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
+    return width, height
 
 
 def view_slope(sensor: SensorSpec) -> tuple[float, float]:
@@ -71,7 +81,9 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
     """Write the network as an ``.npz``."""
     arrays: dict[str, Any] = {f"matrix_{k}": m.astype(np.float32) for k, m in enumerate(weights.matrices)}
     arrays |= {f"offset_{k}": b.astype(np.float32) for k, b in enumerate(weights.offsets)}
-    np.savez(path, background=weights.background.astype(np.float32), **arrays)
+    if weights.view is not None:
+        arrays["view"] = np.array(weights.view)
+    np.savez(path, background=weights.background.astype(np.float32), provenance=json.dumps(weights.provenance), **arrays)
 
 
 def load_mlp(path: str | Path) -> MlpWeights:
@@ -101,4 +113,27 @@ def load_mlp(path: str | Path) -> MlpWeights:
     if background.ndim != 3 or background.shape[2] != 3 or min(background.shape[:2]) < 3:
         raise CalibrationError("must have shape (H, W, 3)", file=path, key="background", value=background.shape)
     check_numbers(path, "background", background, background.shape)
-    return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32))
+    return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), _provenance(path), _view(path))
+
+
+def _provenance(path: Path) -> dict[str, str]:
+    """What the file says of itself; earlier ones say nothing."""
+    if "provenance" not in npz_names(path):
+        return {}
+    text = npz_arrays(path, ("provenance",))["provenance"]
+    try:
+        found = json.loads(str(text)) if text.dtype.kind == "U" and text.shape == () else None
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(value, str) for value in found.values()):
+        raise CalibrationError("must be a JSON object of texts", file=path, key="provenance", value=str(text)[:80])
+    return found
+
+
+def _view(path: Path) -> tuple[float, float] | None:
+    if "view" not in npz_names(path):
+        return None
+    width, height = check_numbers(path, "view", npz_arrays(path, ("view",))["view"], (2,)).tolist()
+    if min(width, height) <= 0:
+        raise CalibrationError("must be two lengths > 0 [m]", file=path, key="view", value=(width, height))
+    return width, height

@@ -12,7 +12,7 @@ import pytest
 from raytac.errors import CalibrationError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics.mlp import MlpMode
-from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, forward, inputs, load_mlp, save_mlp, view_slope
+from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, forward, inputs, load_mlp, save_mlp, view_size, view_slope
 from raytac.sensor import TactileSensor
 from tests.conftest import make_sensor_spec
 from tests.optics.scenes import ball, grid_of, surface
@@ -76,6 +76,16 @@ def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
     assert "mlp" in sensor.label
     with pytest.raises(CalibrationError, match="holds one"):
         load_mlp(tmp_path / "none.npz")
+    spec = make_sensor_spec()
+    own = dataclasses.replace(weights, provenance={"sensor": "mine"}, view=view_size(spec))
+    save_mlp(own, tmp_path / "own.npz")
+    again = load_mlp(tmp_path / "own.npz")
+    assert (again.provenance, again.view) == (own.provenance, pytest.approx(own.view))
+    MlpMode(spec, calibration=tmp_path / "own.npz", device="cpu")
+    pitch = tuple(1.2 * p for p in spec.camera.pixel_pitch)
+    other = dataclasses.replace(spec, camera=dataclasses.replace(spec.camera, pixel_pitch=pitch))
+    with pytest.raises(InputError, match="fitted to the sensor 'mine'"):
+        MlpMode(other, calibration=tmp_path / "own.npz", device="cpu")
     broken = dataclasses.replace(weights, matrices=(weights.matrices[0][:, :5], *weights.matrices[1:]))
     save_mlp(broken, tmp_path / "broken.npz")
     with pytest.raises(CalibrationError, match="matrix_0"):
