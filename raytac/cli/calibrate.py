@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from raytac.cli.real_data import FROM_SCRATCH, read_data
 from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
@@ -42,8 +43,9 @@ class CalibrateArgs(SolverOptions):
     """What a data set is fitted by; table and network take imprint and circles from a fit of the lights too."""
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
-    sides: str | None = None
-    """Numbers of red, green and blue LEDs joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    sides: str = FROM_SCRATCH
+    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
+    these were fitted to photographs that are tested on, errors are not of held-out presses."""
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
@@ -93,7 +95,6 @@ class CalibrateArgs(SolverOptions):
                 raise InputError(default.name, value=value, rule=rule)
 
     def _optics(self, start: float) -> int:
-        from raytac.cli.real_data import read_data
         from raytac.report.real_calibration import run_calibrate_optics
 
         if self.holdout < 0 or self.holdout == 1:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.real_data import read_data
+from raytac.cli.real_data import FROM_SCRATCH, read_data
 from raytac.io.options import CommonOptions
 
 __all__ = ["CompareRealArgs"]
@@ -26,13 +26,14 @@ class CompareRealArgs(CommonOptions):
     data: Annotated[Path, tyro.conf.Positional]
     """Folder of photographs or dataPack.npz (docs/real-images.md)."""
     sensor: str = "gelsight_mini"
-    """Name of a shipped sensor, or path of a sensor file; its lights are where the fits start."""
+    """Name of a shipped sensor, or path of a sensor file."""
     folds: int = 5
     """Every so manieth press is held out in turn."""
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
-    sides: str | None = None
-    """Numbers of red, green and blue LEDs joined by commas: such LEDs at their walls replace the sensor's as the start."""
+    sides: str = FROM_SCRATCH
+    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
+    these were fitted to photographs that are tested on, errors are not of held-out presses."""
     regions: bool = True
     """Also fit to one half of the pad and to shallow presses, and test on the others."""
     ablations: bool = True

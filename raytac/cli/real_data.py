@@ -10,19 +10,26 @@ from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.specs import SensorSpec, load_sensor, with_lights
 
-__all__ = ["read_data"]
+__all__ = ["FROM_SCRATCH", "OWN_LEDS", "read_data"]
+
+FROM_SCRATCH = "5,3,4"
+"""Numbers of LEDs that the figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own lights were
+fitted to photographs: begun from these, presses that are held out would not be new to it."""
+OWN_LEDS = "own"
 
 
 def read_data(
-    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str | None
+    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
     """The sensor, its fully visible presses as read and as floats, and the names of those whose circles were found but are doubtful.
+
+    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.
     """
     sensor = load_sensor(sensor_name)
-    if sides is not None:
+    if sides != OWN_LEDS:
         sensor = with_lights(sensor, leds_at_walls(sensor, sides))
     presses = read_presses(data, ball_diameter=None if ball_diameter_mm is None else ball_diameter_mm / 1e3)
     presses, doubtful = with_found_circles(presses, sensor.camera.pixel_pitch[0])

@@ -10,6 +10,9 @@ import pytest
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.splits import by_press
 from raytac.cli import main
+from raytac.cli.calibrate import CalibrateArgs
+from raytac.cli.compare_real import CompareRealArgs
+from raytac.cli.real_data import FROM_SCRATCH, OWN_LEDS, read_data
 from raytac.io.png import write_png
 from raytac.report.real_figure import table_text
 from raytac.report.real_score import noise_floor, press_scores, summary
@@ -82,7 +85,7 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
     data.mkdir()
     data_set(data, count=6)
     cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--pad", "coarse"], "'markers'")]
-    cases += [(["markers"], ["--model", "mlp"], "a data set"), (["markers"], ["--sides", "5,3,4"], "a data set")]
+    cases += [(["markers"], ["--model", "mlp"], "a data set"), (["markers"], ["--sides", "4,2,3"], "a data set")]
     for what, option, owner in cases:
         assert main(["calibrate", *what, *option, "--device", "cpu", "--out", str(out)]) == 2, option
         told = capsys.readouterr().err
@@ -93,3 +96,12 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
 def test_folds_test_every_press_once() -> None:
     splits = by_press(30, 5)
     assert sorted(np.concatenate([test for _, test in splits])) == list(range(30))
+
+
+def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None:
+    """The shipped lights were fitted to photographs, so nothing may begin from them unasked."""
+    data = data_set(tmp_path, count=6)
+    assert CompareRealArgs(data=data).sides == CalibrateArgs(what=str(data)).sides == FROM_SCRATCH
+    scratch, own = (read_data(data, "gelsight_mini", None, sides)[0].lights for sides in (FROM_SCRATCH, OWN_LEDS))
+    assert scratch.source is None and [sum(led.layer == c for led in scratch.leds) for c in ("red", "green", "blue")] == [5, 3, 4]
+    assert own == SENSOR.lights
