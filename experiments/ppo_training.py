@@ -117,14 +117,15 @@ class Training:
         """Evaluate, write the checkpoint, and say how it is."""
         recipe = self.recipe
         result = evaluate(self.learner, self._evaluation)
-        self.learner.checkpoint().save(self.path)
         low, high = result.interval
         row = {
             "steps": self.steps, "wall_s": round(self._wall, 2), "episodes": result.episodes,
             "success": result.successes / result.episodes, "low": low, "high": high,
             "return": result.mean_return, "length": result.mean_length,
         }  # fmt: skip
+        # Before the checkpoint: a row too many is dropped by a resume, one that is missing never comes back.
         _append(self.folder / "evaluation.csv", row)
+        self.learner.checkpoint().save(self.path)
         self._say(
             f"{recipe.task} {recipe.tactile} seed {recipe.seed}: {self.steps} steps, {self._wall:.0f} s, "
             f"return {result.mean_return:.1f}, length {result.mean_length:.0f}, "
@@ -163,9 +164,14 @@ def _keep_rows(path: Path, steps: int) -> None:
         return
     with path.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
-    path.unlink()
+    rest = path.with_suffix(".partial")
+    rest.unlink(missing_ok=True)
     for row in rows:
-        _append(path, row)
+        _append(rest, row)
+    if rows:
+        rest.replace(path)
+    else:
+        path.unlink()
 
 
 def _last_wall(path: Path) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +17,9 @@ from raytac.specs import load_sensor
 from raytac.specs.press import PADS
 
 __all__ = ["CalibrateArgs"]
+
+_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "starts", "rounds")
+_OF_MARKERS = ("pad", "quick", "verbose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,7 @@ class CalibrateArgs(SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
+        self._refuse_options_of_the_other()
         if self.what != "markers":
             return self._optics(start)
         if self.pad not in PADS:
@@ -78,6 +82,15 @@ class CalibrateArgs(SolverOptions):
         for path in written:
             print(path)
         return 0
+
+    def _refuse_options_of_the_other(self) -> None:
+        """An option that says nothing to what is fitted would else be passed over in silence."""
+        others, owner = (_OF_DATA, "a data set") if self.what == "markers" else (_OF_MARKERS, "'markers'")
+        for default in (one for one in fields(self) if one.name in others):
+            value = getattr(self, default.name)
+            if value != default.default:
+                rule = f"belongs to `calibrate` with {owner}, not with {self.what!r}: leave it out"
+                raise InputError(default.name, value=value, rule=rule)
 
     def _optics(self, start: float) -> int:
         from raytac.cli.real_data import read_data

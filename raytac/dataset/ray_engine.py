@@ -139,13 +139,16 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
                     raise BackendError(
                         f"no worker is left ({error}); run again to go on with the shards that are missing"
                     ) from error
+                text = f"a worker died {_ATTEMPTS + 1} times as it came back: the others go on without it ({error})"
+                warnings.warn(text, RuntimeWarning, stacklevel=2)
                 continue
             again = begun[shard] < _ATTEMPTS
             (waiting if again else lost).append(shard)
             if again:
                 warnings.warn(f"the worker of shard {shard} died: the shard is rendered again", RuntimeWarning, stacklevel=2)
-            # Until Ray has started it again every call would fail at once; one that is retried waits for that.
-            running[actor.prepare.options(max_task_retries=-1).remote(shard)] = actor, None
+            # Until Ray has started it again every call would fail at once; one that is retried waits for that,
+            # not for ever: a worker may die each time that it prepares.
+            running[actor.prepare.options(max_task_retries=_ATTEMPTS).remote(shard)] = actor, None
             continue
         if shard is None:
             if result:

@@ -37,7 +37,7 @@ def test_environment_steps_are_timed_and_split(bench: ModuleType, tmp_path: Path
     bench.main(bench.Args(out=tmp_path, device="cpu", envs=2, modes="none", steps=3))
     found = read_metrics(tmp_path / "metrics.json")
     parts = [float(found[f"push.none.{part}_ms"]) for part in ("physics", "observation", "policy")]
-    assert min(parts) > 0.0 and parts[0] == max(parts)
+    assert min(parts) > 0.0
     assert float(found["push.none.env_steps_per_s"]) <= float(found["push.none.env_steps_per_s_best"])
     assert sum(parts) < 2e3 * 2 / float(found["push.none.env_steps_per_s"])
 

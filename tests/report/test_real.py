@@ -38,8 +38,9 @@ def test_errors_are_those_of_the_regions() -> None:
     assert first["box_psnr"] == pytest.approx(20 * np.log10(255 / np.sqrt(square)), abs=0.2)
     assert summary([first, second])["frame_mae"] == pytest.approx((first["frame_mae"] + second["frame_mae"]) / 2)
     assert noise_floor(SENSOR, real) == pytest.approx(2.0)
-    text = table_text({"raytrace.contact_mae": 6.0, "noise_floor": 2.0}, ())
-    assert "| ray tracer | 6.00 |" in text and "Noise floor: 2.00" in text
+    metrics = {"raytrace.contact_mae": 6.0, "labelled.raytrace.contact_mae": 7.0, "labelled.raytrace.ring_mae": 4.0}
+    text = table_text({**metrics, "noise_floor": 2.0}, ())
+    assert "| ray tracer | 6.00 |" in text and "| 7.00, 4.00 |" in text and "Noise floor: 2.00" in text
 
 
 def data_set(folder: Path, count: int, radius: float = 30.0, shape: tuple[int, int] = (240, 320)) -> Path:
@@ -74,6 +75,19 @@ def test_data_that_cannot_be_fitted_are_refused_with_nothing_written(
     assert "cannot be read as an image" in capsys.readouterr().err
     assert main([command, str(tmp_path / "none"), "--out", str(out)]) == 2
     assert not out.exists() and not list(tmp_path.glob("*.partial"))
+
+
+def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, data = tmp_path / "out", tmp_path / "data"
+    data.mkdir()
+    data_set(data, count=6)
+    cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--pad", "coarse"], "'markers'")]
+    cases += [(["markers"], ["--model", "mlp"], "a data set"), (["markers"], ["--sides", "5,3,4"], "a data set")]
+    for what, option, owner in cases:
+        assert main(["calibrate", *what, *option, "--device", "cpu", "--out", str(out)]) == 2, option
+        told = capsys.readouterr().err
+        assert option[0][2:] in told and "belongs to `calibrate` with" in told and f"with {owner}, not" in told
+    assert not out.exists()
 
 
 def test_folds_test_every_press_once() -> None:
