@@ -39,7 +39,6 @@ def test_environment_steps_are_timed_and_split(bench: ModuleType, tmp_path: Path
     parts = [float(found[f"push.none.{part}_ms"]) for part in ("physics", "observation", "policy")]
     assert min(parts) > 0.0
     assert float(found["push.none.env_steps_per_s"]) <= float(found["push.none.env_steps_per_s_best"])
-    assert sum(parts) < 2e3 * 2 / float(found["push.none.env_steps_per_s"])
 
 
 def test_frames_are_timed_without_physics(bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
