@@ -139,7 +139,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
                     raise BackendError(
                         f"no worker is left ({error}); run again to go on with the shards that are missing"
                     ) from error
-                text = f"a worker died {_ATTEMPTS + 1} times as it came back: the others go on without it ({error})"
+                text = f"a worker died each time it came back: the others go on without it ({error})"
                 warnings.warn(text, RuntimeWarning, stacklevel=2)
                 continue
             again = begun[shard] < _ATTEMPTS
@@ -147,8 +147,8 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             if again:
                 warnings.warn(f"the worker of shard {shard} died: the shard is rendered again", RuntimeWarning, stacklevel=2)
             # Until Ray has started it again every call would fail at once; one that is retried waits for that,
-            # not for ever: a worker may die each time that it prepares.
-            running[actor.prepare.options(max_task_retries=_ATTEMPTS).remote(shard)] = actor, None
+            # not for ever: a worker may die each time that it prepares. A death takes two retries, its own and that of the restart.
+            running[actor.prepare.options(max_task_retries=2 * _ATTEMPTS).remote(shard)] = actor, None
             continue
         if shard is None:
             if result:

@@ -80,6 +80,34 @@ def test_a_shard_that_kills_every_worker_is_named_after_all_others(sweep: SweepS
     assert sorted(found) == [0, 2, 3]
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("local_ray")
+@pytest.mark.filterwarnings("ignore:the worker of shard")
+def test_a_worker_that_dies_each_time_it_comes_back_is_given_up(sweep: SweepSpec, tmp_path: Path) -> None:
+    deaths = tmp_path / "deaths"
+
+    def die() -> None:
+        with deaths.open("a", encoding="utf-8") as file:
+            file.write("x")
+        os._exit(1)
+
+    class Killer(DatasetPlan):
+        def presses(self, shard: int) -> Presses:
+            die()
+            return super().presses(shard)
+
+        def variant(self, shard: int) -> int:
+            if deaths.exists():
+                die()
+            return super().variant(shard)
+
+    with pytest.raises(BackendError, match="no worker is left"):
+        list(render_on_ray(RenderJob(Killer(replace(sweep, count=8)), "cpu", batch=4), range(2), workers=1))
+    assert 3 <= len(deaths.read_text("utf-8")) <= 8, (
+        "one as it rendered, the others as it prepared; Ray counts restarts as retries too"
+    )
+
+
 @pytest.mark.usefixtures("local_ray")
 def test_what_cannot_be_rendered_is_said_before_a_shard_begins(sweep: SweepSpec) -> None:
     plan = DatasetPlan(sweep)
