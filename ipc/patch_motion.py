@@ -98,7 +98,7 @@ class RestPatches:
         stiffness += force * np.diag([1.3 / length] * 3 + [7.0 / 30.0 * length] * 3)
         arm = (y - y.mean(axis=0)) @ frame.T
         spread = _rigid(arm)
-        motion = np.linalg.lstsq(spread, v.reshape(-1), rcond=1e-9)[0].astype(np.float64)
+        motion: Floats = np.linalg.lstsq(spread, np.asarray(v, np.float64).reshape(-1), rcond=1e-9)[0].astype(np.float64)
         heavy = float(np.trace(mass[:3, :3])) / 3.0
         inertia = mass[3:, 3:] + heavy * _LEAST_RADIUS**2 * np.eye(3)
         return PatchMotion(heavy, inertia, frame @ y.mean(axis=0) + origin, motion, stiffness)

@@ -80,6 +80,7 @@ def render_on_ray(
 
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use over the network
+    os.environ.setdefault("RAY_TQDM_PATCH_PRINT", "0")  # Ray would replace print() in the caller's process, for good
     options: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "configure_logging": False}
     if address is not None or "RAY_ADDRESS" in os.environ:
         options = {"address": address, "log_to_driver": False, "configure_logging": False}

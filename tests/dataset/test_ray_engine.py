@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import os
 import signal
 from dataclasses import replace
@@ -20,8 +21,9 @@ ray = pytest.importorskip("ray", reason="Ray is not installed")
 
 @pytest.fixture(scope="module")
 def local_ray():
-    """One Ray for all tests here: to start it takes seconds."""
+    """One Ray for all tests here: to start it takes seconds. With the settings of the engine's own start."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ["RAY_TQDM_PATCH_PRINT"] = "0"
     for attempt in range(4):  # it gives itself 30 s to start, which a busy machine may not keep
         try:
             ray.init(num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False, configure_logging=False)
@@ -50,6 +52,7 @@ def test_a_killed_worker_loses_and_doubles_no_press(sweep: SweepSpec, tmp_path: 
     monkeypatch.setattr(ShardStore, "write", killing)
     with pytest.warns(RuntimeWarning, match="rendered again"):
         report = render_dataset(plan, tmp_path / "ray", engine="ray", device="cpu", batch=4, workers=2)
+    assert builtins.print.__module__ == "builtins"
     assert report.presses == 24 and len(workers) == plan.shards and len(set(workers)) >= 2
     assert not any(worker.endswith(f":{os.getpid()}") for worker in workers)
     assert verify_dataset(tmp_path / "ray").wrong == {}
@@ -96,7 +99,7 @@ def test_a_worker_that_dies_each_time_it_comes_back_is_given_up(sweep: SweepSpec
             die()
             return super().presses(shard)
 
-        def variant(self, shard: int) -> int:
+        def variant(self, shard: int) -> tuple[int, int]:
             if deaths.exists():
                 die()
             return super().variant(shard)

@@ -367,7 +367,7 @@ def test_what_one_environment_of_a_batch_cannot_do_is_named_with_it(own: dict, v
     scene = scene_of("sphere", indent(0.3e-3), StageSpec("shear", shear=(2e-3, 0.0)))
     name = next(iter(own))
     with pytest.raises(InputError, match=f"{name} = .*in environment 1, (in|at) {where}: no part of the object") as caught:
-        press(scene, num_envs=3, **{name: np.array(own[name], float)})
+        press(scene, 1, num_envs=3, **{name: np.array(own[name], float)})
     assert caught.value.value == value
 
 
