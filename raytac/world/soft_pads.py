@@ -29,7 +29,7 @@ from raytac.physics.rotation import quaternion
 from raytac.physics.soft_bodies import SceneBody, scene_body
 from raytac.physics.soft_mesh import pad_mesh
 from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
-from raytac.robots.pose import pose, world_from_site
+from raytac.robots.pose import body_poses, site_poses
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
 from raytac.world.coupling import Coupling
@@ -245,8 +245,7 @@ class SoftPads:
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
         led = {}
         for body in self._led:
-            at = np.stack([pose(d.xmat[body.index].reshape(3, 3), d.xpos[body.index]) for d in datas])
-            led[body.spec.name] = np.where(failed[:, None, None], self._last_led[body.spec.name], at)
+            led[body.spec.name] = np.where(failed[:, None, None], self._last_led[body.spec.name], body_poses(datas, body.index))
         return cases, led
 
     def _follow(
@@ -322,7 +321,7 @@ class SoftPads:
 
     def _pad_poses(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
         """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
-        return np.stack([np.stack([world_from_site(data, site) for site in self._sites]) for data in datas])
+        return np.stack([site_poses(datas, site) for site in self._sites], axis=1)
 
 
 def _solver_body(scene: TaskScene, index: int) -> SceneBody:

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
 
+from experiments import bench_coat
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 
 
-@pytest.fixture
-def bench_coat(monkeypatch):
-    path = Path(__file__).parents[2] / "experiments" / "bench_coat.py"
-    spec = importlib.util.spec_from_file_location("bench_coat", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "bench_coat", module)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.slow
-def test_the_shown_coat_is_nearer_than_the_mesh(bench_coat, tmp_path):
+def test_the_shown_coat_is_nearer_than_the_mesh(tmp_path):
     assert bench_coat.Args(out=tmp_path, levels="coarse", shapes="edge", cell_um=190.0).run() == 0
     found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("edge")}
     assert found["edge.coarse.near_um"] < 0.25 * found["edge.coarse.mesh_near_um"]
@@ -32,7 +18,7 @@ def test_the_shown_coat_is_nearer_than_the_mesh(bench_coat, tmp_path):
     assert found["edge.coarse.force_n"] > found["edge.truth_force_n"] > 2.0
 
 
-def test_markers_are_nearer_than_the_mesh(bench_coat, tmp_path):
+def test_markers_are_nearer_than_the_mesh(tmp_path):
     assert bench_coat.Args(out=tmp_path, levels="coarse", shapes="ball", cell_um=150.0).run() == 0
     found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("ball")}
     for load in ("force", "depth"):
@@ -44,6 +30,6 @@ def test_markers_are_nearer_than_the_mesh(bench_coat, tmp_path):
     assert found["ball.depth.coarse.contact_mm2"] == pytest.approx(found["ball.depth.truth.contact_mm2"], rel=0.03)
 
 
-def test_an_unknown_shape_is_named(bench_coat, tmp_path):
+def test_an_unknown_shape_is_named(tmp_path):
     with pytest.raises(InputError, match=r"shapes.*'cone'.*ball"):
         bench_coat.Args(out=tmp_path, shapes="cone").run()

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from experiments import bench_markers as bench
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
 
 
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    path = Path(__file__).parents[2] / "experiments" / "bench_markers.py"
-    spec = importlib.util.spec_from_file_location("bench_markers", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_markers"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("options", [{"envs": "0"}, {"envs": "1,two"}, {"frames": 0}, {"models": "fots,fotz"}, {"models": ""}])
-def test_bad_options_are_refused_before_anything_is_written(bench: ModuleType, tmp_path: Path, options: dict) -> None:
+def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path, options: dict) -> None:
     with pytest.raises(InputError, match=next(iter(options))):
         bench.main(bench.Args(out=tmp_path / "out", device="cpu", **options))
     assert not (tmp_path / "out").exists()
 
 
-def test_a_small_run_times_every_model(bench: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_small_run_times_every_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("warp")  # the surface model is timed on the coat of a simulated pad
     assert bench.main(bench.Args(out=tmp_path, device="cpu", envs="1,3", frames=6)) == 0
     metrics = read_metrics(tmp_path / "metrics.json")
@@ -46,7 +33,7 @@ def test_a_small_run_times_every_model(bench: ModuleType, tmp_path: Path, capsys
     assert capsys.readouterr().out.count("ms a frame") == 10
 
 
-def test_what_is_timed_is_in_contact_and_moves(bench: ModuleType) -> None:
+def test_what_is_timed_is_in_contact_and_moves() -> None:
     """But for the first, every state touches; environments are at places of their own."""
     surfaces = bench.pressed(load_sensor("gelsight_mini_9x11"), 3)
     assert not surfaces[0].contact.any()

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from experiments import bench_optics as bench
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 
 
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    path = Path(__file__).parents[2] / "experiments" / "bench_optics.py"
-    spec = importlib.util.spec_from_file_location("bench_optics", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_optics"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("options", [{"parts": "speed,colour"}, {"parts": ""}, {"scenes": " , "}, {"spp": 1}])
-def test_bad_options_are_refused_before_anything_is_written(bench: ModuleType, tmp_path: Path, options: dict) -> None:
+def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path, options: dict) -> None:
     with pytest.raises(InputError):
         bench.main(bench.Args(out=tmp_path / "out", device="cpu", **options))
     assert not (tmp_path / "out").exists()
 
 
 def test_quick_run_measures_everything_and_keeps_its_reference(
-    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # for the process that the benchmark starts
     bench.main(bench.Args(out=tmp_path, device="cpu", quick=True))

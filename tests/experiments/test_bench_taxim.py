@@ -2,39 +2,24 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from experiments import bench_taxim as bench
 from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import read_metrics
 
 
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    path = Path(__file__).parents[2] / "experiments" / "bench_taxim.py"
-    spec = importlib.util.spec_from_file_location("bench_taxim", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_taxim"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize(("options", "error"), [({"scenes": " , "}, InputError), ({"scenes": "shpere"}, RaytacError)])
-def test_bad_options_are_refused_before_anything_is_written(
-    bench: ModuleType, tmp_path: Path, options: dict, error: type[Exception]
-) -> None:
+def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path, options: dict, error: type[Exception]) -> None:
     with pytest.raises(error):
         bench.main(bench.Args(out=tmp_path / "out", device="cpu", **options))
     assert not (tmp_path / "out").exists()
 
 
 def test_quick_run_measures_speed_and_error(
-    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("RAYTAC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from experiments import physics_sheet
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 from raytac.sensor import TactileSensor
 from tests.conftest import Shader
 
 
-@pytest.fixture
-def physics_sheet(monkeypatch):
-    path = Path(__file__).parents[2] / "experiments" / "physics_sheet.py"
-    spec = importlib.util.spec_from_file_location("physics_sheet", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "physics_sheet", module)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_quick_is_one_scene_under_both_pads(physics_sheet, tmp_path, monkeypatch):
+def test_quick_is_one_scene_under_both_pads(tmp_path, monkeypatch):
     monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
     assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere,coin").run() == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "sheet.png"]
@@ -40,21 +26,21 @@ def test_quick_is_one_scene_under_both_pads(physics_sheet, tmp_path, monkeypatch
     assert metrics["sphere.contact_um"] < 5.0 < metrics["sphere.ring_um"] < 60.0
 
 
-def test_widening_reaches_as_far_as_asked(physics_sheet):
+def test_widening_reaches_as_far_as_asked():
     mask = np.zeros((21, 31), bool)
     mask[10, 15] = True
     wide = physics_sheet.widened(mask, 0.5e-3, (0.1e-3, 0.25e-3))
     assert wide.sum() == 11 * 5 and wide[8:13, 10:21].all()
 
 
-def test_an_unknown_level_is_named(physics_sheet, tmp_path):
+def test_an_unknown_level_is_named(tmp_path):
     from raytac.errors import InputError
 
     with pytest.raises(InputError, match=r"pad.*'huge'.*coarse"):
         physics_sheet.Args(out=tmp_path, pad="huge").run()
 
 
-def test_levels_against_a_finer_one(physics_sheet, tmp_path):
+def test_levels_against_a_finer_one(tmp_path):
     assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere", against="medium").run() == 0
     read = read_metrics(tmp_path / "metrics.json")
     found = {key: float(value) for key, value in read.items() if key.startswith("sphere")}
@@ -63,7 +49,7 @@ def test_levels_against_a_finer_one(physics_sheet, tmp_path):
     assert found["sphere.coarse.force_n"] > found["sphere.medium.force_n"] > 1.5
 
 
-def test_the_coarsest_level_has_none_below_it(physics_sheet, tmp_path):
+def test_the_coarsest_level_has_none_below_it(tmp_path):
     from raytac.errors import InputError
 
     with pytest.raises(InputError, match=r"against.*'coarse'.*medium"):

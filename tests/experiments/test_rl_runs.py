@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+from experiments import bench_rl as bench
+from experiments import soak
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 
 
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "experiments" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    return script("bench_rl")
-
-
-@pytest.fixture(scope="module")
-def soak() -> ModuleType:
-    return script("soak")
-
-
-def test_environment_steps_are_timed_and_split(bench: ModuleType, tmp_path: Path) -> None:
+def test_environment_steps_are_timed_and_split(tmp_path: Path) -> None:
     bench.main(bench.Args(out=tmp_path, device="cpu", envs=2, modes="none", steps=3))
     found = read_metrics(tmp_path / "metrics.json")
     parts = [float(found[f"push.none.{part}_ms"]) for part in ("physics", "observation", "policy")]
@@ -41,7 +22,7 @@ def test_environment_steps_are_timed_and_split(bench: ModuleType, tmp_path: Path
     assert float(found["push.none.env_steps_per_s"]) <= float(found["push.none.env_steps_per_s_best"])
 
 
-def test_frames_are_timed_without_physics(bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_timed_without_physics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(bench.FRAMES, "table", "phong")  # a table would be baked
     bench.main(bench.Args(out=tmp_path, device="cpu", envs=3, modes="table", steps=3, frames=True, size="24x18"))
     found = read_metrics(tmp_path / "metrics.json")
@@ -51,8 +32,9 @@ def test_frames_are_timed_without_physics(bench: ModuleType, tmp_path: Path, mon
         assert float(found[f"cpu.table.{part}frames_per_s"]) == pytest.approx(3 / call)
 
 
-def test_bad_options_are_refused_before_anything_is_written(bench: ModuleType, soak: ModuleType, tmp_path: Path) -> None:
+def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     out = tmp_path / "out"
+    options: dict[str, Any]
     for options, text in (
         ({"modes": "table"}, "push|none"),
         ({"frames": True, "modes": "fots"}, "table"),
@@ -66,10 +48,8 @@ def test_bad_options_are_refused_before_anything_is_written(bench: ModuleType, s
     assert not out.exists()
 
 
-def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(
-    soak: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = {"out": tmp_path, "device": "cpu", "envs": 2, "modalities": "wrench", "block": 4, "task": "roll"}
+def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"out": tmp_path, "device": "cpu", "envs": 2, "modalities": "wrench", "block": 4, "task": "roll"}
     with monkeypatch.context() as patch:
         write, calls = soak.store, []
 
@@ -91,7 +71,7 @@ def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(
         soak.main(soak.Args(steps=20, **{**options, "envs": 3}))
 
 
-def test_a_soak_run_sees_what_is_not_finite_and_what_grows(soak: ModuleType) -> None:
+def test_a_soak_run_sees_what_is_not_finite_and_what_grows() -> None:
     assert soak.count_nonfinite({"a": np.array([0.0, np.nan]), "b": np.zeros(2), "c": np.array([[np.inf]])}) == 2
     blocks = [soak.Block(s, 10, 1, 0, n, 0.5, m) for s, n, m in ((0, 0, 100.0), (0, 2, 130.0), (1, 0, 500.0), (1, 0, 510.0))]
     found = soak.summary(blocks)

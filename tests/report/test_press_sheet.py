@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from experiments import press_sheet
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 from raytac.sensor import TactileSensor
 from tests.conftest import Shader
 
 
-@pytest.fixture
-def press_sheet(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    path = Path(__file__).parents[2] / "experiments" / "press_sheet.py"
-    spec = importlib.util.spec_from_file_location("press_sheet", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "press_sheet", module)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_presses_and_sheet(press_sheet: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_presses_and_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
     press_sheet.main(press_sheet.Args(out=tmp_path / "demo", scenes=("sphere", "pins")))
     for name in ("sphere", "pins"):
@@ -38,7 +25,7 @@ def test_presses_and_sheet(press_sheet: ModuleType, tmp_path: Path, monkeypatch:
     assert {"sphere.time.optics_ms", "pins.time.physics_ms", "pins.contact.max_indentation_mm", "wall_s"} <= set(metrics)
 
 
-def test_quick_is_one_small_press(press_sheet: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_is_one_small_press(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
     press_sheet.main(press_sheet.Args(out=tmp_path, quick=True))
     assert read_png(tmp_path / "coin" / "rgb.png").shape == (60, 80, 3)
