@@ -37,6 +37,8 @@ class Ablation:
     """Blocks of parameters that stay at their start."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the ray tracer."""
+    settle: bool = True
+    """Whether the image at rest is averaged (``Photographs.settled``)."""
     other_shadows: bool = False
     """Cast shadows where the comparison has none, and none where it has."""
 
@@ -70,6 +72,7 @@ ABLATIONS: dict[str, Ablation] = {
     "no_response_curve": Ablation(sensor=_linear, fixed=("stray",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": Ablation(fixed=("slope",)),
+    "one_photograph_at_rest": Ablation(settle=False),
 }
 """By the name of their keys in ``metrics.json``."""
 
@@ -131,7 +134,7 @@ def compare_real(
                 one = ABLATIONS[name]
                 changed = one.sensor(sensor)
                 options = {"shadows": settings.shadows != one.other_shadows, **one.options}
-                models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), fixed=one.fixed, options=options)
+                models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), one=one, options=options)
                 seen, _ = _tested(models, changed, shots.take(test))
                 for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
                     metrics[f"ablation.{name}.{key}"] = value
@@ -170,18 +173,20 @@ def _fitted(
     bar: Any,
     *,
     modes: tuple[str, ...] = MODES,
-    fixed: tuple[str, ...] = (),
+    one: Ablation | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Models:
+    one = Ablation() if one is None else one
     return fit_models(
         sensor,
         shots,
-        settings=FitSettings(fixed=("gamma", *fixed)),
+        settings=FitSettings(fixed=("gamma", *one.fixed)),
         modes=modes,
         device=settings.device,
         seed=settings.seed,
         starts=settings.starts,
         rounds=settings.rounds,
+        settle=one.settle,
         options={"shadows": settings.shadows} if options is None else options,
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
     )
