@@ -37,8 +37,8 @@ SIGMA = {
     "slope": 0.15,
 }
 """How far a parameter is believed to be from its start: mm, rad, 1, full scales (own channel), …"""
-CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5])
-"""How far [px] a contact circle is believed to be from its label: x, y, radius."""
+CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
+"""How far a contact circle is believed to be from its label: x, y, radius, over the image's width."""
 CIRCLE_PRIOR = 300.0
 """Squared residual [levels²] that a circle's deviation of one sigma is worth."""
 ACTIVE = 6
@@ -53,7 +53,7 @@ REST_FACTOR = 8
 class FitSettings:
     """What a fit does."""
 
-    reach: float = 2.2
+    reach: float = 2.4
     """Pixels up to this many radii from a circle's centre count."""
     ring_weight: float = 0.5
     """Weight of a residual outside the labelled circle."""
@@ -129,6 +129,7 @@ class DirectFit:
         self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
         self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
+        self.circle_sigma = CIRCLE_SIGMA * native[0]
         self.ties = side_ties(start.p, len(self.flat(start)))
 
     # ------------------------------------------------------------------ forward model
@@ -227,7 +228,7 @@ class DirectFit:
         h = self.settings.huber
         robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in off]
         x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
-        c, tied = (state.circles - self.shots.circles) / CIRCLE_SIGMA, self.ties.off(self.flat(state))
+        c, tied = (state.circles - self.shots.circles) / self.circle_sigma, self.ties.off(self.flat(state))
         images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
         priors = self.settings.prior * (x @ x) + self.settings.ties * (tied @ tied) + CIRCLE_PRIOR * (c * c).sum()
         return float(images + priors)
@@ -326,10 +327,12 @@ class DirectFit:
         for k in range(count):
             a, b = slice(first[k], first[k + 1]), slice(size + 3 * k, size + 3 * k + 3)
             weighted = circles[a].T * w[a]
-            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / CIRCLE_SIGMA**2)
+            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / self.circle_sigma**2)
             normal[b, :size] = weighted @ jac[a]
             normal[:size, b] = normal[b, :size].T
-            slope[b] = weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / CIRCLE_SIGMA**2
+            slope[b] = (
+                weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / self.circle_sigma**2
+            )
         pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
         stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
         movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])

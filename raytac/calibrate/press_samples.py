@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.imprint import press_surface
+from raytac.calibrate.imprint import KNOTS, press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.gel.pad import make_grid
 from raytac.optics.phong import PhongMode
@@ -35,7 +35,13 @@ class PressSamples:
 
 
 def press_samples(
-    sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray, *, device: str = "auto", reach: float = 2.4
+    sensor: SensorSpec,
+    shots: Photographs,
+    circles: np.ndarray,
+    slopes: np.ndarray,
+    *,
+    device: str = "auto",
+    reach: float = KNOTS[-1],
 ) -> PressSamples:
     """Samples within ``reach`` radii of the ``circles`` (N, 3) [px] of ``shots``, whose imprints have the ``slopes`` of ``imprint``."""
     height, width = shots.background.shape[:2]

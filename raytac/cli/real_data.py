@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from raytac.calibrate.circles import with_found_circles
 from raytac.calibrate.light_parameters import leds_at_walls
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
+from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
 
-__all__ = ["FROM_SCRATCH", "OWN_LEDS", "read_data"]
+__all__ = ["FROM_SCRATCH", "INNER", "OWN_LEDS", "prior_of", "read_data"]
 
 FROM_SCRATCH = "5,3,4"
 """Numbers of LEDs that the figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own lights were
 fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
+INNER = "inner"
+"""Strength of priors: chosen by cross-validation within the presses that are fitted to."""
+
+
+def prior_of(text: str) -> float | None:
+    """``--prior``: None is ``INNER``.
+
+    Raises:
+        InputError: neither that nor a finite number > 0.
+    """
+    if text == INNER:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise InputError("prior", value=text, rule=f"must be {INNER!r} or a finite number > 0")
+    return value
 
 
 def read_data(

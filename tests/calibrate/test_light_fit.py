@@ -11,6 +11,7 @@ from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
+from raytac.calibrate.prior_choice import choose_prior
 from raytac.calibrate.ray_fit import fit_lights, refine_circles
 from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
@@ -225,3 +226,15 @@ def test_a_start_at_the_walls_is_a_sensor(sensor: SensorSpec) -> None:
     for bad in ("3,2", "3,2,0", "a,b,c", "1,2,3,4"):
         with pytest.raises(InputError, match="three whole numbers"):
             leds_at_walls(sensor, bad)
+
+
+def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSpec) -> None:
+    """Lights that begin 3 mm from where they are: a prior that nails them there serves worse, and the choice says so."""
+    shots, true = direct(sensor, circles(8))
+    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0]))
+    start = with_parameters(sensor, moved, shots.background)
+    settings = FitSettings(fixed=("gamma", "slope", "stray"))
+    found, errors = choose_prior(start, shots, settings, candidates=(1e7, 30.0))
+    assert found == 30.0 and errors[30.0] < 0.6 * errors[1e7], errors
+    with pytest.raises(InputError, match="at least 8"):
+        choose_prior(start, shots.take(np.arange(7)), settings)
