@@ -1,6 +1,6 @@
-"""How strongly priors hold a fit to its start, chosen by cross-validation within the presses that are fitted to.
+"""How strongly priors hold a fit, chosen by cross-validation within the presses that are fitted to.
 
-A weak prior lets LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
+Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
 halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a
 model is judged on have no part in it.
 """
@@ -8,7 +8,7 @@ model is judged on have no part in it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -18,38 +18,45 @@ from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state
 from raytac.errors import InputError
 from raytac.specs import SensorSpec
 
-__all__ = ["PRIORS", "choose_prior"]
+__all__ = ["STRENGTHS", "choose_strength"]
 
-PRIORS = (30.0, 100.0, 300.0, 1000.0)
-"""Candidates for ``FitSettings.prior``."""
+STRENGTHS: dict[str, dict[str, float]] = {
+    "free": {"prior": 30.0, "ties": 0.0, "rest_weight": 0.3},
+    "tied": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.3},
+    "tied-dark": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.1},
+    "tied-darkest": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.03},
+}
+"""Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
+CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
+"""What is chosen from: that LEDs of a side are alike is taken for granted, as sensors are built so."""
 SAMPLES = (90, 45)
 """Pixels of a press that count here, inside and outside its circle: the choice needs fewer than the fit."""
 STEPS, CIRCLE_STEPS = 40, 6
 """Most steps of a fit, and of that of the tested presses' circles."""
 
 
-def choose_prior(
+def choose_strength(
     sensor: SensorSpec,
     shots: Photographs,
     settings: FitSettings,
     *,
-    candidates: Sequence[float] = PRIORS,
+    candidates: Mapping[str, Mapping[str, float]] = CHOICES,
     seed: int = 0,
     tick: Callable[[str, float], None] | None = None,
-) -> tuple[float, dict[float, float]]:
-    """The candidate with the least error, and the error of each: mean absolute residual [levels] in contacts of the other halves.
+) -> tuple[str, dict[str, float]]:
+    """Name of the candidate with the least error, and the error of each: mean absolute residual [levels] in contacts of other halves.
 
     Raises:
         InputError: too few presses to halve.
     """
     if len(shots.circles) < 2 * FEWEST:
-        rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or give --prior a number"
+        rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or name one with --prior"
         raise InputError("presses", value=len(shots.circles), rule=rule)
     few = dataclasses.replace(settings, samples=SAMPLES)
     held = dataclasses.replace(few, fixed=tuple(SIGMA))
     errors = {}
-    for prior in candidates:
-        own, found = dataclasses.replace(few, prior=prior), []
+    for name, values in candidates.items():
+        own, found = dataclasses.replace(few, **values), []
         for train, test in _halves(shots.circles):
             fitted, tested = shots.take(train), shots.take(test)
             begin = first_state(sensor, fitted, own, seed)
@@ -59,8 +66,8 @@ def choose_prior(
             off, _ = problem.residuals(problem.solve(start, CIRCLE_STEPS))
             found.append(float(np.abs(off[problem.inside]).mean()))
             if tick is not None:
-                tick(f"prior {prior:g}", found[-1])
-        errors[prior] = float(np.mean(found))
+                tick(f"prior {name}", found[-1])
+        errors[name] = float(np.mean(found))
     return min(errors, key=errors.__getitem__), errors
 
 

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.light_parameters import CHANNELS, SIDES, LightParameters
+from raytac.calibrate.light_parameters import CHANNELS, LightParameters
 
 __all__ = ["Ties", "side_ties"]
 
 PLACE, AIM, LOBE, POWER = 1.0, 0.2, 1.0, 0.2
 """How far LEDs are believed to be from mirrored places [mm] and aims [rad], and from the lobe and power [full scales] next to them."""
+
+LEAST = 1.0
+"""How far [mm] the middle of a layer's LEDs must be from the pad's for them to be on one side of it."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,11 @@ class Ties:
 
 
 def side_ties(p: LightParameters, size: int) -> Ties:
-    """Ties of LEDs that stand along walls, as ``leds_at_walls`` names and orders them; ``size`` is the vector's length, whose first
-    entries are ``p.leds`` and ``p.power``."""
+    """Ties of the LEDs of every layer, which stand on one side of the pad: mirrored about the line from the pad's middle to theirs.
+
+    An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
+    whose first entries are ``p.leds`` and ``p.power``.
+    """
     rows: list[np.ndarray] = []
     offsets: list[float] = []
 
@@ -45,20 +51,24 @@ def side_ties(p: LightParameters, size: int) -> Ties:
 
     for layer in range(len(CHANNELS)):
         own = np.flatnonzero(p.layer == layer)
-        along = 1 if SIDES[CHANNELS[layer]][0] else 0  # the coordinate that changes sign: y on the walls at ±x
-        for a, b in zip(own, own[::-1], strict=True):
-            if a > b:
-                continue
-            first, second = 6 * a, 6 * b
-            tie(PLACE, 0.0, (first + along, 1), (second + along, 1))
-            # Mirrored, an azimuth A becomes π − A (x changes sign) or −A (y does), up to whole turns.
-            turn = 0.0 if along else np.pi
-            total = p.leds[a, 3] + p.leds[b, 3]
-            tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (first + 3, 1), (second + 3, 1))
-            if a < b:
-                for k in (1 - along, 2):
-                    tie(PLACE, 0.0, (first + k, 1), (second + k, -1))
-                tie(AIM, 0.0, (first + 4, 1), (second + 4, -1))
+        middle = p.leds[own, :2].mean(0)
+        if np.hypot(*middle) > LEAST:
+            out = middle / np.hypot(*middle)
+            across = np.array([-out[1], out[0]])
+            mirrored = p.leds[own, :2] - 2 * np.outer(p.leds[own, :2] @ across, across)
+            nearest = np.argmin(np.linalg.norm(mirrored[:, None] - p.leds[own, :2], axis=2), axis=1)
+            for k in np.flatnonzero(nearest[nearest] == np.arange(len(own))):
+                a, b = own[k], own[nearest[k]]
+                if a > b:
+                    continue
+                tie(PLACE, 0.0, *((6 * led + k, across[k]) for led in (a, b) for k in (0, 1)))
+                # Mirrored, an azimuth A becomes 2 φ − A with φ that of ``out``, up to whole turns.
+                turn, total = 2 * np.arctan2(out[1], out[0]), p.leds[a, 3] + p.leds[b, 3]
+                tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (6 * a + 3, 1), (6 * b + 3, 1))
+                if a < b:
+                    tie(PLACE, 0.0, *((6 * led + k, sign * out[k]) for led, sign in ((a, 1), (b, -1)) for k in (0, 1)))
+                    tie(PLACE, 0.0, (6 * a + 2, 1), (6 * b + 2, -1))
+                    tie(AIM, 0.0, (6 * a + 4, 1), (6 * b + 4, -1))
         for a, b in itertools.pairwise(own):
             tie(LOBE, 0.0, (6 * a + 5, 1), (6 * b + 5, -1))
             for c in range(3):

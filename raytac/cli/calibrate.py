@@ -55,7 +55,7 @@ class CalibrateArgs(SolverOptions):
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
     prior: str = INNER
-    """How strongly LEDs are held to where they begin: a number [levels squared a standard deviation], or `inner`, which chooses it by
+    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
     cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from raytac.calibrate.circles import with_found_circles
 from raytac.calibrate.light_parameters import leds_at_walls
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
+from raytac.calibrate.prior_choice import STRENGTHS
 from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
 
@@ -22,21 +22,15 @@ INNER = "inner"
 """Strength of priors: chosen by cross-validation within the presses that are fitted to."""
 
 
-def prior_of(text: str) -> float | None:
+def prior_of(name: str) -> str | None:
     """``--prior``: None is ``INNER``.
 
     Raises:
-        InputError: neither that nor a finite number > 0.
+        InputError: neither that nor a name of ``STRENGTHS``.
     """
-    if text == INNER:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise InputError("prior", value=text, rule=f"must be {INNER!r} or a finite number > 0")
-    return value
+    if name not in (INNER, *STRENGTHS):
+        raise InputError("prior", value=name, rule="must be a known strength", choices=(INNER, *STRENGTHS))
+    return None if name == INNER else name
 
 
 def read_data(

@@ -40,6 +40,8 @@ class Ablation:
     """Blocks of parameters that stay at their start."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the ray tracer."""
+    prior: str | None = None
+    """Name of another strength of priors than that of the comparison."""
     settle: bool = True
     """Whether the image at rest is averaged (``Photographs.settled``)."""
     other_shadows: bool = False
@@ -76,6 +78,7 @@ ABLATIONS: dict[str, Ablation] = {
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": Ablation(fixed=("slope",)),
     "one_photograph_at_rest": Ablation(settle=False),
+    "untied_leds": Ablation(prior="free"),
 }
 """By the name of their keys in ``metrics.json``."""
 
@@ -90,8 +93,8 @@ class RealSettings:
     regions: bool = True
     """Also half of the pad to half, and shallow to deep."""
     ablations: bool = True
-    prior: float | None = None
-    """``FitSettings.prior``; None chooses it within the presses that are fitted to."""
+    prior: str | None = None
+    """Name of the strength of priors; None chooses it within the presses that are fitted to."""
     starts: int = 3
     rounds: int = 3
     shadows: bool = False
@@ -119,7 +122,7 @@ def compare_real(
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}
-    priors: dict[str, list[float]] = {}
+    priors: dict[str, list[str]] = {}
     starts: dict[str, list[tuple[float, ...]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
     with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
@@ -152,7 +155,7 @@ def compare_real(
                     bar,
                     modes=("raytrace",),
                     one=one,
-                    prior=priors["press"][0],
+                    prior=one.prior or priors["press"][0],
                     options=options,
                 )
                 seen, _ = _tested(models, changed, shots.take(test))
@@ -165,7 +168,7 @@ def compare_real(
             prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
             for mode, of in by_mode.items():
                 metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
-        metrics |= {f"prior.{kind}": ", ".join(f"{prior:g}" for prior in of) for kind, of in priors.items()}
+        metrics |= {f"prior.{kind}": ", ".join(of) for kind, of in priors.items()}
         metrics |= {
             f"start_errors.{kind}_{k}": ", ".join(f"{error:.3f}" for error in errors)
             for kind, of in starts.items()
@@ -201,7 +204,7 @@ def _fitted(
     *,
     modes: tuple[str, ...] = MODES,
     one: Ablation | None = None,
-    prior: float | None = None,
+    prior: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Models:
     one = Ablation() if one is None else one

@@ -44,7 +44,7 @@ def run_calibrate_optics(
     holdout: int,
     starts: int,
     rounds: int,
-    prior: float | None,
+    prior: str | None,
     shadows: bool,
     device: str,
     seed: int,

@@ -15,7 +15,7 @@ from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import press_samples
-from raytac.calibrate.prior_choice import choose_prior
+from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
 from raytac.calibrate.table_fit import fit_table
 from raytac.gel.pad import make_grid
@@ -41,8 +41,8 @@ class Models:
     fitted: Fitted
     rest: np.ndarray
     """The image at rest of all modes [levels], (H, W, 3)."""
-    prior: float
-    """``FitSettings.prior`` of the lights."""
+    prior: str
+    """Name of the strength of priors (``STRENGTHS``)."""
     modes: dict[str, OpticalMode]
     device: str
     options: Mapping[str, Any]
@@ -72,13 +72,13 @@ def fit_models(
     starts: int = 3,
     rounds: int = 3,
     settle: bool = True,
-    prior: float | None = None,
+    prior: str | None = None,
     options: Mapping[str, Any] | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
     """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
 
-    ``prior`` takes the place of that of ``settings``; None chooses it within ``shots`` (``choose_prior``).
+    ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
     ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
 
     Raises as ``fit_lights``.
@@ -87,8 +87,8 @@ def fit_models(
     settings = FitSettings() if settings is None else settings
     shots = shots.settled(sensor) if settle else shots
     if prior is None:
-        prior, _ = choose_prior(sensor, shots, settings, seed=seed, tick=tick)
-    settings = dataclasses.replace(settings, prior=prior)
+        prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
+    settings = dataclasses.replace(settings, **STRENGTHS[prior])
     fitted = fit_lights(
         sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
     )

@@ -11,7 +11,7 @@ from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
-from raytac.calibrate.prior_choice import choose_prior
+from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import fit_lights, refine_circles
 from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
@@ -234,7 +234,7 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0]))
     start = with_parameters(sensor, moved, shots.background)
     settings = FitSettings(fixed=("gamma", "slope", "stray"))
-    found, errors = choose_prior(start, shots, settings, candidates=(1e7, 30.0))
-    assert found == 30.0 and errors[30.0] < 0.6 * errors[1e7], errors
+    found, errors = choose_strength(start, shots, settings, candidates={"nailed": {"prior": 1e7}, "free": {"prior": 30.0}})
+    assert found == "free" and errors["free"] < 0.6 * errors["nailed"], errors
     with pytest.raises(InputError, match="at least 8"):
-        choose_prior(start, shots.take(np.arange(7)), settings)
+        choose_strength(start, shots.take(np.arange(7)), settings)
