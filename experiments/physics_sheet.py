@@ -95,7 +95,7 @@ class Args(CommonOptions):
                 metrics |= {f"{name}.{key}": value for key, value in compared(frames["rigid"], frames["ipc"]).items()}
                 rows.append((name, frames["rigid"], frames["ipc"]))
                 print(f"{name}: done after {time.perf_counter() - start:.0f} s", flush=True)
-            sheet_figure(rows, sensors["ipc"], self.pad).savefig(folder / "sheet.png")
+            sheet_figure(rows, sensors["ipc"], self.pad).savefig(folder / "sheet.png", pil_kwargs={"optimize": True})
             metrics |= {"device": sensors["ipc"].device_used, "wall_s": time.perf_counter() - start}
             write_metrics(folder / "metrics.json", metrics | versions((*VERSIONED, "warp-lang")))
         print(out / "sheet.png")
