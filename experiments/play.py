@@ -196,11 +196,12 @@ def _write_film(frames: list[np.ndarray], path: Path, step: float = 0.02) -> Non
 
 
 def _write_strip(frames: list[np.ndarray], path: Path, count: int = 4) -> None:
-    """Some frames one below the other."""
+    """Some frames, two beside each other, in the order in which one reads."""
     from PIL import Image
 
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
-    Image.fromarray(np.concatenate(chosen)).save(path)
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    rows = [np.concatenate(chosen[i : i + 2], axis=1) for i in range(0, count, 2)]
+    Image.fromarray(np.concatenate(rows)).save(path)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ class BalancePole(Task):
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = False
     tactile: ClassVar = ("markers", "wrench")
+    stands_on: ClassVar = "sensor"
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
         # It leans about an edge of its foot, which stays a hair above the pad.

@@ -12,13 +12,14 @@ import numpy as np
 
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
+from raytac.envs.variation import VariationDraws
 from raytac.errors import InputError
 from raytac.gel.batch import rounded_envs
 from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
 from raytac.robots.pose import pose_error
 from raytac.specs.task_file import load_task
-from raytac.world.world import TactileWorld
+from raytac.world.world import TactileWorld, chosen_physics
 
 __all__ = ["Outcome", "TaskBatch"]
 
@@ -80,7 +81,7 @@ class TaskBatch:
                 and nothing of it is computed.
             body_seen: whether the body's pose and velocity are observed; None is as the task has it.
             action: one of ``ACTIONS``.
-            randomization: of sensors and cameras; None is none.
+            randomization: of sensors, cameras, bodies and mounts; None is none.
             max_episode_steps: after which an episode is truncated; None is as the task has it.
             seed: of what is drawn once a world, and of streams that no ``reset`` has seeded.
             scene: another task scene with the same names in it, name or path.
@@ -103,12 +104,17 @@ class TaskBatch:
         asked = ObservationSettings(("wrench",)) if settings is None else settings
         probe = TactileObserver(loaded.robot.sensor, asked, num_envs=num_envs, randomization=randomization, seed=seed)
         loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
-        loaded = randomised_bodies(loaded, self.randomization, seed)
+        rigid = chosen_physics(loaded, physics, pad) == "rigid"
+        if not rigid:
+            loaded = randomised_bodies(loaded, self.randomization, seed)
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
         if settings is not None:
             options = probe.world_options()
         options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
         self.world = TactileWorld(loaded, physics=physics, pad=pad, device=device, **options)
+        self._draws = VariationDraws(
+            loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
+        )
         self.observers: dict[str, TactileObserver] = {}
         if settings is not None:
             quiet = replace(self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0)
@@ -122,6 +128,7 @@ class TaskBatch:
         state = self.world.state()
         self._tool = self.steering.tool()
         self._start_tool, self._start_body = self._tool[0].copy(), state.world_from_body[task.body][0].copy()
+        self._start_pads = {name: poses[0].copy() for name, poses in state.world_from_pad.items()}
         self._body = state.world_from_body[task.body]
         self._speed, self._body_speed = np.zeros((num_envs, 3)), np.zeros((num_envs, 6))
         self._goal = np.zeros((num_envs, 3))
@@ -136,7 +143,8 @@ class TaskBatch:
         return self.world.scene.control_timestep
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Start the streams of cameras and markers of environments anew; the next ``reset`` draws from them."""
+        """Start the streams of cameras, markers, bodies and mounts of environments anew; the next ``reset`` draws from them."""
+        self._draws.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
             own = [_own_seed(seed, i) for seed in seeds]
             observer.reseed(envs, own)
@@ -149,7 +157,12 @@ class TaskBatch:
         drawn = [self.task.start(rng, self._start_tool, self._start_body) for rng in rngs]
         names = {name for start in drawn for name in start.bodies}
         bodies = {name: np.stack([start.bodies[name] for start in drawn]) for name in names}
-        state = self.world.reset(envs, bodies=bodies)
+        variation = None if self._draws.is_none else self._draws.draw(envs)
+        if variation is not None and self.task.stands_on is not None and self.task.stands_on in variation.mounting:
+            # What stands on the pad starts as far above it as it would were the pad mounted as it is drawn.
+            name, turn = self.task.stands_on, self._start_pads[self.task.stands_on][:3, :3]
+            bodies[self.task.body][:, :3, 3] += variation.mounting[name][:, :3, 3] @ turn.T
+        state = self.world.reset(envs, bodies=bodies, variation=variation)
         for b, start in zip(envs, drawn, strict=True):
             self._goal[b] = start.goal
         self._steps[envs], self._action[envs], self._begun[envs] = 0, 0.0, True

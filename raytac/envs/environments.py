@@ -174,9 +174,16 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         return self._seen, {}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment."""
+        """One step of all; an action of an environment that begins anew in this step is ignored, whatever it holds.
+
+        Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment.
+        """
         late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
-        out = self.batch.step(np.asarray(actions), np.isin(np.arange(self.num_envs), late) if len(late) else None)
+        actions = np.asarray(actions)
+        if len(late) and actions.ndim and len(actions) == self.num_envs:
+            actions = actions.copy()
+            actions[late] = 0.0
+        out = self.batch.step(actions, np.isin(np.arange(self.num_envs), late) if len(late) else None)
         observation, terms = out.observation, {name: term.copy() for name, term in out.terms.items()}
         reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
         success, failed = out.success.copy(), out.failed.copy()

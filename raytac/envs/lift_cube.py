@@ -53,7 +53,7 @@ class LiftCubeEnv(TactileEnv):
 
     Action, Box(-1, 1, (4,)): what the target of the point between the pads moves along world x, y, z (5 mm a step at 1), and by how much
     the opening that is asked for changes (4 mm). The target leads the tool by at most 15 mm along an axis and stays in x 0.30 to 0.60,
-    y ±0.15, z 0.016 to 0.30 m; the opening stays in 20 to 80 mm.
+    y ±0.15, z 0.012 to 0.30 m; the opening stays in 20 to 80 mm.
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 
     Observations, float32:

@@ -24,7 +24,12 @@ class EnvironmentPicture:
         from raytac.world.scene_camera import SceneCamera
 
         self._batch, self._height = batch, height
-        self._camera = SceneCamera(batch.world, resolution=(4 * height // 3, height))
+        # Near enough to see a pad of two centimetres, far enough that tool and body, a long pole too, stay in view.
+        tool, body = batch._start_tool[:3, 3], batch._start_body[:3, 3]
+        distance = 0.45 + 1.5 * float(np.linalg.norm(tool - body))
+        self._camera = SceneCamera(
+            batch.world, resolution=(4 * height // 3, height), distance=distance, lookat=0.5 * (tool + body)
+        )
 
     def draw(self, env: int, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """8-bit picture (H, W, 3) of an environment, the goal in green; ``observation`` (B, …) is what the batch gave last."""

@@ -55,7 +55,7 @@ class Steering:
         self.reset(range(count))
 
     def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool."""
+        """Poses (B, 4, 4) of the tool, as the arm reckons them: where its pad should be, were it mounted as it is drawn."""
         return site_poses(self.world.data, self.arm.site)
 
     def joint_speed(self) -> np.ndarray:
@@ -63,12 +63,11 @@ class Steering:
         return np.array([data.qvel for data in self.world.data])[:, self.arm.dof]
 
     def opening(self) -> np.ndarray:
-        """Gap between both pads [m], (B, 1); (B, 0) without a gripper."""
+        """Gap between both pads by the fingers' joints [m], (B, 1); (B, 0) without a gripper."""
         if not self._has_grip:
             return np.zeros((self.world.num_envs, 0))
-        sites = [self.arm.model.site(mounted.site).id for mounted in self.world.composed.sensors]
-        pads = [site_poses(self.world.data, site)[:, :3, 3] for site in sites]
-        return np.linalg.norm(pads[0] - pads[1], axis=1)[:, None]
+        fingers = self.world.composed.fingers
+        return np.array([data.qpos[fingers].sum() for data in self.world.data])[:, None]
 
     def reset(self, envs: Sequence[int] | range) -> None:
         """Targets of environments are where they are now."""

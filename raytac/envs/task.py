@@ -94,6 +94,9 @@ class Task(ABC):
     tactile: ClassVar[tuple[str, ...]] = ("markers",)
     """Modalities of every sensor unless said otherwise."""
 
+    stands_on: ClassVar[str | None] = None
+    """Sensor whose pad the body stands on at the start; None: on something else."""
+
     @abstractmethod
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
         """Draw an episode, given poses (4, 4) of tool and body in the scene."""

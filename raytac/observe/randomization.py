@@ -14,16 +14,20 @@ from raytac.specs.task import TaskScene
 
 __all__ = ["CameraDrift", "Randomization", "randomised_bodies", "randomised_sensor"]
 
+_ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
+"""Widths that are not relative to 1, and what they must stay below: beyond it a pad is not askew but elsewhere."""
+
 
 @dataclass(frozen=True)
 class Randomization:
-    """Half widths of uniform distributions, relative to 1; all 0 is none.
+    """Half widths of uniform distributions, relative to 1 unless said otherwise; all 0 is none.
 
-    *Each environment, at every reset* (``CameraDrift`` and the marker tracker): ``exposure``, ``white_balance``, ``gamma`` and the pattern
-    of ``markers``. *Each frame*: ``noise``, and noise and losses of ``markers``. *Once a world*, in the sensor that all its environments
-    share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``; and in its bodies
-    (``randomised_bodies``): ``body_mass``, ``body_friction``. A table of ``taxim`` is baked anew for every such sensor, the ray tracer is
-    not: vary seeds over processes.
+    *Each environment, at every reset*: the camera (``CameraDrift``) by ``exposure``, ``white_balance``, ``gamma``; the pattern of
+    ``markers``; how the pad is mounted by ``pad_shift``, ``pad_turn``, and bodies by ``body_mass``, ``body_friction``
+    (``raytac.envs.variation``; simulated pads have bodies drawn once a world, ``randomised_bodies``). *Each frame*: ``noise``, and noise
+    and losses of ``markers``. *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``,
+    ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``. A table of ``taxim`` is baked anew for every such sensor, the ray
+    tracer is not: vary seeds over processes.
     """
 
     led_power: float = 0.0
@@ -39,7 +43,12 @@ class Randomization:
     body_mass: float = 0.0
     """Of every free body by itself."""
     body_friction: float = 0.0
-    """Of every body by itself, where the scene gives it a coefficient; against gel and all else alike."""
+    """Of every body by itself, where the scene gives it a coefficient; against gel and all else alike. Of two bodies that meet, MuJoCo
+    takes the greater coefficient."""
+    pad_shift: float = 0.0
+    """Of every pad on its mount, along each axis of the pad frame [m]; the arm does not know of it."""
+    pad_turn: float = 0.0
+    """Of every pad on its mount: each component of a rotation vector, pad frame [rad]."""
     exposure: float = 0.0
     """Gain of the camera, all channels, in linear light."""
     white_balance: float = 0.0
@@ -56,14 +65,27 @@ class Randomization:
             value = getattr(self, item.name)
             if item.name == "markers":
                 continue
-            rule = "must be 0 or more, and finite" if item.name == "noise" else "must be in [0, 1): a half width relative to 1"
-            if not (np.isfinite(value) and value >= 0.0 and (item.name == "noise" or value < 1.0)):
+            absolute, most = item.name in _ABSOLUTE, _ABSOLUTE.get(item.name, 1.0)
+            rule = "must be 0 or more, and finite" if absolute else "must be in [0, 1): a half width relative to 1"
+            if absolute and np.isfinite(most):
+                rule = f"must be in [0, {most:g}) m or rad"
+            if not (np.isfinite(value) and 0.0 <= value < most):
                 raise InputError(item.name, value=value, rule=rule)
 
     @property
     def changes_images(self) -> bool:
         """Whether images differ between environments of one world."""
         return any((self.exposure, self.white_balance, self.gamma, self.noise))
+
+    @property
+    def changes_bodies(self) -> bool:
+        """Whether bodies differ."""
+        return any((self.body_mass, self.body_friction))
+
+    @property
+    def changes_mounting(self) -> bool:
+        """Whether pads are mounted askew."""
+        return any((self.pad_shift, self.pad_turn))
 
     @property
     def changes_sensor(self) -> bool:
@@ -100,9 +122,9 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
 
 
 def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:
-    """The scene with the bodies that a seed draws; the one given where nothing of them is drawn."""
+    """The scene with the bodies that a seed draws, the same in all environments; the one given where nothing of them is drawn."""
     r = randomization
-    if not (r.body_mass or r.body_friction):
+    if not r.changes_bodies:
         return scene
     rng = np.random.default_rng((seed, 0xB0D1))
     bodies = []

@@ -45,7 +45,7 @@ class StageStart:
     twist: np.ndarray
     """[rad], (B,)."""
     force: np.ndarray
-    """That is kept [N], (B,); NaN where none is."""
+    """Normal force that is kept, or where none is, that the contact bears [N], (B,); what a stage to a force begins from."""
 
 
 class SoftDrive:
@@ -75,7 +75,8 @@ class SoftDrive:
 
     def start(self) -> StageStart:
         """Where the next stage begins."""
-        return StageStart(self._depth.copy(), self._shear.copy(), self._twist.copy(), self._force.copy())
+        force = np.where(np.isfinite(self._force), self._force, np.maximum(np.nan_to_num(self._normal_force()), 0.0))
+        return StageStart(self._depth.copy(), self._shear.copy(), self._twist.copy(), force)
 
     def read(self, clearance: np.ndarray) -> None:
         """Take note of the clearance [m], (B,), in the state that was read last."""
@@ -93,7 +94,7 @@ class SoftDrive:
 
     def advance(self, stage: StageSpec, fraction: float, begun: StageStart) -> None:
         """From wherever it is to ``fraction`` of a stage that began at ``begun``."""
-        depth, shear, twist, force = begun.depth, begun.shear, begun.twist, begun.force
+        depth, shear, twist, borne = begun.depth, begun.shear, begun.twist, begun.force
         if stage.kind in ("shear", "twist"):
             to_shear, to_twist = self._shear, self._twist
             if stage.kind == "shear":
@@ -106,7 +107,6 @@ class SoftDrive:
             self._force[:] = np.nan
             self._release(depth, fraction)
         elif stage.force is not None:
-            borne = np.where(np.isfinite(force), force, 0.0)
             self._force[:] = borne + fraction * (stage.force - borne)
             self._load()
             if not self._is_free and (self._force < borne).any():

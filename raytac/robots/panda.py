@@ -42,6 +42,8 @@ _TCP: Final = 0.1034
 """Point between the finger tips in the hand's frame, along z [m] (franka_ros, franka_hand.xacro)."""
 _FINGER: Final = 0.0584
 """Finger frames in the hand's frame, along z [m] (the same)."""
+_TOOL: Final = "tool"
+"""Site where the drawing has the pad, axes parallel to link7's: it stays there where a world mounts the pad a little askew."""
 _SERVO: Final = (1e4, 100.0, 70.0)
 """Opening servo: gain [N/m], damping [N s/m], greatest force [N], as in ``scenes/robots/panda_hand.xml``."""
 
@@ -56,7 +58,7 @@ class PandaRobot:
     spec: mujoco.MjSpec
     sensors: tuple[MountedSensor, ...]
     site: str
-    """Site that the arm is steered by: the pad of the one sensor, or the point midway between both pads."""
+    """Site that the arm is steered by, fixed to the arm: where the drawing has the one sensor's pad, or the point between both."""
     opening: str | None = None
     """Position actuator of the hand: sum of both finger joints [m], which is the gap between both pads; None without a hand."""
     joints: tuple[str, ...] = JOINTS
@@ -84,8 +86,10 @@ def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
     loaded = load_sensor(sensor) if isinstance(sensor, str) else sensor
     flange_from_pad = standing_on(loaded)
     link7_from_flange = pose(np.eye(3), np.array(_FLANGE))
-    mounted = mount_sensor(spec, loaded, "link7", link7_from_flange @ flange_from_pad, kind="body")
-    return PandaRobot(spec, (mounted,), mounted.site)
+    link7_from_pad = link7_from_flange @ flange_from_pad
+    mounted = mount_sensor(spec, loaded, "link7", link7_from_pad, kind="body")
+    spec.body("link7").add_site(name=_TOOL, pos=link7_from_pad[:3, 3], group=4)
+    return PandaRobot(spec, (mounted,), _TOOL)
 
 
 def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> PandaRobot:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from raytac.view.session import Quantity
+from raytac.view.session import Quantity, round_up
 
 __all__ = ["ColourScale", "legend_html"]
 
@@ -35,7 +33,7 @@ class ColourScale:
         """Let the scale reach the greatest of ``values`` (SI); what is not finite does not count."""
         greatest = float(np.max(values[np.isfinite(values)], initial=0.0)) * self.quantity.factor
         if greatest > self.full:
-            self.full = _round_up(greatest)
+            self.full = round_up(greatest)
 
     def colours(self, values: np.ndarray) -> np.ndarray:
         """8-bit sRGB (V, 3) of SI values (V,): below 0 as 0; grey where not finite."""
@@ -43,12 +41,6 @@ class ColourScale:
         found = self._table[np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(int)]
         found[~np.isfinite(values)] = 128
         return found
-
-
-def _round_up(value: float) -> float:
-    """The next of 1, 2, 5 times a power of ten, within rounding."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1.0 + 1e-9))
 
 
 def legend_html(scale: ColourScale) -> str:

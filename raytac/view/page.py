@@ -28,6 +28,10 @@ _MODES = {
     "stopped": "stopped: the program that served this page has ended",
 }
 _COMMANDS = ("Play", "Pause", "Step", "Reset")
+_SIGNS = (
+    "<p style='margin:0.4em 1em;font-size:0.75em'>Force and torque on the pad, in its frame, about its origin; z points out of the gel "
+    "to the object, so what presses has F<sub>z</sub> &lt; 0.</p>"
+)
 _ALL = "all"
 """Button that takes the eye back to where it began."""
 _AXES = ("x", "y", "z")
@@ -128,6 +132,7 @@ class Page:
             self._arrows = gui.add_checkbox(
                 f"arrows × {ARROW_SCALE:g}", True, visible=False, hint="Where the markers went, so many times as long"
             )
+            self._signs = gui.add_html(_SIGNS, visible=False)
         self._arrows.on_update(lambda _: self._redraw())
         panel.dock_left()
         panel.set_width(380)
@@ -170,6 +175,7 @@ class Page:
                 self._images[name].visible = True
             self._wrenches[name].content = _wrench_html(view)
         self._arrows.visible = any(view.markers_px is not None for view in snapshot.pads.values())
+        self._signs.visible = any(view.wrench is not None for view in snapshot.pads.values())
         times = {f"{name}, time": f"{value:.1f} ms" for name, value in snapshot.time_ms.items()}
         self._facts.content = _table({**snapshot.facts, **times}.items())
         self._warning.visible = bool(snapshot.warning)
@@ -177,11 +183,13 @@ class Page:
 
     def _place_sliders(self, snapshot: Snapshot) -> None:
         for control in self._session.controls:
-            value = snapshot.controls.get(control.name)
+            slider, value = self._sliders[control.name], snapshot.controls.get(control.name)
+            if (slider.min, slider.max) != (control.low, control.high):
+                slider.min, slider.max = control.low, control.high
             if value is None or not np.isfinite(value) or control.name in self._held:
                 continue
             steps = round((min(max(value, control.low), control.high) - control.low) / control.step)
-            self._sliders[control.name].value = min(control.low + steps * control.step, control.high)
+            slider.value = min(control.low + steps * control.step, control.high)
 
 
 def _wrench_html(view: PadView) -> str:

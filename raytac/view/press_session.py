@@ -19,8 +19,18 @@ from raytac.physics.soft_bodies import OBJECT, PAD
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
 from raytac.specs.press import StageSpec
-from raytac.view.sensor_view import coat_edges, grid_faces, narrow_warning, pad_view, sensor_lines, sensor_solids, strided
-from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid, check_targets
+from raytac.view.sensor_view import (
+    MESH_COLOUR,
+    MESH_WIDTH,
+    coat_edges,
+    grid_faces,
+    narrow_warning,
+    pad_view,
+    sensor_lines,
+    sensor_solids,
+    strided,
+)
+from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid, check_targets, reaching
 
 __all__ = ["PressSession"]
 
@@ -31,7 +41,7 @@ _NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twi
 _DEEPEST = 0.4
 """Share of the pad's thickness that the depth slider reaches, more if the scene goes deeper."""
 _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
-"""Ends of the sliders for force [N], shear [mm] and twist [degrees]."""
+"""Ends of the sliders for force [N], shear [mm] and twist [degrees], until the object goes beyond them."""
 _STATES = {"rigid": 20, "ipc": 10}
 """States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
 _SAG = 1e-5
@@ -65,7 +75,7 @@ class PressSession:
         self.title = f"{scene.name} · {sensor.spec.name} · {sensor.label}"
         size = max(sensor.spec.gelpad.size)
         self.camera = CameraPlace((0.9 * size, -1.75 * size, 1.35 * size), (0.0, 0.0, -0.15 * size))
-        self.controls = self._make_controls(scene) if self._is_drivable else ()
+        self._own_controls = self._make_controls(scene) if self._is_drivable else ()
         self._grid = strided(self._pad.grid)
         quantities = ("indentation", *(("pressure", "shear") if "traction" in sensor.outputs else ()))
         self.pads = (Pad(sensor.spec.name, grid_faces(self._grid), quantities),)
@@ -80,6 +90,7 @@ class PressSession:
 
     def reset(self) -> None:
         self._held = {}
+        self.controls: tuple[Control, ...] = self._own_controls
         self._has_ended = False
         if self._sensor.markers is not None:
             self._sensor.reset_markers()
@@ -113,6 +124,7 @@ class PressSession:
                 "the physics broke down here: the state did not settle or is not finite; reset, or try smaller steps"
             )
         self._state, self._shot = state, None
+        self.controls = reaching(self.controls, self._places())
         return True
 
     def snapshot(self) -> Snapshot:
@@ -207,7 +219,7 @@ class PressSession:
         """Edges of the simulated pad's own mesh over the smooth coat."""
         if not isinstance(self._pad, SoftPad):
             return ()
-        return (Lines("coat_mesh", coat_edges(self._pad.mesh.coat, self._pad.mesh.coat.rest), (205, 212, 222), 0.8),)
+        return (Lines("coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH),)  # laid on the first state's surface
 
     def _drawn(self, frame: TactileFrame, image_ms: float) -> Snapshot:
         name, surface = self._sensor.spec.name, frame.surface
@@ -215,7 +227,7 @@ class PressSession:
         reshaped: dict[str, np.ndarray] = {}
         if isinstance(self._pad, SoftPad):
             if surface.coat is not None:
-                reshaped["coat_mesh"] = coat_edges(surface.coat.mesh, surface.coat.positions[0])
+                reshaped["coat_mesh"] = coat_edges(surface.coat.mesh, surface.coat.positions[0], surface, self._grid)
             soft = self._soft_object()
             if soft is not None:
                 reshaped["object"], poses["object"] = soft[0], np.eye(4)

@@ -7,15 +7,30 @@ import numpy as np
 from raytac.frame import TactileFrame
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.pad import rest_height
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import GelSurface, PadGrid
 from raytac.sensor.contact_width import LEAST_CELLS
 from raytac.specs import SensorSpec
 from raytac.view.session import Lines, PadView, Solid
 
-__all__ = ["coat_edges", "gel_solid", "grid_faces", "narrow_warning", "pad_view", "sensor_lines", "sensor_solids", "strided"]
+__all__ = [
+    "MESH_COLOUR",
+    "MESH_WIDTH",
+    "coat_edges",
+    "gel_solid",
+    "grid_faces",
+    "narrow_warning",
+    "pad_view",
+    "sensor_lines",
+    "sensor_solids",
+    "strided",
+]
 
 _MOST_VERTICES = 12_000
 """Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
+_CLEAR = 2e-5
+"""How far lines lie above the faces below them [m]."""
+MESH_COLOUR, MESH_WIDTH = (205, 212, 222), 0.8
+"""Of a simulated pad's own mesh over its smooth coat; the width on the screen [px]."""
 _GEL, _CASE, _VIEW = (176, 205, 212), (105, 112, 122), (190, 150, 60)
 
 
@@ -45,10 +60,7 @@ def grid_faces(grid: PadGrid) -> np.ndarray:
 
 def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0) -> PadView:
     """What the page draws of one environment's frame, with the coat at the nodes of ``grid`` (from ``strided``)."""
-    full = frame.surface.grid
-    rows, columns = np.searchsorted(full.y, grid.y), np.searchsorted(full.x, grid.x)
-    at = np.ix_(rows, columns)
-    height = frame.surface.height[env][at].astype(float)
+    at, height = _places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
     x, y = np.meshgrid(grid.x, grid.y)
     values = {"indentation": (grid.rest - height).ravel()}
     if frame.traction is not None:
@@ -72,15 +84,55 @@ def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
     if frame.contact_cells is None or not frame.contact_cells[env] < LEAST_CELLS:
         return ""
     cells = frame.contact_cells[env]
-    return f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} its force at a given depth is too large."
+    return (
+        f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} the simulated pad is too stiff, "
+        "the force at a given depth too large, the depth under a given force too small."
+    )
 
 
-def coat_edges(mesh: CoatMesh, vertices: np.ndarray) -> np.ndarray:
-    """Grid lines of a simulated coat whose vertices (V, 3) [m] are where they are now, as segments (N, 2, 3)."""
+def coat_edges(mesh: CoatMesh, vertices: np.ndarray, surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
+    """Grid lines of a simulated coat on the surface that is drawn, as segments (N, 2, 3) [m].
+
+    Args:
+        mesh: of the coat.
+        vertices: where its vertices are now, shape (V, 3) [m]; their heights do not count, since between them the surface is curved.
+        surface: what is drawn, of environment ``env``.
+        grid: nodes of ``surface`` that are drawn (from ``strided``).
+    """
     rows, columns = mesh.shape
-    at = vertices.reshape(rows, columns, 3) + np.array([0.0, 0.0, 2e-5])  # clear of the faces below
-    along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 3)])
+    at = vertices[:, :2].reshape(rows, columns, 2)
+    along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 2)
+    ends = np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 2)])
+    wanted = int(np.ceil(max(np.diff(mesh.lines_x).max(), np.diff(mesh.lines_y).max()) / (0.5 * min(grid.pitch))))
+    pieces = max(min(wanted, _MOST_VERTICES // len(ends)), 1)
+    share = np.linspace(0.0, 1.0, pieces + 1)[:, None]
+    points = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (E, pieces + 1, 2)
+    lifted = _on_faces(grid, _thinned_height(surface, grid, env), points) + _CLEAR
+    line = np.concatenate([points, lifted[..., None]], axis=-1)
+    return np.stack([line[:, :-1], line[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+
+def _on_faces(grid: PadGrid, height: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Height of the triangles of ``grid_faces`` at places (..., 2); beyond the grid that of its edge."""
+    where = [np.clip(points[..., k], axis[0], axis[-1]) for k, axis in enumerate((grid.x, grid.y))]
+    i, j = (
+        np.clip(np.searchsorted(axis, at, "right") - 1, 0, len(axis) - 2)
+        for axis, at in zip((grid.x, grid.y), where, strict=True)
+    )
+    s = (where[0] - grid.x[i]) / (grid.x[i + 1] - grid.x[i])
+    t = (where[1] - grid.y[j]) / (grid.y[j + 1] - grid.y[j])
+    a, b, c, d = height[j, i], height[j, i + 1], height[j + 1, i], height[j + 1, i + 1]
+    return np.where(s >= t, a + s * (b - a) + t * (d - b), a + t * (c - a) + s * (d - c))
+
+
+def _thinned_height(surface: GelSurface, grid: PadGrid, env: int) -> np.ndarray:
+    """Height [m] at the nodes of a grid from ``strided``, (Ny, Nx)."""
+    return surface.height[env][_places(surface.grid, grid)].astype(float)
+
+
+def _places(full: PadGrid, grid: PadGrid) -> tuple[np.ndarray, ...]:
+    """Index of a thinned grid's nodes in arrays (Ny, Nx, ...) of the full one."""
+    return np.ix_(np.searchsorted(full.y, grid.y), np.searchsorted(full.x, grid.x))
 
 
 def gel_solid(spec: SensorSpec, name: str = "gel") -> Solid:

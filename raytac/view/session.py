@@ -6,8 +6,9 @@ are in metres in the session's world frame unless a field says otherwise.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -26,6 +27,8 @@ __all__ = [
     "Snapshot",
     "Solid",
     "check_targets",
+    "reaching",
+    "round_up",
 ]
 
 Colour = tuple[int, int, int]
@@ -77,6 +80,25 @@ def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> 
         control = known[name]
         if not control.low <= value <= control.high:
             raise InputError(control.label, value=value, rule=f"must be within {control.low:g} and {control.high:g}")
+
+
+def reaching(controls: Sequence[Control], places: Mapping[str, float]) -> tuple[Control, ...]:
+    """The controls with ends moved out to a round number wherever something is beyond them, so that a slider can show it."""
+    return tuple(_reaching(control, places.get(control.name, control.low)) for control in controls)
+
+
+def _reaching(control: Control, place: float) -> Control:
+    if place > control.high + 0.5 * control.step:
+        return replace(control, high=round_up(place))
+    if place < control.low - 0.5 * control.step:
+        return replace(control, low=-round_up(-place))
+    return control
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten, within rounding; ``value`` is above 0."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1.0 + 1e-9))
 
 
 @dataclass(frozen=True)
@@ -173,6 +195,7 @@ class Session(Protocol):
     """Scale of the 3-D view, so that what matters is about 1 unit large."""
     camera: CameraPlace
     controls: tuple[Control, ...]
+    """Their ends may move while the scene moves, their names not."""
     is_driven_at_rest: bool
     """Whether a control that is moved moves the scene at once, though it is paused: True for what is quasi-static."""
     solids: tuple[Solid, ...]

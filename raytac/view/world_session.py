@@ -11,7 +11,16 @@ from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.physics.geoms import geom_part
 from raytac.physics.part_surface import part_surface
-from raytac.view.sensor_view import coat_edges, gel_solid, grid_faces, narrow_warning, pad_view, strided
+from raytac.view.sensor_view import (
+    MESH_COLOUR,
+    MESH_WIDTH,
+    coat_edges,
+    gel_solid,
+    grid_faces,
+    narrow_warning,
+    pad_view,
+    strided,
+)
 from raytac.view.session import CameraPlace, Colour, Control, Lines, Pad, Snapshot, Solid, check_targets
 from raytac.view.steering import Steering
 from raytac.world.state import WorldState
@@ -66,7 +75,7 @@ class WorldSession:
         self.camera = self._camera()
         # Their number of segments is known with the first frame, which computes images.
         simulated = self._sensors if world.physics == "ipc" else ()
-        self.lines = tuple(Lines(f"{name}_coat_mesh", np.zeros((1, 2, 3)), (205, 212, 222), 0.8) for name in simulated)
+        self.lines = tuple(Lines(f"{name}_coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH) for name in simulated)
         self._physics_ms = 0.0
         self._shot: Snapshot | None = None
 
@@ -157,7 +166,9 @@ class WorldSession:
         for name, frame in frames.items():
             poses[f"{name}_gel"] = poses[f"{name}_coat_mesh"] = state.world_from_pad[name][0]
             if frame.surface.coat is not None:
-                reshaped[f"{name}_coat_mesh"] = coat_edges(frame.surface.coat.mesh, frame.surface.coat.positions[0])
+                reshaped[f"{name}_coat_mesh"] = coat_edges(
+                    frame.surface.coat.mesh, frame.surface.coat.positions[0], frame.surface, self._grids[name]
+                )
             for part, value in frame.time_ms.items():
                 time_ms[part] = time_ms.get(part, 0.0) + value
         return Snapshot(

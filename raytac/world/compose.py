@@ -74,6 +74,8 @@ class ComposedScene:
     """The joints that move the robot's site; None where there are none."""
     opening: int | None
     """Actuator of the gap between two pads; None without."""
+    fingers: np.ndarray
+    """Addresses in ``qpos`` of the joints whose sum is that gap; none without."""
     bodies: dict[str, ComposedBody]
     """Rigid bodies by name; soft ones are not MuJoCo's."""
     start: np.ndarray
@@ -131,8 +133,9 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
     bodies = {b.name: _composed(model, b, shapes[b.name]) for b in scene.bodies if b.dynamics != "soft"}
     arm = Arm(model, robot.site, robot.joints) if robot.joints else None
     opening = None if robot.opening is None else int(model.actuator(robot.opening).id)
-    start, ctrl = _start(scene, model, arm, opening, bodies)
-    return ComposedScene(scene, model, robot.sensors, specs, arm, opening, bodies, start, ctrl)
+    fingers = _fingers(model, opening)
+    start, ctrl = _start(scene, model, arm, opening, fingers, bodies)
+    return ComposedScene(scene, model, robot.sensors, specs, arm, opening, fingers, bodies, start, ctrl)
 
 
 def pose_of(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
@@ -253,7 +256,12 @@ def _composed(model: mujoco.MjModel, body: BodySpec, parts: tuple[Part, ...]) ->
 
 
 def _start(
-    scene: TaskScene, model: mujoco.MjModel, arm: Arm | None, opening: int | None, bodies: dict[str, ComposedBody]
+    scene: TaskScene,
+    model: mujoco.MjModel,
+    arm: Arm | None,
+    opening: int | None,
+    fingers: np.ndarray,
+    bodies: dict[str, ComposedBody],
 ) -> tuple[np.ndarray, np.ndarray]:
     robot = scene.robot
     start, ctrl = model.qpos0.copy(), np.zeros(model.nu)
@@ -284,12 +292,17 @@ def _start(
         if not 0.0 <= gap <= widest:
             rule = f"must be in [0, {widest * 1e3:g}] mm, as wide as the gripper opens"
             raise SpecError(rule, file=scene.source, key="robot.opening_mm", value=gap * 1e3)
-        ctrl[opening] = gap
-        tendon = int(model.actuator_trnid[opening, 0])
-        first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-        for joint in model.wrap_objid[first : first + count]:
-            start[model.jnt_qposadr[joint]] = gap / count
+        ctrl[opening], start[fingers] = gap, gap / len(fingers)
     return start, ctrl
+
+
+def _fingers(model: mujoco.MjModel, opening: int | None) -> np.ndarray:
+    """Addresses of the joints that the opening's tendon adds up."""
+    if opening is None:
+        return np.zeros(0, int)
+    tendon = int(model.actuator_trnid[opening, 0])
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    return model.jnt_qposadr[model.wrap_objid[first : first + count]].astype(int)
 
 
 def _balance_servos(model: mujoco.MjModel, start: np.ndarray, ctrl: np.ndarray) -> None:

@@ -41,6 +41,7 @@ from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedBody, ComposedScene
 from raytac.world.pad_overlap import PadOverlap, Touches
 from raytac.world.state import Drive, lost
+from raytac.world.variation import EnvironmentModels
 
 __all__ = ["RigidPads"]
 
@@ -77,8 +78,8 @@ class _Contact:
 class RigidPads:
     """All pads of a world, B environments; MuJoCo moves every body."""
 
-    def __init__(self, composed: ComposedScene, num_envs: int) -> None:
-        self.composed, self.model = composed, composed.model
+    def __init__(self, composed: ComposedScene, models: EnvironmentModels, num_envs: int) -> None:
+        self.composed, self.model, self._models = composed, composed.model, models
         self.pads = {
             mounted.name: _Pad(mounted, spec, composed.model)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
@@ -86,8 +87,6 @@ class RigidPads:
         self.bodies = tuple(composed.bodies.values())
         self._radius = [_radius(body) for body in self.bodies]
         self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
-        # A body's friction against gel; None is the gel's own.
-        self._friction = [body.spec.friction_on_gel for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
         self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
@@ -105,31 +104,31 @@ class RigidPads:
 
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
-        scene, model = self.composed.scene, self.model
+        scene, models = self.composed.scene, self._models
         sound, touching = np.flatnonzero(~failed), []
         for b in sound.tolist():
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
         for _ in range(round(scene.control_timestep / scene.timestep)):
             for b in sound.tolist():
-                mujoco.mj_step1(model, datas[b])
+                mujoco.mj_step1(models[b], datas[b])
             touching = self._add_contacts(datas, sound, failed)
             sound = sound[~failed[sound]]
             if not len(sound):
                 break
             for b in sorted({contact.env for contact in touching if not failed[contact.env]}):
                 # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
-                mujoco.mj_makeConstraint(model, datas[b])
-                mujoco.mj_island(model, datas[b])
-                mujoco.mj_projectConstraint(model, datas[b])
-                mujoco.mj_referenceConstraint(model, datas[b])
+                mujoco.mj_makeConstraint(models[b], datas[b])
+                mujoco.mj_island(models[b], datas[b])
+                mujoco.mj_projectConstraint(models[b], datas[b])
+                mujoco.mj_referenceConstraint(models[b], datas[b])
             drive(sound)
             for b in sound.tolist():
-                mujoco.mj_step2(model, datas[b])
+                mujoco.mj_step2(models[b], datas[b])
             failed[sound] = lost([datas[b] for b in sound.tolist()])
             sound = sound[~failed[sound]]
         self._read_forces(datas, sound, [contact for contact in touching if not failed[contact.env]])
         for b in sound.tolist():
-            mujoco.mj_kinematics(model, datas[b])  # so that poses are those of the end of the step
+            mujoco.mj_kinematics(models[b], datas[b])  # so that poses are those of the end of the step
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
@@ -198,14 +197,14 @@ class RigidPads:
 
     def _add_contacts(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> list[_Contact]:
         """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
-        found, model = [], self.model
+        found, models, weight = [], self._models, self._models.inverse_weight
         some = [datas[b] for b in envs.tolist()]
         world_from_body = [body_poses(some, body.index) for body in self.bodies]
         for name, pad in self.pads.items():
             world_from_pad = site_poses(some, pad.site)
             for i, body in enumerate(self.bodies):
-                compliance = float(model.body_invweight0[pad.body, 0] + model.body_invweight0[body.index, 0])
-                if compliance <= 0.0:
+                compliance = weight[:, pad.body] + weight[:, body.index]
+                if not compliance.any():
                     continue  # neither moves
                 touches = self._touches(pad, i, world_from_pad, world_from_body[i])
                 if not len(touches.env):
@@ -219,8 +218,8 @@ class RigidPads:
                         law = self._laws[b][name, i] = pad.overlap.law(touches, k)
                     contact = self._forms[name, i]
                     contact.frame[:], contact.pos[:] = frames[k], places[k]
-                    self._load(contact, pad, i, float(touches.depth[k]), law, compliance)
-                    if mujoco.mj_addContact(model, datas[b], contact) != 0:
+                    self._load(contact, pad, float(touches.depth[k]), law, float(compliance[b]), float(models.gel_friction[b, i]))
+                    if mujoco.mj_addContact(models[b], datas[b], contact) != 0:
                         failed[b] = True
                     else:
                         found.append(_Contact(b, name, int(datas[b].ncon) - 1))
@@ -236,8 +235,8 @@ class RigidPads:
         contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
         return contact
 
-    def _load(self, contact: mujoco.MjContact, pad: _Pad, i: int, depth: float, law: LoadLaw, compliance: float) -> None:
-        """Stiffness and friction of a contact, from gel to body.
+    def _load(self, contact: mujoco.MjContact, pad: _Pad, depth: float, law: LoadLaw, compliance: float, friction: float) -> None:
+        """Stiffness and friction of a contact, from gel to body; a coefficient of NaN is the gel's own.
 
         A contact of the direct form, stiffness s, impedance d, on a compliance A (MuJoCo's estimate of J M⁻¹ Jᵀ) is at rest a spring of
         K = s / ((1 − d) A): see ``contact_solref``.
@@ -248,8 +247,8 @@ class RigidPads:
         stiffness = natural * loss
         contact.solimp[:] = 1.0 - loss, 1.0 - loss, 1e-3, 0.5, 2.0
         contact.solref[:] = -stiffness, -2.0 * stiffness**0.5
-        friction, radius = self._friction[i], law.contact_radius(depth)
-        friction = pad.spec.gelpad.friction if friction is None else friction
+        radius = law.contact_radius(depth)
+        friction = pad.spec.gelpad.friction if np.isnan(friction) else friction
         least = 1e-6  # MuJoCo wants them positive
         rolling = max(3.0 / 16.0 * _HYSTERESIS * radius, least)
         spin = max(3.0 * np.pi / 16.0 * friction * radius, least)
@@ -261,7 +260,7 @@ class RigidPads:
         local = np.empty(6)
         for one in touching:
             data = datas[one.env]
-            mujoco.mj_contactForce(self.model, data, one.index, local)
+            mujoco.mj_contactForce(self._models[one.env], data, one.index, local)
             contact = data.contact[one.index]
             to_world = contact.frame.reshape(3, 3).T
             # MuJoCo's force is on the second body; the pad gets the opposite.

@@ -36,14 +36,16 @@ class SceneCamera:
         distance: float = 0.75,
         azimuth: float = 120.0,
         elevation: float = -15.0,
+        lookat: np.ndarray | None = None,
     ) -> None:
         """Open the renderer.
 
         Args:
             world: whose model and states are drawn; the brightness of its model's headlight is raised, which only pictures show.
             resolution: (width, height) [px], at most 640 x 480.
-            distance: from the middle of the pads at the start, which is looked at [m].
+            distance: from what is looked at [m].
             azimuth, elevation: of the view [°].
+            lookat: the point (3,) that is looked at [m]; None is the middle of the pads as they are now.
 
         Raises:
             InputError: a resolution out of range.
@@ -61,9 +63,10 @@ class SceneCamera:
         except Exception as error:
             rule = "set MUJOCO_GL=egl (or osmesa) before Python starts, and install libEGL (or libOSMesa)"
             raise BackendError(f"MuJoCo cannot draw here ({error}): {rule}") from error
-        pads = world.state().world_from_pad
+        if lookat is None:
+            lookat = np.mean([poses[0, :3, 3] for poses in world.state().world_from_pad.values()], axis=0)
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat[:] = np.mean([poses[0, :3, 3] for poses in pads.values()], axis=0)
+        self._camera.lookat[:] = lookat
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
 
     def draw(self, env: int = 0, points: Sequence[np.ndarray] = ()) -> np.ndarray:

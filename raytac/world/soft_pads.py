@@ -36,6 +36,7 @@ from raytac.world.coupling import Coupling
 from raytac.world.robot_overlap import Inside, RobotOverlap
 from raytac.world.soft_answers import soft_answers
 from raytac.world.state import Drive, lost
+from raytac.world.variation import EnvironmentModels
 
 __all__ = ["SoftPads"]
 
@@ -65,6 +66,7 @@ class SoftPads:
     def __init__(
         self,
         composed: ComposedScene,
+        models: EnvironmentModels,
         datas: Sequence[mujoco.MjData],
         *,
         level: str,
@@ -74,7 +76,7 @@ class SoftPads:
         """Put the pads of all environments into the solver where MuJoCo has them.
 
         Args:
-            composed: the scene; ``datas``: its state in every environment.
+            composed: the scene; ``models``, ``datas``: MuJoCo's of every environment.
             level: how finely pads are cut, one of ``PADS``.
             coupling: one of ``COUPLINGS``.
             device: of the solver.
@@ -83,7 +85,7 @@ class SoftPads:
             SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
-        self.composed, self.model = composed, composed.model
+        self.composed, self.model, self._models = composed, composed.model, models
         scene = composed.scene
         pads = [
             ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level))
@@ -229,15 +231,15 @@ class SoftPads:
 
     def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
         """One step of MuJoCo; returns whether the state is still sound."""
-        mujoco.mj_step1(self.model, data)
+        mujoco.mj_step1(self._models[b], data)
         drive([b])
         if self._coupling is not None:
             self._coupling.apply(data, b)
-        mujoco.mj_step2(self.model, data)
+        mujoco.mj_step2(self._models[b], data)
         if lost([data])[0]:
             return False
-        mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_kinematics(self._models[b], data)
+        mujoco.mj_comPos(self._models[b], data)
         return True
 
     def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -283,7 +285,7 @@ class SoftPads:
                 datas[b].mocap_quat[body.mocap] = quaternion(at[b, :3, :3])
         if self._own:
             for b in envs:
-                mujoco.mj_kinematics(self.model, datas[b])
+                mujoco.mj_kinematics(self._models[b], datas[b])
 
     def _inside(
         self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False

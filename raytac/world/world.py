@@ -31,18 +31,24 @@ from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.state import BatchController, Control, Drive, WorldState
+from raytac.world.variation import EnvironmentModels, Variation
 
 if TYPE_CHECKING:
     from raytac.physics.soft_scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
-__all__ = ["TactileWorld"]
+__all__ = ["TactileWorld", "chosen_physics"]
 
 _OVERLAP = 1e-4
 """How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
 
 _BEYOND = 1e-2
 """How far joints may start beyond their range [rad or m]: MuJoCo's limits give way, and a start may be recorded at one (a guess)."""
+
+
+def chosen_physics(scene: TaskScene, physics: str | None, pad: str | None) -> str:
+    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
+    return physics or ("ipc" if pad is not None else scene.physics or "rigid")
 
 
 class TactileWorld:
@@ -58,7 +64,8 @@ class TactileWorld:
     Attributes:
         scene: the task scene.
         physics: ``rigid`` or ``ipc``.
-        model, data: MuJoCo's model, and its state in every environment.
+        model, data: MuJoCo's model of the scene, and its state in every environment.
+        models: the model of every environment: the scene's own, but where ``reset`` was told of a variation.
         arm: the joints that move the robot's site; None without.
         composed: names and indices of what the scene is made of.
     """
@@ -101,7 +108,7 @@ class TactileWorld:
         if coupling is not None and coupling not in COUPLINGS:
             raise InputError("coupling", value=coupling, rule="must be a known coupling", choices=COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
-        self.physics = physics or ("ipc" if pad is not None else self.scene.physics or "rigid")
+        self.physics = chosen_physics(self.scene, physics, pad)
         self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]
         self.coupling = coupling or self.scene.coupling
         self.num_envs, self.device, self.seed = num_envs, device, seed
@@ -119,6 +126,7 @@ class TactileWorld:
         self.composed = compose(self.scene, self.physics)
         self.model = self.composed.model
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
         self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
         self._failed = np.zeros(num_envs, bool)
@@ -128,12 +136,13 @@ class TactileWorld:
 
     def _make_pads(self) -> RigidPads | SoftPads:
         if self.physics == "rigid":
-            return RigidPads(self.composed, self.num_envs)
+            return RigidPads(self.composed, self.models, self.num_envs)
         check_solver("physics='ipc'")
         from raytac.world.soft_pads import SoftPads
 
         return SoftPads(
             self.composed,
+            self.models,
             self.data,
             level=self.pad,
             coupling=self.coupling,
@@ -164,6 +173,7 @@ class TactileWorld:
         *,
         joints: np.ndarray | None = None,
         bodies: Mapping[str, np.ndarray] | None = None,
+        variation: Variation | None = None,
     ) -> WorldState:
         """Put environments (a mask (B,), a list, or None for all) back to the start: joints, bodies, pads, markers and time.
 
@@ -171,10 +181,12 @@ class TactileWorld:
             envs: n environments.
             joints: where the arm's joints start instead (n, joints) [rad or m].
             bodies: where free bodies start instead: name to ``world_from_body`` (n, 4, 4).
+            variation: what these environments have otherwise than the scene from now on; None leaves them as they are, and
+                ``Variation()`` makes them the scene's again.
 
         Raises:
-            InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid, or joints out of
-                their range.
+            InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid, joints out of
+                their range, or a variation that cannot be (see ``EnvironmentModels.check``).
             OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
                 pad a start may be one in contact, as it was recorded, so overlap is not looked for.
         """
@@ -188,23 +200,30 @@ class TactileWorld:
         if joints is not None:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
             self._check_joints(joints, chosen)
-        if joints is None and not places:
+        if variation is not None:
+            self.models.check(variation, len(chosen), rigid=self.physics == "rigid")
+        if joints is None and not places and variation is None and not self.models.differ(chosen):
             self._start_over(chosen)
             self._pads.reset(chosen, self.data)
         else:
-            self._start_elsewhere(chosen, joints, places)
+            self._start_elsewhere(chosen, joints, places, variation)
         for sensor in self._sensors.values():
             if sensor.markers is not None:
                 sensor.reset_markers(chosen)
         return self.state()
 
-    def _start_elsewhere(self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray]) -> None:
-        """A reset to starts that are given; as before if they cannot be."""
-        before, failed = [copy(self.data[b]) for b in envs], self._failed.copy()
+    def _start_elsewhere(
+        self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
+    ) -> None:
+        """A reset to starts or with models that are given; as before if they cannot be."""
+        before, failed, models = [copy(self.data[b]) for b in envs], self._failed.copy(), self.models.snapshot()
+        if variation is not None:
+            self.models.vary(envs, variation)
         self._start_over(envs, joints, bodies)
         try:
             self._pads.reset(envs, self.data, bodies)
         except OverlapError:
+            self.models.restore(models)
             for b, data in zip(envs, before, strict=True):
                 mujoco.mj_copyData(self.data[b], self.model, data)
             self._failed[:] = failed
@@ -236,7 +255,7 @@ class TactileWorld:
         """MuJoCo's part of a reset."""
         for row, b in enumerate(envs):
             data = self.data[b]
-            mujoco.mj_resetData(self.model, data)
+            mujoco.mj_resetData(self.models[b], data)
             data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
             if joints is not None and self.arm is not None:
                 data.qpos[self.arm.qpos] = joints[row]
@@ -245,7 +264,7 @@ class TactileWorld:
                 if body.is_free:  # the solver's are mirrored when it has its own
                     data.qpos[body.qpos : body.qpos + 3] = at[row, :3, 3]
                     data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(at[row, :3, :3])
-            mujoco.mj_forward(self.model, data)
+            mujoco.mj_forward(self.models[b], data)
             self._failed[b] = False
 
     def step(self, control: Control | None = None) -> WorldState:

@@ -16,6 +16,7 @@ from raytac.io.metrics import read_metrics
 
 pytest.importorskip("stable_baselines3")
 
+from experiments import training_curves
 from experiments.play import Args, main
 from experiments.ppo_learner import Checkpoint, Learner, Recipe
 from experiments.training_curves import draw_curves
@@ -73,6 +74,26 @@ def test_curves_are_drawn_from_runs_that_differ_in_length(tmp_path: Path) -> Non
             rows = "".join(f"{n},{n / 30},{n}\n" for n in steps)
             (folder / "evaluation.csv").write_text("steps,success,return\n" + rows, encoding="utf-8")
     assert draw_curves(tmp_path).stat().st_size > 1000
+
+
+def test_trainings_of_several_folders_are_one_figure(tmp_path: Path) -> None:
+    for name, kind, seed in (("a_0", "task", 0), ("a_1", "task", 1), ("b_0", "none", 0), ("again", "none", 0)):
+        folder = tmp_path / name / kind / f"seed{seed}"
+        folder.mkdir(parents=True)
+        (folder / "evaluation.csv").write_text("steps,success,return\n10,0.5,1\n20,1.0,2\n", encoding="utf-8")
+    out = tmp_path / "curves.png"
+    draw = training_curves.Args((f"Both={tmp_path}/a_?,{tmp_path}/b_0", f"Felt={tmp_path}/a_0"), out=out)
+    assert training_curves.main(draw) == out and out.stat().st_size > 1000
+    assert training_curves.main(training_curves.Args((str(tmp_path / "a_0"),))) == tmp_path / "a_0" / "curves.png"
+    for panels, text in (
+        ((f"x={tmp_path}/b_0,{tmp_path}/again",), "none/seed0"),
+        ((f"x={tmp_path}/c_*",), "must match"),
+        (("x=",), "TITLE=FOLDER"),
+        ((f"x={tmp_path}/a_0", f"x={tmp_path}/a_1"), "title of its own"),
+        ((), "must name"),
+    ):
+        with pytest.raises(InputError, match=text):
+            training_curves.main(training_curves.Args(panels, out=out))
 
 
 _SCRIPT = """

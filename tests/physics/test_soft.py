@@ -248,6 +248,18 @@ def test_a_lowered_force_keeps_coulombs_law(kind):
     assert (np.diff(dragged) < 0.0).all() and (np.diff(depths) < 0.0).all()
 
 
+@pytest.mark.parametrize("make", [soft, lambda scene: RigidPad(SENSOR, scene, pitch=PITCH)], ids=["soft", "rigid"])
+def test_a_force_after_a_depth_begins_from_what_is_borne_and_forgets_no_shear(make):
+    scene = press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0)), indent(force=0.7))
+    pad = make(scene)
+    states = list(pad.run(4))
+    sheared, eased = states[8], states[9:]
+    assert sheared.normal_force[0] > 0.75
+    way = [sheared.normal_force[0], *(state.normal_force[0] for state in eased)]
+    assert (np.diff(way) < 0.0).all() and way[-1] == pytest.approx(0.7, rel=1e-3)  # and never off the pad in between
+    assert eased[-1].shear_force[0, 0] > 0.6 * sheared.shear_force[0, 0] > 0.1
+
+
 def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
     """The contact's stiffness is known from the states before: six steps of the solver a state at most, on the mean."""
     steps = []

@@ -20,7 +20,10 @@ class StillSession:
     title = "still · nothing"
     units_per_metre = 100.0
     camera = CameraPlace((0.02, -0.03, 0.02), (0.0, 0.0, 0.0))
-    controls = (Control("reach", "reach [mm]", 0.0, 100.0, 0.5), Control("push", "push [N]", 0.0, 10.0, 0.5, instead_of="reach"))
+    controls: tuple[Control, ...] = (
+        Control("reach", "reach [mm]", 0.0, 100.0, 0.5),
+        Control("push", "push [N]", 0.0, 10.0, 0.5, instead_of="reach"),
+    )
     solids = (Solid("block", np.eye(3) * 1e-2, np.array([[0, 1, 2]]), (200, 100, 50), hides_pads=True),)
     lines = (Lines("axis", np.zeros((1, 2, 3)), (10, 20, 30)),)
     pads = (Pad("left", np.array([[0, 1, 2]]), ("indentation", "pressure")),)

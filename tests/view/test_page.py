@@ -11,6 +11,7 @@ import pytest
 
 from raytac.errors import BackendError, InputError
 from raytac.view import viewer as viewer_module
+from raytac.view.session import reaching
 from raytac.view.viewer import Viewer
 from tests.view.page_client import PageClient
 from tests.view.still import LENGTH, StillSession
@@ -76,6 +77,23 @@ def test_a_slider_drives_and_the_other_clients_see_it(open_page):
     second.set("push [N]", 2.0)
     first.until(lambda: at(first, 2.0), "the other client's target")
     second.close()
+
+
+def test_a_slider_is_as_long_as_its_control_is_now(open_page):
+    session = StillSession()
+    _, client = open_page(session)
+    slider = next(e for e in client.elements.values() if e.get("label") == "push [N]")
+    assert slider["max"] == 10.0
+    session.controls = reaching(session.controls, {"reach": -3.0, "push": 27.1})
+    assert [(c.low, c.high) for c in session.controls] == [(-5.0, 100.0), (0.0, 50.0)]
+    client.press("Step")
+    client.until(lambda: slider["max"] == 50.0, "the longer slider")
+
+
+def test_the_sign_of_a_force_is_explained_where_there_is_one(open_page):
+    _, client = open_page(StillSession())
+    signs = client.until(lambda: next((e for e in client.elements.values() if "z points out" in str(e.get("content"))), None))
+    assert signs["visible"]
 
 
 def test_an_error_is_shown_until_the_next_command(open_page):

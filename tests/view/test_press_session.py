@@ -39,6 +39,10 @@ def driven(press: PressSession, **targets: float) -> Snapshot:
     raise AssertionError("the target is never reached")
 
 
+def limits(press: PressSession, name: str) -> tuple[float, float]:
+    return next((control.low, control.high) for control in press.controls if control.name == name)
+
+
 @pytest.fixture(scope="module")
 def rigid() -> PressSession:
     return session()
@@ -176,6 +180,39 @@ def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
     assert "cells across" in shot.warning
     shot = driven(press, shear_x=0.1)
     assert wrench(shot)[0] > 0.01
+    shot = driven(press, force=0.5)
+    assert wrench(shot)[2] == pytest.approx(-0.5, rel=1e-3) and shot.controls["force"] == 0.5
+    assert wrench(shot)[0] > 0.01  # eased, not lifted off and pressed anew
+
+
+@pytest.mark.parametrize("kind", ["torus", "pins"])
+def test_the_mesh_of_a_simulated_pad_lies_on_the_coat_that_is_drawn(kind):
+    """Above it everywhere, so that no line is broken, by no more than is needed for that."""
+    from matplotlib.tri import LinearTriInterpolator, Triangulation
+
+    press = session(load_press(kind), physics="ipc", pad="coarse", pitch=0.1e-3)
+    shot = driven(press, depth=0.5)
+    x, y, z = shot.pads[SENSOR.name].vertices.T
+    drawn = LinearTriInterpolator(Triangulation(1e3 * x, 1e3 * y, press.pads[0].faces), 1e3 * z)
+    lines = 1e3 * shot.reshaped["coat_mesh"]
+    for share in (0.0, 0.25, 0.5, 0.75):
+        points = lines[:, 0] + share * (lines[:, 1] - lines[:, 0])
+        above = np.ma.filled(points[:, 2] - drawn(points[:, 0], points[:, 1]), np.nan)
+        assert np.isfinite(above).mean() > 0.8  # the rest is the rim, and what came out over it
+        assert (above[np.isfinite(above)] > 0.0).mean() > 0.995 and np.nanmedian(above) == pytest.approx(0.02, abs=1e-3)
+
+
+def test_no_slider_shows_less_than_there_is():
+    press = session(load_press("torus"))
+    assert limits(press, "force") == (0.0, 20.0)
+    shot = driven(press, depth=1.5)
+    force = -wrench(shot)[2]
+    assert 20.0 < force == pytest.approx(shot.controls["force"], rel=1e-3)
+    assert force < limits(press, "force")[1] == 50.0
+    shot = driven(press, force=25.0)  # what was reached may be asked for
+    assert wrench(shot)[2] == pytest.approx(-25.0, rel=1e-3)
+    press.reset()
+    assert limits(press, "force") == (0.0, 20.0)
 
 
 def test_an_object_that_lies_free_is_played_and_not_driven():
