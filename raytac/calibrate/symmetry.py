@@ -50,7 +50,9 @@ def side_ties(p: LightParameters, size: int) -> Ties:
         offsets.append(offset / sigma)
 
     for layer in range(len(CHANNELS)):
-        own = np.flatnonzero(p.layer == layer)
+        own = [int(led) for led in np.flatnonzero(p.layer == layer)]
+        if not own:
+            continue
         middle = p.leds[own, :2].mean(0)
         if np.hypot(*middle) > LEAST:
             out = middle / np.hypot(*middle)
@@ -61,12 +63,16 @@ def side_ties(p: LightParameters, size: int) -> Ties:
                 a, b = own[k], own[nearest[k]]
                 if a > b:
                     continue
-                tie(PLACE, 0.0, *((6 * led + k, across[k]) for led in (a, b) for k in (0, 1)))
+                tie(PLACE, 0.0, *((6 * led + axis, float(across[axis])) for led in (a, b) for axis in (0, 1)))
                 # Mirrored, an azimuth A becomes 2 φ − A with φ that of ``out``, up to whole turns.
-                turn, total = 2 * np.arctan2(out[1], out[0]), p.leds[a, 3] + p.leds[b, 3]
+                turn, total = 2 * float(np.arctan2(out[1], out[0])), float(p.leds[a, 3] + p.leds[b, 3])
                 tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (6 * a + 3, 1), (6 * b + 3, 1))
                 if a < b:
-                    tie(PLACE, 0.0, *((6 * led + k, sign * out[k]) for led, sign in ((a, 1), (b, -1)) for k in (0, 1)))
+                    tie(
+                        PLACE,
+                        0.0,
+                        *((6 * led + axis, float(sign * out[axis])) for led, sign in ((a, 1), (b, -1)) for axis in (0, 1)),
+                    )
                     tie(PLACE, 0.0, (6 * a + 2, 1), (6 * b + 2, -1))
                     tie(AIM, 0.0, (6 * a + 4, 1), (6 * b + 4, -1))
         for a, b in itertools.pairwise(own):
