@@ -6,7 +6,8 @@ An edge (the cube of the scene "edge", along x, 0.8 mm deep) and a bar 3 mm wide
 Mini's pad. Both are the same all along x in the middle, so that a pad can be refined across y alone until nothing changes: the truth
 is the vertices of such a mesh, with cells of ``--cell-um`` at the sharp line (nothing is interpolated or corrected).
 
-``--shapes ball``: a ball (4 mm) pressed lightly, to 0.33 N and to 0.3 mm, and what markers see of it. The truth is a pad with cells of four
+``--shapes ball``: a ball (4 mm) pressed lightly, to 0.33 N and to 0.3 mm, and 0.5 mm deep and then sheared by 0.4 mm or twisted by 10°, and
+what markers see of it. The truth is a pad with cells of four
 times ``--cell-um`` in the middle, its solver's vertices; markers are 285 points on a grid of 1 mm that ride on the coat.
 ``ball.<load>.<level>.markers_um``, ``markers_most_um``: mean and greatest sideways distance of a marker from the truth;
 ``mesh_markers_um`` …: the same on the solver's vertices; ``force_n``, ``contact_mm2``; with ``truth`` for a level: its own motion.
@@ -43,7 +44,12 @@ from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 SHAPES = {"edge": 0.0, "bar": 1.5e-3}
 """y of the sharp line [m]."""
 BALL = "ball"
-LIGHT = {"force": StageSpec("indent", force=0.33), "depth": StageSpec("indent", depth=0.3e-3)}
+LOADS = {
+    "force": (StageSpec("indent", force=0.33),),
+    "depth": (StageSpec("indent", depth=0.3e-3),),
+    "shear": (StageSpec("indent", depth=0.5e-3), StageSpec("shear", shear=(0.4e-3, 0.0))),
+    "twist": (StageSpec("indent", depth=0.5e-3), StageSpec("twist", twist=np.deg2rad(10.0))),
+}
 RANGES = {"near": (0.02e-3, 1e-3), "ring": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
 _GROWTH, _DOWN = 0.14, 0.25
 """How much a cell grows for each unit of distance from the sharp line, across and downwards."""
@@ -109,16 +115,16 @@ def pressed(spec: SensorSpec, shape: str, mesh: PadMesh) -> tuple[Section, float
 
 
 def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, Metric]:
-    """Markers under a ball pressed lightly, off those of a pad with cells of ``cell`` [m] in the middle."""
+    """Markers under a ball that is pressed, sheared or twisted, off those of a pad with cells of ``cell`` [m] in the middle."""
     target = ObjectSpec("sphere", {"radius": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05)
     probes = np.stack(np.meshgrid(np.arange(-9, 10) * 1e-3, np.arange(-7, 8) * 1e-3), axis=-1).reshape(-1, 2)
     truth_mesh = pad_mesh(spec.gelpad, PadLevel(2.9 * cell, max(round(2.2e-3 / cell), 3), 7.0, 5.0, cell / 25.0))
     metrics: dict[str, Metric] = {}
-    for load, stage in LIGHT.items():
+    for load, stages in LOADS.items():
         truth = np.zeros(0)
         for level in ("truth", *levels):
             mesh = truth_mesh if level == "truth" else pad_mesh(spec.gelpad, level)
-            pad = SoftPad(spec, PressScene(BALL, target, (stage,)), pitch=0.1e-3, pad=mesh)
+            pad = SoftPad(spec, PressScene(BALL, target, stages), pitch=0.1e-3, pad=mesh)
             state = pad.peak(pad.run())
             surface, reading = pad.surface(state), state.reading
             assert reading is not None and surface.coat is not None

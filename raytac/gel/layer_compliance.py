@@ -6,7 +6,7 @@ import numpy as np
 
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["CosineSeries", "layer_compliance", "layer_spread"]
+__all__ = ["CosineSeries", "layer_compliance", "layer_shear", "layer_spread"]
 
 _DEEP = 20.0
 """Wave number times thickness beyond which a layer is a half-space to rounding."""
@@ -38,6 +38,18 @@ def layer_spread(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
     return 2.0 * (1.0 + nu) / young * (α**2 - (1.0 - 2.0 * nu) * κ * np.sinh(α) ** 2) / determinant * reach
 
 
+def layer_shear(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Sideways displacement over traction [m/Pa] of the face of that layer under a wave of traction, same shape twice.
+
+    First along the wave vector, 2 (1 − ν²)/(E k) · (K sinh 2α + 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same plane strain as
+    ``layer_compliance``; then across it, where gel is only sheared: 2 (1 + ν)/(E k) · tanh α. Both tend to h/G for long waves.
+    """
+    young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
+    reach, α, κ, determinant = _layer(wave_number, gelpad)
+    along = 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) + 2.0 * α) / determinant * reach
+    return along, 2.0 * (1.0 + nu) / young * np.tanh(α) * reach
+
+
 def _layer(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """1/k, α = k h within bounds, K, and what both numerators are divided by."""
     nu, thickness = gelpad.poisson_ratio, gelpad.thickness
@@ -60,6 +72,8 @@ class CosineSeries:
         order = np.arange(n)
         self.analysis = 2.0 * half[:, None] * half * np.cos(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """What takes values at the nodes to the amplitudes, shape (n, n)."""
+        self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
+        """The same for sines, which are 0 at the ends, shape (n, n)."""
         self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
         """Amplitudes of hat functions on the nodes over those of the cosines that pass through the same values, shape (n,)."""
 

@@ -5,36 +5,42 @@ from __future__ import annotations
 import numpy as np
 
 from raytac.gel.fine_contact import FineContact, FineShape
+from raytac.gel.grip import Grip, RigidMotion
 from raytac.gel.layer_compliance import layer_compliance, layer_spread
 from raytac.gel.product import product, sandwich
+from raytac.gel.sampled import sampled
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["SkinMotion", "sampled"]
+__all__ = ["SkinMotion"]
 
 _SPACING = 0.2e-3
 """Spacing of the places at which the layer's motion is computed [m]; shorter waves than twice that hardly move the skin sideways."""
 
 
 class SkinMotion:
-    """Takes the mesh's own way of spreading under normal pressure out of a coat's motion, one pad at a time.
+    """Takes the mesh's own way of spreading and of being dragged out of a coat's motion, one pad at a time.
 
-    Nearly incompressible gel gives way sideways, and a mesh whose cells are as wide as the contact pushes it out far too much: E, what the
-    mesh does sideways under the normal forces of ``FineContact``, is to be exchanged for L, the layer's own response to the pressure on
-    the fine grid, as the height is. But what touches sticks: friction has let only a share θ of that spread happen, of which the rest of
-    the solver's motion u, under shear and twist, says nothing. So the skin goes
+    Nearly incompressible gel gives way sideways under pressure, and a mesh whose cells are as wide as the contact pushes it out far too
+    much: E, what the mesh does sideways under the normal forces of ``FineContact``, is to be exchanged for L, the layer's own response to
+    the pressure on the fine grid, as the height is. But what touches sticks: friction has let only a share θ of that spread happen,
+    of which the rest of the solver's motion u, under shear and twist, says nothing. So the skin goes
 
         u − θ (E − L),   θ = ⟨u, E⟩ / ⟨E, E⟩ within [0, 1],
 
     the products over the vertices in contact, less their rigid motions (u has the object's shear and twist besides). Without friction u is
     E but for large strain, and θ is 1, as where only one vertex touches; what sticks from the first has θ = 0. The finer the mesh, the
     smaller is E − L. One θ holds for all of a pad's contact.
+
+    What is left in contact, u − θ E, is friction's doing, and how far the skin around follows it is exchanged by ``Grip``.
     """
 
     def __init__(self, contact: FineContact, gelpad: GelpadSpec, compliance: np.ndarray, continued: np.ndarray) -> None:
-        """``compliance``, ``continued`` [m/N], (3, V, V): as for ``FineContact``, with displacements along x, y and z."""
+        """``compliance`` [m/N], (3, V, V): displacements along x, y, z of the vertices over a force along z on each; ``continued``,
+        (3, 3, V, V): over a force along x, y, z (first axis) if the sides of the pad may not move outwards."""
+        self._grip = Grip(contact, gelpad, continued[:2, :2])
         self._contact = contact
         self._mesh = compliance[:2].astype(np.float32)
-        self._sides = (compliance[:2] - continued[:2]).astype(np.float32)
+        self._sides = (compliance[:2] - continued[2, :2]).astype(np.float32)
         self._x, self._y = (t[:: max(round(_SPACING / (t[1] - t[0])), 1)] for t in (contact.x, contact.y))
         series_x, series_y = contact.series_x, contact.series_y
         self._some = np.ix_(*(s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x))))
@@ -46,12 +52,19 @@ class SkinMotion:
         self._cos_x, self._sin_x = (f(self._x)[:, :columns].T.astype(np.float32) for f in (series_x.synthesis, series_x.sines))
         self._cos_y, self._sin_y = (f(self._y)[:, :rows].astype(np.float32) for f in (series_y.synthesis, series_y.sines))
 
-    def sideways(self, shape: FineShape, moved: np.ndarray, touching: np.ndarray) -> np.ndarray:
-        """Displacement along x, y [m], (V, 2), of vertices that went ``moved`` (V, 3) in the solver; ``touching`` (V,): in contact."""
-        rest = self._contact.surface.mesh.rest
+    def sideways(self, shape: FineShape, moved: np.ndarray, load: np.ndarray, friction: float | None = None) -> np.ndarray:
+        """Displacement along x, y [m], (V, 2), of vertices that went ``moved`` (V, 3) in the solver.
+
+        ``load``: normal force on each [N], (V,); ``friction``: μ, None or 0 where what it does is to be left as the mesh has it.
+        """
+        rest, touching = self._contact.surface.mesh.rest, self._contact.touching(load)
         mesh = product(self._mesh.reshape(-1, len(rest)), shape.held[:, None]).reshape(2, -1).T
         layer = self._layer(shape, rest[:, 0] + moved[:, 0], rest[:, 1] + moved[:, 1])
-        return moved[:, :2] - _share(mesh[touching], moved[touching, :2], rest[touching, :2]) * (mesh - layer)
+        share = _share(mesh[touching], moved[touching, :2], rest[touching, :2])
+        went = moved[:, :2] - share * (mesh - layer)
+        if friction:
+            went += self._grip.exchange(shape, moved[:, :2] - share * mesh, touching, load, friction)
+        return went
 
     def _layer(self, shape: FineShape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Motion of the layer, whose sides are the pad's, under the fine grid's pressure [m], (V, 2)."""
@@ -69,6 +82,7 @@ class SkinMotion:
 
 def _share(pattern: np.ndarray, moved: np.ndarray, place: np.ndarray) -> float:
     """How much of a ``pattern`` (T, 2) there is in what ``moved`` (T, 2), besides a rigid motion of the ``place`` (T, 2); in [0, 1]."""
+    moved = moved - RigidMotion.of(moved, place, np.ones(len(place))).at(place)
     arm = place - place.mean(axis=0)
     turn = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
     turn /= max(float(np.linalg.norm(turn)), 1e-12)
@@ -80,15 +94,3 @@ def _share(pattern: np.ndarray, moved: np.ndarray, place: np.ndarray) -> float:
     pattern, moved = without_rigid(pattern), without_rigid(moved)
     size = float((pattern**2).sum())
     return float(np.clip((pattern * moved).sum() / size, 0.0, 1.0)) if size > 0.0 else 1.0
-
-
-def sampled(field: np.ndarray, x: np.ndarray, y: np.ndarray, at_x: np.ndarray, at_y: np.ndarray) -> np.ndarray:
-    """Fields (…, Ny, Nx) over even lines ``x``, ``y`` at places (V,), bilinear, carried on beyond the edges as they are there; (…, V)."""
-    parts = []
-    for line, at in ((x, at_x), (y, at_y)):
-        t = np.clip((at - line[0]) / (line[1] - line[0]), 0.0, len(line) - 1.0)
-        first = np.minimum(t.astype(int), len(line) - 2)
-        parts += [first, t - first]
-    i, a, j, b = parts
-    near, far = ((1.0 - a) * field[..., row, i] + a * field[..., row, i + 1] for row in (j, j + 1))
-    return (1.0 - b) * near + b * far

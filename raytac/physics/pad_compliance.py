@@ -18,10 +18,10 @@ _SAME = 1e-9
 """Relative difference of two stiffnesses that rounding explains."""
 
 
-def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False) -> np.ndarray:
-    """Displacement along x, y, z of each coat vertex [m] that 1 N along z on each gives, shape (3, V, V); small strain, float64.
+def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False, along: tuple[int, ...] = (2,)) -> np.ndarray:
+    """Displacement along x, y, z of each coat vertex [m] that 1 N on each gives, shape (A, 3, V, V); small strain, float64.
 
-    Entry (c, i, j): component c of vertex i, force on vertex j; the last of the three matrices is symmetric.
+    Entry (a, c, i, j): component c of vertex i, force on vertex j along the axis ``along[a]`` (0, 1, 2: x, y, z).
 
     Linear tetrahedra with the gelpad's E and ν, as the solver's neo-Hookean gel has them at small strain, held where the mesh is
     bonded. ``rollers``: the sides of the pad do not move outwards either (and may slide), as if the pad went on as its own mirror
@@ -37,12 +37,13 @@ def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False)
             at = mesh.tets.vertices[:, axis]
             held[(at <= at.min() + _SAME_PLACE) | (at >= at.max() - _SAME_PLACE), axis] = True
     layer = _layers(mesh)
-    found = np.zeros((3, *(len(mesh.coat_vertices),) * 2))
+    found = np.zeros((len(along), 3, *(len(mesh.coat_vertices),) * 2))
     on_coat = np.full(len(mesh.tets.vertices), -1)
     on_coat[mesh.coat_vertices] = np.arange(len(mesh.coat_vertices))
     for basis in _halves(mesh, stiffness, held):
-        found += _condensed(stiffness, basis, layer, on_coat)
-    found[2] = 0.5 * (found[2] + found[2].T)
+        found += _condensed(stiffness, basis, layer, on_coat, along)
+    for one, axis in zip(found, along, strict=True):
+        one[axis] = 0.5 * (one[axis] + one[axis].T)
     return found
 
 
@@ -149,8 +150,8 @@ def _mirror_image(vertices: np.ndarray, axis: int) -> np.ndarray | None:
     return image
 
 
-def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: np.ndarray) -> np.ndarray:
-    """Share of one half in the coat's compliance, (3, V, V)."""
+def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: np.ndarray, along: tuple[int, ...]) -> np.ndarray:
+    """Share of one half in the coat's compliance, (A, 3, V, V)."""
     by_row = np.argsort(basis.row, kind="stable")
     row, column, value = basis.row[by_row], basis.column[by_row], basis.value[by_row]
     n = stiffness.shape[0]
@@ -184,5 +185,5 @@ def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: n
     for axis in range(3):
         top = np.flatnonzero((column_of >= 0) & (np.arange(n) % 3 == axis) & (on_coat[np.arange(n) // 3] >= 0))
         spread[axis, on_coat[top // 3], place[column_of[top]]] = weight[top]
-    answer = inverse @ spread[2].T
-    return np.stack([along @ answer for along in spread])
+    answers = [inverse @ spread[axis].T for axis in along]
+    return np.stack([[side @ answer for side in spread] for answer in answers])

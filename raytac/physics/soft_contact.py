@@ -133,4 +133,4 @@ class SoftContact:
         free = not self.body.is_driven
         pose = inverse(self._world_from_pad) @ self.scene.pose(OBJECT) if free else driven
         surface = self.scene.skin(OBJECT, PAD) if self.body.is_soft else None
-        return SeenPad(self.scene.coat(PAD), self.forces(), (SeenObject(self.body.parts, pose, surface),))
+        return SeenPad(self.scene.coat(PAD), self.forces(), (SeenObject(self.body.parts, pose, surface, None, self._friction),))

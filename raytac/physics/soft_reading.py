@@ -15,7 +15,8 @@ from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid, rest_height
 from raytac.gel.part import Part, mesh_part
 from raytac.gel.product import sandwich
-from raytac.gel.skin_motion import SkinMotion, sampled
+from raytac.gel.sampled import sampled
+from raytac.gel.skin_motion import SkinMotion
 from raytac.gel.standoff import StandOff
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.physics.pad_compliance import coat_compliance
@@ -51,6 +52,8 @@ class SeenObject:
     """Of a soft object: vertices (B, n, 3) [m] and faces as they are now."""
     near: np.ndarray | None = None
     """Whether it counts, (B,) bool; None: always. One that does not touch may lie anywhere, also behind the pad."""
+    friction: float | None = None
+    """Coulomb's coefficient on the pad; None: not known, and the skin under shear and twist is shown as the mesh has it."""
 
     def counts(self, b: int) -> bool:
         return self.near is None or bool(self.near[b])
@@ -155,7 +158,7 @@ class SoftReader:
             same = self._fine_pad is self.grid
             under = undersides[b] = near if same else self._underside(seen, b, self.grid, kept, height[b])
             height[b], touched[b] = to_grid.lay(self._rest + to_grid.rise(shape), shape, under)
-            coat[b, :, :2] = rest[:, :2] + skin.sideways(shape, vertices[b] - rest, fine.touching(load))
+            coat[b, :, :2] = rest[:, :2] + skin.sideways(shape, vertices[b] - rest, load, _friction(seen, b))
             coat[b, :, 2] = self._on_surface(height[b], coat[b, :, :2])
             centre[b] = load @ vertices[b, :, :2] / load.sum()
         self._tell(residual)
@@ -202,8 +205,9 @@ class SoftReader:
     def _fine_contact(self) -> tuple[FineContact, FineGrid, SkinMotion]:
         """What finds the contact and takes it to grid and vertices; made at the first contact: the mesh's compliance takes a while."""
         if self._fine is None:
-            found, continued = (coat_compliance(self.mesh, self._gelpad, rollers=rollers) for rollers in (False, True))
-            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found[2], continued[2])
+            found = coat_compliance(self.mesh, self._gelpad)[0]
+            continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
+            fine = FineContact(self._surface, self._gelpad, self._fine_pad.x, self._fine_pad.y, found[2], continued[2, 2])
             motion = SkinMotion(fine, self._gelpad, found, continued)
             self._fine = fine, FineGrid(fine, self.grid.x, self.grid.y), motion
         return self._fine
@@ -222,6 +226,12 @@ class SoftReader:
         if len(seen.objects) > 1 and smooth is not None:
             under[under < smooth - _BEHIND] = np.inf
         return under
+
+
+def _friction(seen: SeenPad, b: int) -> float | None:
+    """Coulomb's coefficient if one rigid object alone touches pad ``b``; of several, each of which may drag the skin elsewhere, none."""
+    things = [thing for thing in seen.objects if thing.counts(b)]
+    return things[0].friction if len(things) == 1 and things[0].surface is None else None
 
 
 def _touched_pose(seen: SeenPad, poses: tuple[np.ndarray, ...]) -> np.ndarray | None:

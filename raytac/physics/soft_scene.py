@@ -115,7 +115,7 @@ class SoftScene:
         gels = [
             self._at_start(pad_body(pad.mesh, pad.sensor.gelpad, pad.name), self._start[0][0, k]) for k, pad in enumerate(pads)
         ]
-        mu = self._cast.friction() | dict(friction or {})
+        self._friction = mu = self._cast.friction() | dict(friction or {})
         try:
             self.world = ipc.World([*gels, *placed], self.settings, self.num_envs, device, mu, ignored)
             if settings is None:
@@ -301,10 +301,14 @@ class SoftScene:
         for name, near in self.world.touching(pad).items():
             body = self.bodies.get(name)
             if body is not None and not body.is_soft:
-                objects.append(SeenObject(body.parts, frame @ self.pose(name), None, near))
+                objects.append(SeenObject(body.parts, frame @ self.pose(name), None, near, self._friction_between(pad, name)))
             elif name != pad:
                 objects.append(SeenObject((), frame @ self.pose(name), self.skin(name, pad), near))
         return SeenPad(self.coat(pad), self.coat_forces(pad), tuple(objects))
+
+    def _friction_between(self, pad: str, body: str) -> float:
+        """μ as the solver has it, which takes the last where a pair was given both ways round."""
+        return [mu for pair, mu in self._friction.items() if set(pair) == {pad, body}][-1]
 
     # --- state -----------------------------------------------------------------------------------------------------------------
 

@@ -11,7 +11,8 @@ from raytac.gel.coat_surface import CoatSurface
 from raytac.gel.fine_contact import FineContact, FineGrid, _evening
 from raytac.gel.layer_compliance import CosineSeries, layer_compliance, layer_spread
 from raytac.gel.pad import make_grid
-from raytac.gel.skin_motion import SkinMotion, sampled
+from raytac.gel.sampled import sampled
+from raytac.gel.skin_motion import SkinMotion
 from raytac.physics.pad_compliance import coat_compliance
 from raytac.physics.soft_mesh import PadLevel, pad_mesh
 from raytac.specs import load_sensor
@@ -41,13 +42,14 @@ def test_cosines_pass_through_their_nodes():
     assert abs(slope[0]) < 1e-2 * np.abs(values).max() / 0.5e-3
 
 
+@pytest.mark.parametrize("pushed", [0, 1, 2])
 @pytest.mark.parametrize("rollers", [False, True])
-def test_the_coats_compliance_is_that_of_the_whole_stiffness(rollers):
+def test_the_coats_compliance_is_that_of_the_whole_stiffness(rollers, pushed):
     """Against a dense solve of the same stiffness: eliminating layers, and halves of a symmetric pad, loses nothing."""
     from raytac.physics.pad_compliance import _stiffness
 
-    found = coat_compliance(MESH, GELPAD, rollers=rollers)
-    assert np.abs(found[2] - found[2].T).max() == 0.0
+    found = coat_compliance(MESH, GELPAD, rollers=rollers, along=(0, pushed))[1]
+    assert np.abs(found[pushed] - found[pushed].T).max() == 0.0
     sparse = _stiffness(MESH.tets.vertices, MESH.tets.tets, GELPAD)
     dense = np.zeros(sparse.shape)
     dense[sparse.row, sparse.column] = sparse.value
@@ -58,7 +60,7 @@ def test_the_coats_compliance_is_that_of_the_whole_stiffness(rollers):
             held[np.abs(MESH.tets.vertices[:, axis]) > 0.5 * GELPAD.size[axis] - 1e-9, axis] = True
     free = np.flatnonzero(~held.ravel())
     force = np.zeros((len(dense), len(MESH.coat_vertices)))
-    force[3 * MESH.coat_vertices + 2, np.arange(len(MESH.coat_vertices))] = 1.0
+    force[3 * MESH.coat_vertices + pushed, np.arange(len(MESH.coat_vertices))] = 1.0
     truth = np.zeros_like(force)
     truth[free] = np.linalg.solve(dense[np.ix_(free, free)], force[free])
     for axis in range(3):
@@ -80,7 +82,7 @@ def test_finite_elements_tend_to_the_layers_compliance():
         corners = mesh.coat.rest[mesh.coat.faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         lumped = np.bincount(mesh.coat.faces.ravel(), np.repeat(area / 3.0, 3))
-        sideways, _, down = -coat_compliance(mesh, flat, rollers=True) @ (lumped * cosine)
+        sideways, _, down = -coat_compliance(mesh, flat, rollers=True)[0] @ (lumped * cosine)
         found = [
             (-down * cosine * lumped).sum() / (cosine**2 * lumped).sum(),
             (sideways * sine * lumped).sum() / (sine**2 * lumped).sum(),
@@ -94,7 +96,7 @@ def test_finite_elements_tend_to_the_layers_compliance():
 def fine():
     grid = make_grid(GELPAD, 0.2e-3)
     surface = CoatSurface(MESH.coat, GELPAD)
-    compliances = [coat_compliance(MESH, GELPAD, rollers=rollers)[2] for rollers in (False, True)]
+    compliances = [coat_compliance(MESH, GELPAD, rollers=rollers)[0, 2] for rollers in (False, True)]
     contact = FineContact(surface, GELPAD, grid.x, grid.y, *compliances)
     return contact, grid, FineGrid(contact, grid.x, grid.y)
 
@@ -170,7 +172,14 @@ def test_the_best_of_the_search_is_kept_and_its_residual_told(fine, monkeypatch)
 
 @pytest.fixture(scope="module")
 def skin(fine):
-    return SkinMotion(fine[0], GELPAD, *(coat_compliance(MESH, GELPAD, rollers=rollers) for rollers in (False, True)))
+    continued = coat_compliance(MESH, GELPAD, rollers=True, along=(0, 1, 2))
+    return SkinMotion(fine[0], GELPAD, coat_compliance(MESH, GELPAD)[0], continued)
+
+
+def rigid(turn):
+    """Where the vertices go with an object that turns by ``turn`` [rad] and is dragged by 0.3 mm for each radian."""
+    rest, cosine, sine = MESH.coat.rest[:, :2], math.cos(turn), math.sin(turn)
+    return rest @ np.array([[cosine, sine], [-sine, cosine]]) - rest + 0.3e-3 * turn
 
 
 def spread(fine, skin, held_back=0.0, turn=0.0):
@@ -178,14 +187,14 @@ def spread(fine, skin, held_back=0.0, turn=0.0):
     contact, grid, _ = fine
     rest = MESH.coat.rest
     touching = np.hypot(*rest[:, :2].T) < 3.5e-3
-    compliance = coat_compliance(MESH, GELPAD)
+    compliance = coat_compliance(MESH, GELPAD)[0]
     load = np.where(touching, 1.0 - (np.hypot(*rest[:, :2].T) / 4e-3) ** 2, 0.0) / touching.sum()
     moved = -(compliance @ load).T
     shape = contact.solve(contact.surface.places(np.zeros_like(moved)), moved[:, 2], load, ball(grid, 0.6e-3) - grid.rest)
     mesh = moved[:, :2].copy()
     moved[:, :2] *= 1.0 - held_back
-    moved[:, :2] += turn * np.stack([-rest[:, 1], rest[:, 0]], axis=1) + 0.3 * turn * 1e-3
-    return shape, mesh, moved, skin.sideways(shape, moved, touching), touching
+    moved[:, :2] += rigid(turn)
+    return shape, mesh, moved, skin.sideways(shape, moved, load), touching
 
 
 def test_without_friction_the_meshs_spread_is_exchanged_for_the_layers(fine, skin):
@@ -205,9 +214,7 @@ def test_what_friction_keeps_back_is_not_taken_out_twice_and_the_objects_motion_
     assert np.abs(went - 0.5 * layer).max() < 1e-8 < 0.01 * np.abs(mesh - layer).max()
     stuck = spread(fine, skin, held_back=1.0)
     assert not stuck[3].any()
-    rest = MESH.coat.rest
-    rigid = 0.1 * np.stack([-rest[:, 1], rest[:, 0]], axis=1) + 0.03 * 1e-3
-    assert np.abs(turned[3] - went - rigid)[touching].max() < 0.1 * np.abs(mesh).max()
+    assert np.abs(turned[3] - went - rigid(0.1))[touching].max() < 0.1 * np.abs(mesh).max()
 
 
 def test_sampling_is_bilinear():

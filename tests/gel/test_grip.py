@@ -1,0 +1,184 @@
+"""Friction below the mesh's cells: the layer under shear, stick and slip, and what is exchanged of a coat's motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.gel.coat_surface import CoatSurface
+from raytac.gel.fine_contact import FineContact
+from raytac.gel.grip import Grip, RigidMotion
+from raytac.gel.layer_compliance import layer_shear
+from raytac.gel.pad import make_grid
+from raytac.gel.skin_motion import SkinMotion, _share
+from raytac.physics.pad_compliance import coat_compliance
+from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.specs import load_sensor
+
+GELPAD = load_sensor("gelsight_mini").gelpad
+MESH = pad_mesh(GELPAD, PadLevel(2.0e-3, 3, 1.5, 1.5, 5e-5))
+REST = MESH.coat.rest
+RADIUS = 2.5e-3
+
+
+def test_long_waves_shear_the_layer_and_short_ones_a_half_space():
+    young, nu, thickness = GELPAD.youngs_modulus, GELPAD.poisson_ratio, GELPAD.thickness
+    short = np.array([2e4])
+    along, across = layer_shear(short, GELPAD)
+    assert along == pytest.approx(2.0 * (1.0 - nu**2) / (young * short), rel=1e-6)
+    assert across == pytest.approx(2.0 * (1.0 + nu) / (young * short), rel=1e-6)
+    for law in layer_shear(np.array([0.1]), GELPAD):
+        assert law == pytest.approx(2.0 * thickness * (1.0 + nu) / young, rel=1e-3)
+
+
+def test_finite_elements_tend_to_the_layers_answer_to_shear():
+    """A wave of traction, along its wave vector and across, on a flat pad between rollers: linear tetrahedra against the closed forms."""
+    flat = replace(GELPAD, dome_radius=(math.inf, math.inf))
+    off = []
+    for cell, layers in ((2.2e-3, 3), (1.1e-3, 6)):
+        mesh = pad_mesh(flat, PadLevel(cell, layers, 1.0001, 1.5, 5e-5))
+        k = np.array([3.0, 2.0]) * math.pi / np.array(flat.size)
+        x, y = (k * (mesh.coat.rest[:, :2] + 0.5 * np.array(flat.size))).T
+        waves = np.stack([np.sin(x) * np.cos(y), np.cos(x) * np.sin(y)])
+        corners = mesh.coat.rest[mesh.coat.faces]
+        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        lumped = np.bincount(mesh.coat.faces.ravel(), np.repeat(area / 3.0, 3))
+        compliance = coat_compliance(mesh, flat, rollers=True, along=(0, 1))[:, :2]
+        truth = layer_shear(np.array([float(np.hypot(*k))]), flat)
+        for way, law in zip((k, np.array([-k[1], k[0]])), truth, strict=True):
+            traction = way[:, None] / np.hypot(*k) * waves
+            moved = np.einsum("acij,aj->ci", compliance, traction * lumped)
+            found = (moved * traction * lumped).sum() / (traction**2 * lumped).sum()
+            off.append(abs(1.0 - found / float(law[0])))
+    assert off[2] < 0.5 * off[0] and off[3] < 0.5 * off[1] and max(off) < 0.3 and min(off) > 0.0
+
+
+@pytest.fixture(scope="module")
+def contact():
+    grid = make_grid(GELPAD, 0.2e-3)
+    surface = CoatSurface(MESH.coat, GELPAD)
+    found, continued = coat_compliance(MESH, GELPAD)[0], coat_compliance(MESH, GELPAD, rollers=True, along=(0, 1, 2))
+    fine = FineContact(surface, GELPAD, grid.x, grid.y, found[2], continued[2, 2])
+    return fine, SkinMotion(fine, GELPAD, found, continued), continued[:2, :2]
+
+
+@pytest.fixture(scope="module")
+def grip(contact):
+    return Grip(contact[0], GELPAD, contact[2])
+
+
+def dome(fine, height=1e5):
+    """Pressure of a ball on a half-space over the fine grid [Pa]."""
+    square = 1.0 - (fine.x[None, :] ** 2 + fine.y[:, None] ** 2) / RADIUS**2
+    return height * np.sqrt(np.maximum(square, 0.0)).astype(np.float32)
+
+
+def motion(x=0.0, y=0.0, turn=0.0):
+    return RigidMotion(np.zeros(2), np.array([x, y]), turn)
+
+
+def test_a_rigid_motion_is_found_again():
+    place = np.random.default_rng(0).normal(size=(40, 2)) * 1e-3
+    weight = np.random.default_rng(1).uniform(size=40)
+    given = motion(1e-4, -2e-4, math.sin(0.4))
+    turned = place @ np.array([[math.cos(0.4), math.sin(0.4)], [-math.sin(0.4), math.cos(0.4)]]) - place + given.shift
+    assert np.allclose(given.at(place), turned)
+    found = RigidMotion.of(turned, place, weight)
+    assert found.turn == pytest.approx(math.sin(0.4)) and np.allclose(found.at(place), turned)
+
+
+def test_what_sticks_moves_with_the_object(contact, grip):
+    """With friction enough the contact moves as one, but for its very edge, and drags as a disc does on a half-space with a back."""
+    goal = motion(1e-4, 0.5e-4, 0.05)
+    held = grip.hold(dome(contact[0]), goal, 1e4)
+    inside = held.bound > 0.0
+    well = inside & (np.hypot(held.place[..., 0], held.place[..., 1]) < RADIUS - 0.3e-3)
+    off = np.abs(np.moveaxis(held.moved, 0, -1) - goal.at(held.place)).max(axis=-1)
+    assert well.sum() > 300 and off[well].max() < 3e-6 and off[inside].max() < 3e-5
+    assert np.hypot(*held.traction).max() < held.bound.max()
+    force = held.traction.sum(axis=(1, 2)) * 4e-8
+    disc = 8.0 * RADIUS / (2.0 - GELPAD.poisson_ratio) * GELPAD.youngs_modulus / (2.0 * (1.0 + GELPAD.poisson_ratio)) * goal.shift
+    assert (force > 1.05 * disc).all() and (force < 2.0 * disc).all()  # a disc on a half-space, which has no back to hold it
+
+
+def test_slip_begins_at_the_edge_and_never_exceeds_friction(contact, grip):
+    pressure, friction = dome(contact[0]), 0.4
+    normal = pressure.sum() * 4e-8
+    slipping, forces = [], []
+    for shift in (3e-5, 6e-5, 1.2e-4, 1e-2):
+        held = grip.hold(pressure, motion(shift), friction)
+        size, inside = np.hypot(*held.traction), held.bound > 0.0
+        assert (size <= held.bound * 1.0001).all() and size.max() > 0.0
+        radius = np.hypot(held.place[..., 0], held.place[..., 1])
+        slips = inside & (size > 0.999 * held.bound)
+        if slips.any() and (inside & ~slips).any():
+            assert radius[slips].mean() > radius[inside & ~slips].mean()
+        slipping.append(slips.sum() / inside.sum())
+        forces.append(held.traction[0].sum() * 4e-8)
+        assert abs(held.traction[1].sum()) < 1e-3 * held.traction[0].sum()
+    assert np.all(np.diff(slipping) > 0.0) and slipping[-1] > 0.99
+    assert np.all(np.diff(forces) > 0.0) and forces[-1] == pytest.approx(friction * normal, rel=0.01)
+
+
+def test_the_mean_motion_is_the_one_asked_for_also_where_the_edge_slips(contact, grip):
+    for goal in (motion(2e-5), motion(0.0, -2e-5), motion(turn=0.01), motion(1e-5, 1e-5, -0.005)):
+        held = grip.hold(dome(contact[0]), goal, 0.6)
+        assert (np.hypot(*held.traction) > 0.999 * held.bound)[held.bound > 0.0].mean() > 0.02
+        mean = RigidMotion.of(np.moveaxis(held.moved, 0, -1).reshape(-1, 2), held.place.reshape(-1, 2), held.bound.ravel())
+        at = held.place[held.bound > 0.0]
+        assert np.abs(mean.at(at) - goal.at(at)).max() < 1.5e-6
+
+
+def dragged(contact, x=0.0, y=0.0, turn=0.0):
+    """A linear solution of the mesh that is held down and sticks, and what the skin is shown to do with the exchange and without."""
+    fine, skin, compliance = contact
+    touching = np.hypot(*REST[:, :2].T) < RADIUS + 0.5e-3
+    v = len(REST)
+    load = np.where(touching, 1.0 - (np.hypot(*REST[:, :2].T) / 4e-3) ** 2, 0.0) / touching.sum()
+    goal = motion(x, y, turn).at(REST[:, :2])
+    at = np.flatnonzero(np.tile(touching, 2))
+    whole = compliance.transpose(1, 2, 0, 3).reshape(2 * v, 2 * v)
+    sideways = (whole[:, at] @ np.linalg.solve(whole[np.ix_(at, at)], goal.T.ravel()[at])).reshape(2, v).T
+    moved = np.concatenate([sideways, np.zeros((v, 1))], axis=1)
+    grid = make_grid(GELPAD, 0.2e-3)
+    square = (4e-3) ** 2 - grid.x[None, :] ** 2 - grid.y[:, None] ** 2
+    under = np.where(square > 0, 4e-3 - 0.6e-3 - np.sqrt(np.maximum(square, 0.0)), np.inf)
+    down = coat_compliance(MESH, GELPAD)[0, 2] @ -load
+    shape = fine.solve(fine.surface.places(moved), down, load, under - grid.rest)
+    return shape, moved, touching, skin.sideways(shape, moved, load, 1e4), skin.sideways(shape, moved, load)
+
+
+def test_a_linear_drag_of_the_mesh_is_exchanged_for_the_layers(contact, grip):
+    """In contact the skin goes with the object, around it as the layer under the fine contact's friction does, whatever the mesh did."""
+    shape, moved, touching, went, before = dragged(contact, 2e-4)
+    held = grip.hold(shape.pressure, motion(2e-4), 1e4)
+    layer = grip._back(held.waves, (grip._vertex_x, grip._vertex_y)).reshape(2, -1).T
+    assert np.abs(before - moved[:, :2]).max() < 2e-6  # nothing was exchanged: no spread is in a drag
+    assert np.abs(went - layer).max() < 4e-6
+    assert np.abs(went - moved[:, :2])[~touching].max() > 2e-5
+
+
+def test_the_skin_follows_a_mirrored_or_turned_drag_likewise(contact):
+    rows, columns = MESH.coat.shape
+    right, left = (dragged(contact, x)[3].reshape(rows, columns, 2) for x in (1e-4, -1e-4))
+    assert np.abs(right - left[:, ::-1] * [-1.0, 1.0]).max() < 1e-6 < 1e-2 * np.abs(right).max()
+    up = dragged(contact, y=1e-4)[3].reshape(rows, columns, 2)
+    assert np.abs(up - up[:, ::-1] * [-1.0, 1.0]).max() < 1e-6
+    twist = dragged(contact, turn=0.05)[3]
+    assert np.abs((twist * REST[:, :2]).sum(axis=1)).max() < 0.15 * np.abs(twist).max() * np.abs(REST[:, :2]).max()
+    assert np.abs(twist.sum(axis=0)).max() < 1e-3 * np.abs(twist).sum()
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.7, 1.2])
+def test_a_turn_does_not_change_what_friction_is_said_to_have_let_happen(angle):
+    """The radial part of a finite rotation was once taken for spread that friction had kept back."""
+    place = REST[np.hypot(*REST[:, :2].T) < 4e-3, :2]
+    spread = place * (1.0 - np.hypot(*place.T) / 8e-3)[:, None] * 0.01
+    moved = 0.6 * spread
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turned = place @ np.array([[cosine, sine], [-sine, cosine]]) - place + 1e-4
+    assert _share(spread, moved, place) == pytest.approx(0.6, abs=1e-9)
+    assert _share(spread, moved + turned, place) == pytest.approx(0.6, abs=1e-6)
