@@ -32,6 +32,7 @@ from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
 from raytac.robots.pose import pose_error
+from raytac.specs.task import BodySpec, RobotSpec, TaskScene
 from raytac.world.variation import Variation
 from raytac.world.world import TactileWorld
 
@@ -321,26 +322,27 @@ def test_the_wrench_alone_is_the_wrench_that_is_seen_beside_markers() -> None:
 
 
 def test_bodies_and_mounts_are_drawn_at_every_reset_of_an_environment() -> None:
-    widths = {"body_mass": 0.3, "body_friction": 0.2, "pad_shift": 1e-3, "pad_turn": 0.02}
+    widths = {"body_mass": 0.3, "body_friction": 0.2, "youngs_modulus": 0.2, "friction": 0.2, "pad_shift": 1e-3, "pad_turn": 0.02}
     batch = TaskBatch(PushCube(), num_envs=4, tactile=None, seed=0, randomization=Randomization(**widths))  # type: ignore[arg-type]
     world, cube, table = batch.world, batch.world.composed.bodies["cube"], batch.world.composed.bodies["table"]
     nominal = world.state().world_from_pad["sensor"][0]
 
     def drawn() -> np.ndarray:
-        """Of every environment: mass, friction on the table's side and on the gel's, table's friction, pad's place and turn."""
+        """Of every environment: mass, friction on the table's side and on the gel's, table's friction, gel, pad's place and turn."""
         models = [world.models[b] for b in range(4)]
         own = [[m.body_mass[cube.index], m.geom_friction[m.body_geomadr[cube.index], 0]] for m in models]
-        gel = world.models.gel_friction[:, list(world.composed.bodies).index("cube")]
+        gel = world.models.friction_on_gel[:, list(world.composed.bodies).index("cube")]
         other = [m.geom_friction[m.body_geomadr[table.index], 0] for m in models]
         off = pose_error(nominal, world.state().world_from_pad["sensor"])
-        return np.column_stack([np.array(own) / [0.05, 0.2], gel, np.array(other) / 0.2, off])
+        soft = world.models.gel_stiffness[:, 0], world.models.gel_friction[:, 0] / world.composed.sensor_specs[0].gelpad.friction
+        return np.column_stack([np.array(own) / [0.05, 0.2], gel, np.array(other) / 0.2, *soft, off])
 
     streams = [np.random.default_rng(b) for b in range(4)]
     batch.reset(range(4), streams)
     first = drawn()
-    assert np.ptp(first, axis=0).min() > 1e-4 and (np.ptp(first[:, :4], axis=0) > 0.05).all()
-    assert (np.abs(first[:, :4] - 1.0) <= [0.3, 0.2, 0.2, 0.2]).all() and np.abs(first[:, 4:7]).max() <= 1e-3
-    assert 0.0 < np.abs(first[:, 7:]).max() <= 0.0201
+    assert np.ptp(first, axis=0).min() > 1e-4 and (np.ptp(first[:, :6], axis=0) > 0.05).all()
+    assert (np.abs(first[:, :6] - 1.0) <= [0.3, 0.2, 0.2, 0.2, 0.2, 0.2]).all() and np.abs(first[:, 6:9]).max() <= 1e-3
+    assert 0.0 < np.abs(first[:, 9:]).max() <= 0.0201
     np.testing.assert_allclose(first[:, 1], first[:, 2])
     assert np.abs(batch.steering.tool() - batch._start_tool).max() < 1e-9, "the arm knows nothing of it"
     batch.reset([1], streams[1:2])
@@ -353,7 +355,7 @@ def test_bodies_and_mounts_are_drawn_at_every_reset_of_an_environment() -> None:
     alone = TaskBatch(PushCube(), tactile=None, seed=2, randomization=Randomization(pad_shift=1e-3))
     alone.reset([0], streams[:1])
     at = alone.world.state().world_from_pad["sensor"][0]
-    np.testing.assert_allclose(pose_error(nominal, at)[:3], first[2, 4:7], atol=1e-12)
+    np.testing.assert_allclose(pose_error(nominal, at)[:3], first[2, 6:9], atol=1e-12)
     assert alone.world.models[0].body_mass[cube.index] == 0.05
 
 
@@ -409,6 +411,33 @@ def test_a_heavier_cube_rises_slower_and_a_smoother_one_slides_further() -> None
     world.step()
     speed = [data.qvel[dof + 2] for data in world.data]
     np.testing.assert_allclose(speed, (lift / (0.05 * factors) - 9.81) * 0.04, rtol=0.05)
+
+
+def _ball_on_a_pad() -> TaskScene:
+    """Half a kilogram on a pad that looks up."""
+    robot = RobotSpec("fixed_sensor", "gelsight_mini_9x11")
+    ball = BodySpec("ball", "sphere", {"radius": 5e-3}, position=(0.0, 0.0, 5e-3), mass=0.5)
+    return TaskScene("ball_on_a_pad", robot, (ball,), timestep=2e-3, soft_timestep=1e-2, control_timestep=1e-2)
+
+
+def test_a_softer_gel_gives_way_further_under_a_ball_that_lies_on_it() -> None:
+    gel = TactileWorld(_ball_on_a_pad(), outputs=("wrench",), num_envs=3)
+    differs = Variation(gel_stiffness={"sensor": np.array([1.0, 0.5, 2.0])}, gel_friction={"sensor": np.array([1.0, 1.0, 0.5])})
+    gel.reset(variation=differs)
+    for _ in range(60):
+        state = gel.step()
+    weight = 9.81 * 0.5
+    np.testing.assert_allclose(-state.wrench["sensor"][:, 2], weight, rtol=1e-3)
+    depth = 5e-3 - state.world_from_body["ball"][:, 2, 3]
+    assert depth[1] > depth[0] > depth[2] > 1e-4
+    slip = np.array([data.contact.friction[-1, 0] for data in gel.data])  # the pads' contacts come last
+    np.testing.assert_allclose(slip, gel.composed.sensor_specs[0].gelpad.friction * np.array([1.0, 1.0, 0.5]))
+    # What bears F at half the modulus bears 2 F at the whole.
+    whole = TactileWorld(_ball_on_a_pad(), outputs=("wrench",), num_envs=2)
+    whole.reset(variation=Variation(mass={"ball": np.array([2.0, 0.5])}))
+    for _ in range(60):
+        other = whole.step()
+    np.testing.assert_allclose(depth[1:], 5e-3 - other.world_from_body["ball"][:, 2, 3], rtol=2e-3)
 
 
 def test_a_pole_stands_on_a_pad_that_is_mounted_askew() -> None:
