@@ -4,7 +4,8 @@
     python experiments/physics_sheet.py --pad medium --out runs/physics_sheet_medium
     python experiments/physics_sheet.py --scenes sphere --against fine --out runs/sphere_against_fine   # the levels against a finer one
 
-One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's.
+One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's, on a
+scale of its own. No scale cuts anything off.
 ``metrics.json``: ``<scene>.<physics>.`` ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``force_n``, ``contact_mm2``,
 ``press_s``; and ``<scene>.contact_um``, ``ring_um``, ``image``: height of the simulated pad less that of the rigid one, root mean square
 where both touch and within 2 mm of that, and mean absolute difference of the images (of 255).
@@ -20,7 +21,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -34,10 +35,13 @@ from raytac.io.options import CommonOptions, parse_names
 from raytac.sensor import PADS, TactileSensor
 from raytac.specs import load_press
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 SCENES = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
 RING = 2e-3
-DIFFERENCE_MM = 0.2
-"""Height differences are shown up to so much, either way."""
+STEP_MM = 0.05
+"""A scale of height differences ends at a multiple of this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +95,7 @@ class Args(CommonOptions):
                 metrics |= {f"{name}.{key}": value for key, value in compared(frames["rigid"], frames["ipc"]).items()}
                 rows.append((name, frames["rigid"], frames["ipc"]))
                 print(f"{name}: done after {time.perf_counter() - start:.0f} s", flush=True)
-            draw(rows, sensors["ipc"], folder / "sheet.png", self.pad)
+            sheet_figure(rows, sensors["ipc"], self.pad).savefig(folder / "sheet.png", pil_kwargs={"optimize": True})
             metrics |= {"device": sensors["ipc"].device_used, "wall_s": time.perf_counter() - start}
             write_metrics(folder / "metrics.json", metrics | versions((*VERSIONED, "warp-lang")))
         print(out / "sheet.png")
@@ -172,25 +176,24 @@ def widened(mask: np.ndarray, by: float, pitch: tuple[float, float]) -> np.ndarr
     return out
 
 
-def draw(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSensor, path: Path, pad: str) -> None:
-    import matplotlib
+def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSensor, pad: str) -> Figure:
+    """One row for each scene: its name, and its frames under the rigid and the simulated pad."""
+    from matplotlib.figure import Figure
 
     from raytac.report.preview import camera_extent_mm
-
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
 
     left, right, bottom, top = camera_extent_mm(sensor.spec.camera)
     titles = (
         "image, rigid pad",
         f"image, ipc ({pad})",
-        "indentation, rigid [mm]",
-        f"indentation, ipc ({pad}) [mm]",
-        "ipc − rigid [mm]",
+        "indentation, rigid",
+        f"indentation, ipc ({pad})",
+        "height, ipc − rigid",
     )
-    figure = Figure(figsize=(13.0, 1.72 * len(rows) + 0.35), layout="constrained", dpi=100)
+    figure = Figure(figsize=(10.0, 1.24 * len(rows) + 0.45), layout="constrained", dpi=100)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.0, wspace=0.0)  # type: ignore[union-attr, call-arg]
     axes = np.atleast_2d(figure.subplots(len(rows), len(titles), squeeze=False))
-    for line, (name, rigid, soft) in zip(axes, rows, strict=True):
+    for row, (line, (name, rigid, soft)) in enumerate(zip(axes, rows, strict=True)):
         grid = rigid.surface.grid
         extent = [1e3 * v for v in (grid.x[0], grid.x[-1], grid.y[-1], grid.y[0])]
         dents = [1e3 * frame.surface.indentation[0] for frame in (rigid, soft)]
@@ -200,19 +203,23 @@ def draw(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSens
             axis.imshow(frame.rgb[0], extent=(left, right, bottom, top))
         for axis, dent in zip(line[2:4], dents, strict=True):
             shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
-        figure.colorbar(shown, ax=list(line[2:4]), shrink=0.85, pad=0.01)
+        bars = [figure.colorbar(shown, ax=list(line[2:4]), shrink=0.9, pad=0.01)]
         off = dents[0] - dents[1]
-        shown = line[4].imshow(off, extent=extent, cmap="PuOr", vmin=-DIFFERENCE_MM, vmax=DIFFERENCE_MM)
-        figure.colorbar(shown, ax=line[4], shrink=0.85, pad=0.02)
+        end = max(float(np.ceil(np.abs(off).max() / STEP_MM - 1e-9)), 1.0) * STEP_MM
+        shown = line[4].imshow(off, extent=extent, cmap="PuOr", vmin=-end, vmax=end)
+        bars.append(figure.colorbar(shown, ax=line[4], shrink=0.9, pad=0.02, ticks=(-end, 0.0, end)))
+        for bar in bars:
+            bar.set_label("mm", fontsize=8, labelpad=1)
+            bar.ax.tick_params(labelsize=7.5, length=2)
         for axis in line:
             axis.set(xlim=(left, right), ylim=(bottom, top), xticks=(-5, 0, 5), yticks=(-5, 0, 5))
-            axis.tick_params(labelsize=7, length=2)
+            axis.tick_params(labelsize=7.5, length=2, labelleft=axis is line[0], labelbottom=row == len(rows) - 1)
         line[0].set_ylabel(f"{name}\ny [mm]", fontsize=9)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("x [mm]", fontsize=8)
-    figure.savefig(path)
+    return figure
 
 
 def main() -> int:

@@ -20,6 +20,7 @@ from raytac.calibrate.direct_light import LedLight, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.light_parameters import CEILING, DARKEST, REFERENCE_DISTANCE, LightParameters, darkest
 from raytac.calibrate.photographs import Photographs, decode, encode
+from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
 __all__ = ["DirectFit", "FitSettings", "FitState", "Light"]
@@ -36,12 +37,10 @@ SIGMA = {
     "slope": 0.15,
 }
 """How far a parameter is believed to be from its start: mm, rad, 1, full scales (own channel), …"""
-CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5])
-"""How far [px] a contact circle is believed to be from its label: x, y, radius."""
-PRIOR = 30.0
-"""Squared residual [levels²] that a deviation of one sigma is worth."""
+CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
+"""How far a contact circle is believed to be from its label: x, y, radius, over the image's width."""
 CIRCLE_PRIOR = 300.0
-"""The same of a circle."""
+"""Squared residual [levels²] that a circle's deviation of one sigma is worth."""
 ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
@@ -54,7 +53,7 @@ REST_FACTOR = 8
 class FitSettings:
     """What a fit does."""
 
-    reach: float = 2.2
+    reach: float = 2.4
     """Pixels up to this many radii from a circle's centre count."""
     ring_weight: float = 0.5
     """Weight of a residual outside the labelled circle."""
@@ -68,6 +67,10 @@ class FitSettings:
     """Whether circles are fitted."""
     fixed: tuple[str, ...] = ()
     """Blocks of parameters that stay: names of ``SIGMA``."""
+    prior: float = 30.0
+    """Squared residual [levels²] that a parameter's deviation of one sigma from its start is worth."""
+    ties: float = 0.0
+    """The same of a deviation from ``side_ties``: LEDs of a side alike and mirrored."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,8 @@ class DirectFit:
         self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
         self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
+        self.circle_sigma = CIRCLE_SIGMA * native[0]
+        self.ties = side_ties(start.p, len(self.flat(start)))
 
     # ------------------------------------------------------------------ forward model
 
@@ -223,9 +228,10 @@ class DirectFit:
         h = self.settings.huber
         robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in off]
         x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
-        c = (state.circles - self.shots.circles) / CIRCLE_SIGMA
+        c, tied = (state.circles - self.shots.circles) / self.circle_sigma, self.ties.off(self.flat(state))
         images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
-        return float(images + PRIOR * (x @ x) + CIRCLE_PRIOR * (c * c).sum())
+        priors = self.settings.prior * (x @ x) + self.settings.ties * (tied @ tied) + CIRCLE_PRIOR * (c * c).sum()
+        return float(images + priors)
 
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Slopes of the presses' pixels (3M, G) and of the image at rest (3K, G) by the vector, of the first by their own press's circle
@@ -312,17 +318,21 @@ class DirectFit:
         size = len(x)
         n = size + 3 * count
         normal, slope = np.zeros((n, n)), np.zeros(n)
-        normal[:size, :size] = (jac.T * w) @ jac + (rest_jac.T * rest_w) @ rest_jac + np.diag(PRIOR / sigma**2)
-        slope[:size] = (jac.T * w) @ off.ravel() + (rest_jac.T * rest_w) @ rest_off.ravel() + PRIOR * (x - x0) / sigma**2
+        normal[:size, :size] = (jac.T * w) @ jac + (rest_jac.T * rest_w) @ rest_jac
+        normal[:size, :size] += np.diag(settings.prior / sigma**2) + settings.ties * self.ties.matrix.T @ self.ties.matrix
+        slope[:size] = (jac.T * w) @ off.ravel() + (rest_jac.T * rest_w) @ rest_off.ravel()
+        slope[:size] += settings.prior * (x - x0) / sigma**2 + settings.ties * self.ties.matrix.T @ self.ties.off(x)
         own = np.repeat(self.press, 3)
         first = np.searchsorted(own, np.arange(count + 1))
         for k in range(count):
             a, b = slice(first[k], first[k + 1]), slice(size + 3 * k, size + 3 * k + 3)
             weighted = circles[a].T * w[a]
-            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / CIRCLE_SIGMA**2)
+            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / self.circle_sigma**2)
             normal[b, :size] = weighted @ jac[a]
             normal[:size, b] = normal[b, :size].T
-            slope[b] = weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / CIRCLE_SIGMA**2
+            slope[b] = (
+                weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / self.circle_sigma**2
+            )
         pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
         stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
         movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])

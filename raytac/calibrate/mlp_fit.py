@@ -43,10 +43,11 @@ def fit_mlp(
     flat = round(FLAT * len(chosen))
     column = np.concatenate([samples.column[chosen], rng.integers(width, size=flat)])
     row = np.concatenate([samples.row[chosen], rng.integers(height, size=flat)])
-    slope_x, slope_y = (np.concatenate([s[chosen], np.zeros(flat)]) for s in (samples.slope_x, samples.slope_y))
+    told = (samples.slope_x, samples.slope_y, samples.touched.astype(float))
+    slope_x, slope_y, touched = (np.concatenate([s[chosen], np.zeros(flat)]) for s in told)
     target = np.concatenate([samples.difference[chosen], np.zeros((flat, 3))]) / LEVELS
     u, v = (column + 0.5) * (2 / width) - 1, (row + 0.5) * (2 / height) - 1
-    x = np.stack(inputs(np, slope_x, slope_y, u, v, view_slope(sensor)), axis=1).astype(np.float32)
+    x = np.stack(inputs(np, slope_x, slope_y, touched, u, v, view_slope(sensor)), axis=1).astype(np.float32)
     target = target.astype(np.float32)
     sizes = (INPUTS, *HIDDEN, 3)
     matrices: list[np.ndarray] = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in itertools.pairwise(sizes)]

@@ -12,7 +12,10 @@ from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.errors import InputError
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Photographs", "decode", "encode", "photographs_of", "read_photographs"]
+__all__ = ["FAR", "Photographs", "decode", "encode", "photographs_of", "read_photographs"]
+
+FAR = 3.0
+"""Radii from a contact's centre beyond which a press counts as changing nothing."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,15 @@ class Photographs:
 
     def take(self, index: np.ndarray) -> Photographs:
         return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
+
+    def settled(self, sensor: SensorSpec) -> Photographs:
+        """The same with another ``background``: whole levels of the mean of it and of the presses' pixels beyond ``FAR`` radii.
+
+        One photograph of the sensor at rest holds that photograph's noise, and was taken at another time than the presses were.
+        """
+        far = self.distance(sensor)[..., None] > FAR
+        total = self.background + np.where(far, self.presses, 0).sum(0)
+        return dataclasses.replace(self, background=np.rint(total / (1 + far.sum(0))))
 
     def shrunk(self, factor: int) -> Photographs:
         """Mean of every ``factor`` × ``factor`` pixels."""

@@ -25,7 +25,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.raytrace import RayTracer
 from raytac.specs import SensorSpec
 
-__all__ = ["FEWEST", "Fitted", "brightened", "defect", "fit_lights", "refine_circles"]
+__all__ = ["FEWEST", "Fitted", "brightened", "defect", "first_state", "fit_lights", "refine_circles"]
 
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
@@ -50,6 +50,8 @@ class Fitted:
     state: FitState
     costs: tuple[float, ...]
     """Cost of the least-squares problem after every round, the first with direct light alone."""
+    start_errors: tuple[float, ...]
+    """Mean absolute residual [levels] in the contacts after direct light from every start."""
 
 
 def brightened(problem: DirectFit, state: FitState) -> FitState:
@@ -57,6 +59,12 @@ def brightened(problem: DirectFit, state: FitState) -> FitState:
     rest = np.einsum("lmc,lc->mc", problem.light(state.p, problem.geometry(state)).rest, state.p.power).mean(0)
     gain = decode(problem.rest_real, state.p.response[0]).mean(0) / np.maximum(rest, 1e-9)
     return dataclasses.replace(state, p=dataclasses.replace(state.p, power=state.p.power * gain))
+
+
+def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, seed: int) -> FitState:
+    """Where a fit begins: the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles."""
+    begin = FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
+    return brightened(DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed), begin)
 
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any]) -> Light:
@@ -112,24 +120,23 @@ def fit_lights(
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":
         raise InputError("refraction.model", value=sensor.refraction.model, rule="cannot be fitted", choices=("none",))
-    begin = start or FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
+    begin = start or first_state(sensor, shots, settings, seed)
     problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
     unknown, known = len(problem.flat(begin)) + 3 * len(shots.circles), 3 * len(problem.press)
     if known < 10 * unknown or len(shots.circles) < FEWEST:
         rule = f"are too few for {unknown} parameters ({known} values): take at least {FEWEST}, and 10 values a parameter"
         raise InputError("presses", value=len(shots.circles), rule=rule)
-    if start is None:
-        begin = brightened(problem, begin)
-        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
 
     def told(stage: str) -> Callable[[FitState, float], None]:
         return lambda _, cost: tick(stage, cost) if tick is not None else None
 
-    rng, found = np.random.default_rng(seed), []
+    rng, found, errors = np.random.default_rng(seed), [], []
     for k in range(starts):
         first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
         here = problem.solve(first, FIRST, told(f"direct light, start {k + 1} of {starts}"))
-        found.append((problem.cost(here, problem.residuals(here)), here))
+        off = problem.residuals(here)
+        found.append((problem.cost(here, off), here))
+        errors.append(float(np.abs(off[0][problem.inside]).mean()))
     cost, state = min(found, key=lambda pair: pair[0])
     costs = [cost]
     grid = make_grid(sensor.gelpad, GRID_PITCH)
@@ -138,7 +145,7 @@ def fit_lights(
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
         state = problem.solve(state, LATER, told(f"all light, round {k + 1} of {rounds}"))
         costs.append(problem.cost(state, problem.residuals(state)))
-    return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs))
+    return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs), tuple(errors))
 
 
 def _perturbed(problem: DirectFit, state: FitState, rng: np.random.Generator) -> FitState:

@@ -19,15 +19,20 @@ _PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_t
 
 
 def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples, *, n_bins: int = N_BINS) -> PolyTable:
-    """The table of ``samples`` over the real ``background`` (H, W, 3) [levels]; no shadows: balls alone tell too little of them."""
+    """The table of ``samples`` over the real ``background`` (H, W, 3) [levels], one sheet for touched pixels and one for those around;
+    no shadows: balls alone tell too little of them."""
     height, width = background.shape[:2]
-    sums = BinSums(n_bins, (width, height))
     i, j = slope_bins(samples.slope_x, samples.slope_y, n_bins)
-    sums.add(i, j, samples.column, samples.row, samples.difference.astype(np.float32))
-    fit = sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE)
+    sheets = []
+    for own in (samples.touched, ~samples.touched):
+        sums = BinSums(n_bins, (width, height))
+        sums.add(i[own], j[own], samples.column[own], samples.row[own], samples.difference[own].astype(np.float32))
+        sheets.append(sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE))
+    contact, surround = sheets
     return PolyTable(
-        gradients=fit.gradients,
-        covered=fit.covered,
+        gradients=contact.gradients,
+        covered=contact.covered,
+        surround=surround.gradients,
         background=background.astype(np.float32),
         pixel_pitch=sensor.camera.pitch_at((width, height)),
         slopes_of="displacement",

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, read_data
+from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
 from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
@@ -19,7 +19,7 @@ from raytac.specs.press import PADS
 
 __all__ = ["CalibrateArgs"]
 
-_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "starts", "rounds")
+_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "starts", "rounds", "prior")
 _OF_MARKERS = ("pad", "quick", "verbose")
 
 
@@ -54,6 +54,9 @@ class CalibrateArgs(SolverOptions):
     """Places that a fit of direct light starts from; the best goes on."""
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
+    prior: str = INNER
+    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
+    cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
@@ -113,6 +116,7 @@ class CalibrateArgs(SolverOptions):
             holdout=self.holdout,
             starts=self.starts,
             rounds=self.rounds,
+            prior=prior_of(self.prior),
             shadows=self.shadows,
             device=self.device,
             seed=self.seed,

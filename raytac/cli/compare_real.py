@@ -9,7 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, read_data
+from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
+from raytac.errors import InputError
 from raytac.io.options import CommonOptions
 
 __all__ = ["CompareRealArgs"]
@@ -29,6 +30,8 @@ class CompareRealArgs(CommonOptions):
     """Name of a shipped sensor, or path of a sensor file."""
     folds: int = 5
     """Every so manieth press is held out in turn."""
+    tested: int | None = None
+    """How many of the folds are fitted and tested, for a run that is about regions or ablations; all if not given."""
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
     sides: str = FROM_SCRATCH
@@ -44,6 +47,9 @@ class CompareRealArgs(CommonOptions):
     """Places that a fit of direct light starts from; the best goes on."""
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
+    prior: str = INNER
+    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
+    cross-validation between halves of the pad within the presses that are fitted to."""
 
     def run(self) -> int:
         began = time.perf_counter()
@@ -51,12 +57,16 @@ class CompareRealArgs(CommonOptions):
 
         sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides)
         check_folds(presses, self.folds)
+        if self.tested is not None and not 1 <= self.tested <= self.folds:
+            raise InputError("tested", value=self.tested, rule=f"must be 1 to {self.folds}, the number of folds")
         settings = RealSettings(
             folds=self.folds,
+            tested=self.tested,
             regions=self.regions,
             ablations=self.ablations,
             starts=self.starts,
             rounds=self.rounds,
+            prior=prior_of(self.prior),
             shadows=self.shadows,
             device=self.device,
             seed=self.seed,

@@ -8,14 +8,29 @@ from raytac.calibrate.circles import with_found_circles
 from raytac.calibrate.light_parameters import leds_at_walls
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
+from raytac.calibrate.prior_choice import STRENGTHS
+from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
 
-__all__ = ["FROM_SCRATCH", "OWN_LEDS", "read_data"]
+__all__ = ["FROM_SCRATCH", "INNER", "OWN_LEDS", "prior_of", "read_data"]
 
 FROM_SCRATCH = "5,3,4"
 """Numbers of LEDs that the figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own lights were
 fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
+INNER = "inner"
+"""Strength of priors: chosen by cross-validation within the presses that are fitted to."""
+
+
+def prior_of(name: str) -> str | None:
+    """``--prior``: None is ``INNER``.
+
+    Raises:
+        InputError: neither that nor a name of ``STRENGTHS``.
+    """
+    if name not in (INNER, *STRENGTHS):
+        raise InputError("prior", value=name, rule="must be a known strength", choices=(INNER, *STRENGTHS))
+    return None if name == INNER else name
 
 
 def read_data(

@@ -102,9 +102,12 @@ class TaskBatch:
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the sensor needs no markers: the force alone is asked of the probe.
         asked = ObservationSettings(("wrench",)) if settings is None else settings
-        probe = TactileObserver(loaded.robot.sensor, asked, num_envs=num_envs, randomization=randomization, seed=seed)
-        loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
         rigid = chosen_physics(loaded, physics, pad) == "rigid"
+        shared = self.randomization  # what is drawn once for all environments
+        if rigid:
+            shared = replace(shared, youngs_modulus=0.0, friction=0.0)
+        probe = TactileObserver(loaded.robot.sensor, asked, num_envs=num_envs, randomization=shared, seed=seed)
+        loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
         if not rigid:
             loaded = randomised_bodies(loaded, self.randomization, seed)
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}

@@ -1,4 +1,4 @@
-"""What is drawn for the bodies and the mounting of every environment, each time it begins anew."""
+"""What is drawn for the bodies, the gels and the mounting of every environment, each time it begins anew."""
 
 from __future__ import annotations
 
@@ -32,16 +32,18 @@ class VariationDraws:
         Args:
             scene: whose bodies differ.
             sensors: names of those whose pads are mounted askew.
-            randomization: half widths; ``body_mass``, ``body_friction``, ``pad_shift`` and ``pad_turn`` of it are used.
-            rigid: whether pads are rigid; bodies among simulated ones are the same in all environments, so nothing of them is drawn.
+            randomization: half widths; ``body_mass``, ``body_friction``, ``youngs_modulus``, ``friction``, ``pad_shift`` and ``pad_turn``
+                of it are used.
+            rigid: whether pads are rigid; simulated ones and bodies among them are the same in all environments, so nothing of them is
+                drawn but how they are mounted.
             num_envs: number of environments B.
             seed: environment b begins with seed + b.
         """
         self._randomization, self._sensors = randomization, tuple(sensors)
-        self._bodies_differ = rigid and randomization.changes_bodies
+        self._bodies_differ, self._gels_differ = rigid and randomization.changes_bodies, rigid and randomization.changes_gel
         self._masses = [body.name for body in scene.bodies if body.dynamics == "free"]
         self._frictions = [body.name for body in scene.bodies]
-        self.is_none = not (self._bodies_differ or randomization.changes_mounting)
+        self.is_none = not (self._bodies_differ or self._gels_differ or randomization.changes_mounting)
         """Whether there is nothing to draw."""
         self._streams = [_stream(seed + b) for b in range(num_envs)]
 
@@ -54,20 +56,23 @@ class VariationDraws:
         """Of the environments named, one row each."""
         r = self._randomization
         # As many numbers in the same order whatever is asked, so that a width of 0 changes nothing else.
-        count = len(self._masses) + len(self._frictions) + 6 * len(self._sensors)
+        count = len(self._masses) + len(self._frictions) + 8 * len(self._sensors)
         u = np.array([self._streams[b].uniform(-1.0, 1.0, count) for b in envs]).reshape(len(envs), count)
         mass, friction, mounting = np.split(u, np.cumsum([len(self._masses), len(self._frictions)]), axis=1)
         poses = np.repeat(np.eye(4)[None], len(envs) * len(self._sensors), axis=0).reshape(len(envs), -1, 4, 4)
-        mounting = mounting.reshape(len(envs), -1, 6)
+        mounting, gel = np.split(mounting.reshape(len(envs), -1, 8), [6], axis=2)
         poses[..., :3, 3] = r.pad_shift * mounting[..., :3]
         poses[..., :3, :3] = rotations(r.pad_turn * mounting[..., 3:].reshape(-1, 3)).reshape(len(envs), -1, 3, 3)
-        return Variation(
-            {name: 1.0 + r.body_mass * mass[:, i] for i, name in enumerate(self._masses)} if self._bodies_differ else {},
-            {name: 1.0 + r.body_friction * friction[:, i] for i, name in enumerate(self._frictions)}
-            if self._bodies_differ
-            else {},
-            {name: poses[:, i] for i, name in enumerate(self._sensors)} if r.changes_mounting else {},
-        )
+        drawn: dict[str, dict[str, np.ndarray]] = {}
+        if self._bodies_differ:
+            drawn["mass"] = {name: 1.0 + r.body_mass * mass[:, i] for i, name in enumerate(self._masses)}
+            drawn["friction"] = {name: 1.0 + r.body_friction * friction[:, i] for i, name in enumerate(self._frictions)}
+        if self._gels_differ:
+            drawn["gel_stiffness"] = {name: 1.0 + r.youngs_modulus * gel[:, i, 0] for i, name in enumerate(self._sensors)}
+            drawn["gel_friction"] = {name: 1.0 + r.friction * gel[:, i, 1] for i, name in enumerate(self._sensors)}
+        if r.changes_mounting:
+            drawn["mounting"] = {name: poses[:, i] for i, name in enumerate(self._sensors)}
+        return Variation(**drawn)
 
 
 def _stream(seed: int) -> np.random.Generator:

@@ -23,11 +23,11 @@ class Randomization:
     """Half widths of uniform distributions, relative to 1 unless said otherwise; all 0 is none.
 
     *Each environment, at every reset*: the camera (``CameraDrift``) by ``exposure``, ``white_balance``, ``gamma``; the pattern of
-    ``markers``; how the pad is mounted by ``pad_shift``, ``pad_turn``, and bodies by ``body_mass``, ``body_friction``
-    (``raytac.envs.variation``; simulated pads have bodies drawn once a world, ``randomised_bodies``). *Each frame*: ``noise``, and noise
-    and losses of ``markers``. *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``,
-    ``led_colour``, ``reflectance``, ``youngs_modulus``, ``friction``. A table of ``taxim`` is baked anew for every such sensor, the ray
-    tracer is not: vary seeds over processes.
+    ``markers``; how the pad is mounted by ``pad_shift``, ``pad_turn``; and in environments with rigid pads (``raytac.envs.variation``)
+    bodies by ``body_mass``, ``body_friction``, gels by ``youngs_modulus``, ``friction``. *Each frame*: ``noise``, and noise and losses of
+    ``markers``. *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``, ``led_colour``,
+    ``reflectance``; with simulated pads, or a sensor that is in no environment, gels too, and bodies (``randomised_bodies``). A table of
+    ``taxim`` is baked anew for every such sensor, the ray tracer is not: vary seeds over processes.
     """
 
     led_power: float = 0.0
@@ -39,7 +39,7 @@ class Randomization:
     youngs_modulus: float = 0.0
     """Of the gel."""
     friction: float = 0.0
-    """Of the gel."""
+    """Of the gel, where it meets bodies that the scene gives no coefficient."""
     body_mass: float = 0.0
     """Of every free body by itself."""
     body_friction: float = 0.0
@@ -83,6 +83,11 @@ class Randomization:
         return any((self.body_mass, self.body_friction))
 
     @property
+    def changes_gel(self) -> bool:
+        """Whether gels differ."""
+        return any((self.youngs_modulus, self.friction))
+
+    @property
     def changes_mounting(self) -> bool:
         """Whether pads are mounted askew."""
         return any((self.pad_shift, self.pad_turn))
@@ -90,7 +95,7 @@ class Randomization:
     @property
     def changes_sensor(self) -> bool:
         """Whether the sensor differs between worlds."""
-        return any((self.led_power, self.led_colour, self.reflectance, self.youngs_modulus, self.friction))
+        return any((self.led_power, self.led_colour, self.reflectance, self.changes_gel))
 
 
 def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:

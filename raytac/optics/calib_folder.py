@@ -7,8 +7,8 @@
 ``gelmap.npy``     (H, W) height of the gel at rest [px], larger is farther from the camera; may be missing
 ``shadowTable.npz``  ``shadowDirections`` (n_dir,), ``shadowTable`` (3, n_dir, n_depth) objects: lists of numbers; may be missing
 ``params.json``    ``sensor`` (``pixmm``, ``num_bins``, ``h``, ``w``) and ``simulator``, as the PyPI package ``taxim`` has it
-``raytac.npz``     what the files above cannot say of a table of raytac's own: ``background``, ``covered``; settings are in
-                   ``params.json`` under ``raytac``
+``raytac.npz``     what the files above cannot say of a table of raytac's own: ``background``, ``covered``, and ``surround``, the
+                   coefficients (3, n, n, 6) of pixels that are not touched; settings are in ``params.json`` under ``raytac``
 =================  ===================================================================================================
 
 Everything is checked while it is read: kind, shape, size and finiteness. Pickled lists go through ``restricted_pickle``.
@@ -61,9 +61,9 @@ def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> Po
     params = read_params(folder / "params.json", pixel_pitch, gradients.shape[1], f0.shape)
     gel_map = _gel_map(folder / "gelmap.npy", f0.shape[:2]) if (folder / "gelmap.npy").exists() else None
     shadow = _shadow(folder / "shadowTable.npz", params.shadow) if (folder / "shadowTable.npz").exists() else None
-    covered, background = None, None
+    covered, background, surround = None, None, None
     if (folder / "raytac.npz").exists():
-        covered, background = _own_arrays(folder / "raytac.npz", gradients.shape[1], f0.shape)
+        covered, background, surround = _own_arrays(folder / "raytac.npz", gradients.shape[1], f0.shape)
     try:
         return PolyTable(
             gradients=gradients,
@@ -74,6 +74,7 @@ def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> Po
             slopes_of=params.slopes_of,
             rest_image=f0,
             gel_map=gel_map,
+            surround=surround,
             constants=params.constants,
             provenance=params.provenance,
         )
@@ -138,14 +139,17 @@ def _gel_map(path: Path, shape: tuple[int, int]) -> np.ndarray:
     return check_numbers(path, "", npy_array(path, "", data), shape).astype(np.float64)
 
 
-def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> tuple[np.ndarray | None, np.ndarray]:
+def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
     names = npz_names(path)
-    arrays = npz_arrays(path, ("background", *(name for name in ("covered",) if name in names)))
+    arrays = npz_arrays(path, ("background", *(name for name in ("covered", "surround") if name in names)))
+    surround = arrays.get("surround")
+    if surround is not None:
+        surround = check_numbers(path, "surround", surround, (3, n, n, 6)).astype(np.float64)
     covered = arrays.get("covered")
     if covered is not None and (covered.shape != (n, n) or covered.dtype != np.bool_):
         value = f"{covered.dtype} {covered.shape}"
         raise CalibrationError(f"must be bool of shape {(n, n)}", file=path, key="covered", value=value)
-    return covered, check_numbers(path, "background", arrays["background"], shape).astype(np.float32)
+    return covered, check_numbers(path, "background", arrays["background"], shape).astype(np.float32), surround
 
 
 def _shadow(path: Path, settings: dict[str, Any]) -> ShadowTable:
@@ -206,8 +210,8 @@ def save_calibration(table: PolyTable, folder: str | Path) -> None:
         np.savez(work / "polycalib.npz", bins=np.int64(table.n_bins), **gradients)
         np.savez(work / "dataPack.npz", f0=rest[..., ::-1], img_size=np.array(rest.shape))
         np.save(work / "gelmap.npy", np.zeros((height, width)) if table.gel_map is None else table.gel_map)
-        covered: dict[str, Any] = {} if table.covered is None else {"covered": table.covered}
-        np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **covered)
+        own: dict[str, Any] = {name: getattr(table, name) for name in ("covered", "surround") if getattr(table, name) is not None}
+        np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **own)
         if table.shadow is not None:
             _save_shadow(work / "shadowTable.npz", table.shadow)
         (work / "params.json").write_text(json.dumps(params_of(table), indent=2) + "\n", encoding="utf-8")

@@ -33,6 +33,7 @@ class MlpMode(ImageMode):
     """The optical mode ``mlp``: one sensor, one network, one resolution; batches of surfaces in, images out."""
 
     label = "mlp"
+    needs_contact = True
 
     def __init__(
         self,
@@ -73,7 +74,7 @@ class MlpMode(ImageMode):
         width, height = self.camera.resolution
         row, column = np.mgrid[:height, :width].astype(np.float32)
         u, v = self._place(np, column, row)
-        flat = forward(np, self.weights, inputs(np, 0 * u, 0 * u, u, v, self._view))
+        flat = forward(np, self.weights, inputs(np, 0 * u, 0 * u, 0 * u, u, v, self._view))
         rest = resized(self.weights.background, (width, height)) - LEVELS * np.stack(flat, axis=-1)
         padded = np.concatenate([rest, np.zeros_like(rest[..., :1])], axis=-1).astype(np.float32)
         return MlpArrays(self.mi.Float(np.ascontiguousarray(padded).ravel()))
@@ -83,7 +84,7 @@ class MlpMode(ImageMode):
         sx, sy, _ = seen.slopes(mi, seen.moved)
         _, p, column, row = seen.pixel(mi)
         u, v = self._place(dr, mi.Float(column), mi.Float(row))
-        change = forward(dr, self.weights, inputs(dr, sx, sy, u, v, self._view))
+        change = forward(dr, self.weights, inputs(dr, sx, sy, mi.Float(seen.contact), u, v, self._view))
         rest = dr.gather(mi.Vector4f, inputs_.rest, p)
         return [LEVELS * c + rest[k] for k, c in enumerate(change)], mi.UInt8(0)
 

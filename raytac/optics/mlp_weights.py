@@ -3,11 +3,12 @@
 Zhao, Qian, Duan and Luo, FOTS (RA-L 2024), map normal and position to colour by a network of three hidden layers of 32; Si et al.,
 DiffTactile (ICLR 2024), give theirs positions in a frequency code and the direction of view. Here the inputs are
 
-    3 (n_x, n_y, 1 − n_z), 0.3 (u, v), 0.03 (sin, cos) of π u, π v, 2 π u and 2 π v, 0.3 (x, y) of the unit view direction,
+    3 (n_x, n_y, 1 − n_z), 0.3 (u, v), 0.03 (sin, cos) of π u, π v, 2 π u and 2 π v, 0.3 (x, y) of the unit view direction, c,
 
-with n the normal of the surface −displacement and u, v in [−1, 1] over the image; the factors hold a network back from learning places by
-heart where presses are few. Between layers stands ReLU, and the output is the difference from the image at rest over ``LEVELS``. What it
-says of a pixel that has not moved is taken off, so that the image at rest is the background exactly.
+with n the normal of the surface −displacement, u, v in [−1, 1] over the image and c = 1 where the object touches, else 0 (in neither
+paper: the apex of a press and the skirt around it have slopes alike but not colours). The factors hold a network back from learning
+places by heart where presses are few. Between layers stands ReLU, and the output is the difference from the image at rest over
+``LEVELS``. What it says of a pixel that has not moved is taken off, so that the image at rest is the background exactly.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from raytac.specs.sensor import SensorSpec
 
 __all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_size", "view_slope"]
 
-INPUTS = 15
+INPUTS = 16
 LEVELS = 100.0
 """Levels that an output of 1 stands for."""
 _LARGEST = 256
@@ -58,14 +59,14 @@ def view_slope(sensor: SensorSpec) -> tuple[float, float]:
     return tuple(0.5 * n * p / distance for n, p in zip(camera.resolution, camera.pixel_pitch, strict=True))  # type: ignore[return-value]
 
 
-def inputs(ops: Any, slope_x: Any, slope_y: Any, u: Any, v: Any, view: tuple[float, float]) -> list[Any]:
-    """The network's ``INPUTS`` arrays of slopes of the displacement and places u, v; ``ops`` is NumPy or Dr.Jit."""
+def inputs(ops: Any, slope_x: Any, slope_y: Any, touched: Any, u: Any, v: Any, view: tuple[float, float]) -> list[Any]:
+    """The network's ``INPUTS`` arrays of slopes of the displacement, c (0. or 1.) and places u, v; ``ops`` is NumPy or Dr.Jit."""
     nz = 1 / ops.sqrt(slope_x * slope_x + slope_y * slope_y + 1)
     tx, ty = view[0] * u, view[1] * v
     wz = 1 / ops.sqrt(tx * tx + ty * ty + 1)
     codes = [f(k * np.pi * w) for k in (1, 2) for w in (u, v) for f in (ops.sin, ops.cos)]
     normal = [3 * slope_x * nz, 3 * slope_y * nz, 3 * (1 - nz)]
-    return [*normal, *(0.3 * w for w in (u, v)), *(0.03 * c for c in codes), 0.3 * tx * wz, 0.3 * ty * wz]
+    return [*normal, *(0.3 * w for w in (u, v)), *(0.03 * c for c in codes), 0.3 * tx * wz, 0.3 * ty * wz, touched]
 
 
 def forward(ops: Any, weights: MlpWeights, x: list[Any]) -> list[Any]:

@@ -125,8 +125,8 @@ class PolyTable:
     gradients: np.ndarray
     """Coefficients [levels], shape (3, n_bins, n_bins, 6), float64: channel, magnitude bin, direction bin, monomial."""
     covered: np.ndarray | None
-    """Bins that a calibration sample reached, shape (n_bins, n_bins), bool; the others hold a fill (``provenance["fill"]`` says
-    which). None if that is not known, as of upstream's folders."""
+    """Bins of ``gradients`` that a calibration sample reached, shape (n_bins, n_bins), bool; the others hold a fill
+    (``provenance["fill"]`` says which). None if that is not known, as of upstream's folders."""
     background: np.ndarray
     """What the differences are added to [levels], shape (H, W, 3), float32: already processed."""
     pixel_pitch: tuple[float, float]
@@ -139,6 +139,9 @@ class PolyTable:
     """The image at rest as it was taken, shape (H, W, 3), uint8, for ``save_calibration``; None: the rounded background."""
     gel_map: np.ndarray | None = None
     """Height of the gel at rest as upstream stores it [calibration pixels], shape (H, W), larger is farther from the camera."""
+    surround: np.ndarray | None = None
+    """Coefficients where the object does not touch, as ``gradients``, which then hold for touched pixels alone: the apex of a press and the
+    skirt around it have slopes alike but not colours. None: one sheet serves both (upstream)."""
     constants: TaximConstants = TaximConstants()
     provenance: dict[str, str] = field(default_factory=dict)
     """Where the table came from, text by name: ``source``, ``sensor``, ``fill``, …"""
@@ -149,6 +152,9 @@ class PolyTable:
             raise InputError("gradients", value=shape, rule="must have shape (3, n_bins, n_bins, 6), n_bins >= 2")
         if not np.isfinite(self.gradients).all():
             raise InputError("gradients", value=self.gradients.dtype, rule="must be finite")
+        if self.surround is not None and (self.surround.shape != shape or not np.isfinite(self.surround).all()):
+            rule = f"must be finite and of the gradients' shape {shape}, or None"
+            raise InputError("surround", value=self.surround.shape, rule=rule)
         if self.covered is not None and (self.covered.shape != shape[1:3] or self.covered.dtype != np.bool_):
             value = f"{self.covered.dtype} {self.covered.shape}"
             raise InputError("covered", value=value, rule=f"must be bool of shape {shape[1:3]}, or None")

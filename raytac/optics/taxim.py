@@ -32,7 +32,7 @@ class TableArrays:
     """Device arrays of a table: what a recorded frame reads besides the surface."""
 
     bins: Any
-    """20 floats a bin: 6 coefficients of each channel, whether it is covered, and one unused."""
+    """20 floats a bin: 6 coefficients of each channel, whether it is covered, and one unused; all bins of ``surround`` follow."""
     background: Any
     """4 floats a pixel, the last unused."""
     shadow: ShadowArrays | None
@@ -74,7 +74,10 @@ class TableShader:
         magnitude = dr.atan(dr.sqrt(sx * sx + sy * sy))
         i = dr.minimum(mi.UInt32(magnitude * ((n - 1) / (0.5 * np.pi))), n - 1)
         j = dr.minimum(mi.UInt32(dr.maximum(direction + np.pi, 0) * ((n - 1) / (2 * np.pi))), n - 1)
-        packet = [dr.gather(mi.Vector4f, inputs.bins, (i * n + j) * 5 + k) for k in range(5)]
+        which = i * n + j
+        if table.surround is not None:
+            which += dr.select(seen.contact == 0, mi.UInt32(n * n), 0)
+        packet = [dr.gather(mi.Vector4f, inputs.bins, which * 5 + k) for k in range(5)]
         c = [packet[k][m] for k in range(5) for m in range(4)]
         x = (mi.Float(column) + 0.5) * self.scale[0] - 0.5
         y = (mi.Float(row) + 0.5) * self.scale[1] - 0.5
@@ -134,7 +137,7 @@ class TaximMode(ImageMode):
         if abs(ratio - 1) > _ASPECT_TOLERANCE:
             rule = f"must have the aspect ratio of the table's image, {columns}x{rows}, within {100 * _ASPECT_TOLERANCE:.0f} %"
             raise InputError("resolution", value=f"{width}x{height}", rule=rule)
-        self.needs_contact = self.shadow or self.table.covered is not None
+        self.needs_contact = self.shadow or self.table.covered is not None or self.table.surround is not None
         self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadow)
 
     @property
@@ -194,9 +197,11 @@ def _table(calibration: object, sensor: SensorSpec, device: str) -> PolyTable:
 
 def _packed_bins(table: PolyTable) -> np.ndarray:
     n = table.n_bins
-    packed = np.zeros((n, n, 20), dtype=np.float32)
-    packed[..., :18] = np.moveaxis(table.gradients, 0, 2).reshape(n, n, 18)
-    packed[..., 18] = 1 if table.covered is None else table.covered
+    sheets = [table.gradients] if table.surround is None else [table.gradients, table.surround]
+    packed = np.zeros((len(sheets), n, n, 20), dtype=np.float32)
+    for own, sheet in zip(packed, sheets, strict=True):
+        own[..., :18] = np.moveaxis(sheet, 0, 2).reshape(n, n, 18)
+        own[..., 18] = 1 if table.covered is None else table.covered
     return packed.ravel()
 
 

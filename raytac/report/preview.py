@@ -118,7 +118,9 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
     if data.markers is not None:
         panels.append(lambda axes: _marker_panel(axes, data))
     if data.traction is not None:
-        panels += [lambda axes: _pressure_panel(axes, data), lambda axes: _shear_panel(axes, data)]
+        panels.append(lambda axes: _pressure_panel(axes, data))
+        if _is_sheared(data):
+            panels.append(lambda axes: _shear_panel(axes, data))
     with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
         return _lay_out(panels, data)
 
@@ -211,9 +213,14 @@ def _traction_title(kind: str, data: PreviewData) -> str:
     return f"{kind} traction [kPa]" + (", rest place" if data.traction_at_rest else "")
 
 
+def _is_sheared(data: PreviewData) -> bool:
+    """Whether there is any shear traction; a map of none would be black and say nothing."""
+    return data.traction is not None and bool(data.traction[..., :2].any())
+
+
 def _pressure_panel(axes: Axes, data: PreviewData) -> None:
     assert data.traction is not None
-    _map_axes(axes, data, _traction_title("normal", data))
+    _map_axes(axes, data, _traction_title("normal", data) + ("" if _is_sheared(data) else ", no shear"))
     pressure = -1e-3 * data.traction[..., 2]
     extent = _grid_extent_mm(data.grid)
     _colour_bar(axes, axes.imshow(pressure, extent=extent, cmap="magma", vmin=0.0, vmax=max(float(pressure.max()), 1e-3)))

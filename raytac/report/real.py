@@ -27,6 +27,9 @@ from raytac.specs import SensorSpec
 
 __all__ = ["ABLATIONS", "Ablation", "RealSettings", "compare_real"]
 
+SHOWN = 3
+"""Presses on the image sheet: in true colour, with their noise, more make a large file."""
+
 
 @dataclass(frozen=True)
 class Ablation:
@@ -37,6 +40,10 @@ class Ablation:
     """Blocks of parameters that stay at their start."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the ray tracer."""
+    prior: str | None = None
+    """Name of another strength of priors than that of the comparison."""
+    settle: bool = True
+    """Whether the image at rest is averaged (``Photographs.settled``)."""
     other_shadows: bool = False
     """Cast shadows where the comparison has none, and none where it has."""
 
@@ -70,6 +77,8 @@ ABLATIONS: dict[str, Ablation] = {
     "no_response_curve": Ablation(sensor=_linear, fixed=("stray",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": Ablation(fixed=("slope",)),
+    "one_photograph_at_rest": Ablation(settle=False),
+    "untied_leds": Ablation(prior="free"),
 }
 """By the name of their keys in ``metrics.json``."""
 
@@ -79,9 +88,13 @@ class RealSettings:
     """What is compared."""
 
     folds: int = 5
+    tested: int | None = None
+    """Folds that are fitted and tested, the first ones; None is all."""
     regions: bool = True
     """Also half of the pad to half, and shallow to deep."""
     ablations: bool = True
+    prior: str | None = None
+    """Name of the strength of priors; None chooses it within the presses that are fitted to."""
     starts: int = 3
     rounds: int = 3
     shadows: bool = False
@@ -99,7 +112,7 @@ def compare_real(
         InputError: a split that leaves too few presses.
     """
     began = time.perf_counter() if began is None else began
-    splits: list[tuple[str, Split]] = [("press", split) for split in by_press(len(presses), settings.folds)]
+    splits: list[tuple[str, Split]] = [("press", split) for split in by_press(len(presses), settings.folds)[: settings.tested]]
     if settings.regions:
         splits += [("left_right", by_half(presses)[0]), ("right_left", by_half(presses)[1])]
         splits += [("shallow_deep", shallow_to_deep(presses))]
@@ -109,11 +122,15 @@ def compare_real(
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}
+    priors: dict[str, list[str]] = {}
+    starts: dict[str, list[tuple[float, ...]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
     with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
         with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
             for number, (kind, (train, test)) in enumerate(splits):
                 models = _fitted(sensor, shots.take(train), settings, bar)
+                priors.setdefault(kind, []).append(models.prior)
+                starts.setdefault(kind, []).append(models.fitted.start_errors)
                 seen, labelled = _tested(models, sensor, shots.take(test))
                 for where, found in (("", seen), ("labelled_", labelled)):
                     for mode, stack in found.items():
@@ -131,7 +148,16 @@ def compare_real(
                 one = ABLATIONS[name]
                 changed = one.sensor(sensor)
                 options = {"shadows": settings.shadows != one.other_shadows, **one.options}
-                models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), fixed=one.fixed, options=options)
+                models = _fitted(
+                    changed,
+                    shots.take(train),
+                    settings,
+                    bar,
+                    modes=("raytrace",),
+                    one=one,
+                    prior=one.prior or priors["press"][0],
+                    options=options,
+                )
                 seen, _ = _tested(models, changed, shots.take(test))
                 for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
                     metrics[f"ablation.{name}.{key}"] = value
@@ -142,11 +168,18 @@ def compare_real(
             prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
             for mode, of in by_mode.items():
                 metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
+        metrics |= {f"prior.{kind}": ", ".join(of) for kind, of in priors.items()}
+        metrics |= {
+            f"start_errors.{kind}_{k}": ", ".join(f"{error:.3f}" for error in errors)
+            for kind, of in starts.items()
+            for k, errors in enumerate(of)
+        }
         metrics["noise_floor"] = noise_floor(sensor, shots)
         head: dict[str, Metric] = {"command": "compare-real", "device": device, "seed": settings.seed, "sensor": sensor.name}
         head |= {
             "presses": len(shots.presses),
             "folds": settings.folds,
+            "tested_folds": len(priors["press"]),
             "shadows": int(settings.shadows),
             "starts": settings.starts,
             "rounds": settings.rounds,
@@ -157,7 +190,7 @@ def compare_real(
         from raytac.report.real_figure import draw, table_text
 
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
-        shown = sorted(images)[:: max(1, len(images) // 6)][:6]
+        shown = sorted(images)[len(images) // (2 * SHOWN) :: max(1, len(images) // SHOWN)][:SHOWN]
         draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")
         write_metrics(folder / "metrics.json", head | metrics | {"wall_s": time.perf_counter() - began})
     return [out / name for name in ("real.md", "real.png", "metrics.json")]
@@ -170,18 +203,22 @@ def _fitted(
     bar: Any,
     *,
     modes: tuple[str, ...] = MODES,
-    fixed: tuple[str, ...] = (),
+    one: Ablation | None = None,
+    prior: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Models:
+    one = Ablation() if one is None else one
     return fit_models(
         sensor,
         shots,
-        settings=FitSettings(fixed=("gamma", *fixed)),
+        settings=FitSettings(fixed=("gamma", *one.fixed)),
         modes=modes,
         device=settings.device,
         seed=settings.seed,
         starts=settings.starts,
         rounds=settings.rounds,
+        settle=one.settle,
+        prior=settings.prior if prior is None else prior,
         options={"shadows": settings.shadows} if options is None else options,
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
     )

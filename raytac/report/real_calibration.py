@@ -44,6 +44,7 @@ def run_calibrate_optics(
     holdout: int,
     starts: int,
     rounds: int,
+    prior: str | None,
     shadows: bool,
     device: str,
     seed: int,
@@ -78,6 +79,7 @@ def run_calibrate_optics(
                 seed=seed,
                 starts=starts,
                 rounds=rounds,
+                prior=prior,
                 options={"shadows": shadows},
                 tick=tick,
             )
@@ -89,6 +91,7 @@ def run_calibrate_optics(
             "shadows": int(shadows),
             "starts": starts,
             "rounds": rounds,
+            "prior": models.prior,
             "leds": len(sensor.lights.leds),
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             "presses.fitted": int((~held).sum()),

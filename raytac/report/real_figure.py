@@ -68,7 +68,7 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
 
     modes = [(key, name) for key, name in _ROWS if key in images[0] and key != "background"]
     columns = ["photograph", *(name for _, name in modes), *(f"{name}, error × 4" for _, name in modes)]
-    with plt.rc_context({"font.size": 7}):
+    with plt.rc_context({"font.size": 6.5}):
         figure, axes = plt.subplots(
             len(real), len(columns), figsize=(1.1 * len(columns), 1.12 * len(real)), squeeze=False, layout="constrained"
         )
@@ -81,5 +81,5 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
                 axis.set(xticks=[], yticks=[])
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
-        figure.savefig(path, dpi=150)
+        figure.savefig(path, dpi=115)
         plt.close(figure)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import press_samples
+from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
 from raytac.calibrate.table_fit import fit_table
 from raytac.gel.pad import make_grid
@@ -37,6 +39,10 @@ class Models:
     """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
 
     fitted: Fitted
+    rest: np.ndarray
+    """The image at rest of all modes [levels], (H, W, 3)."""
+    prior: str
+    """Name of the strength of priors (``STRENGTHS``)."""
     modes: dict[str, OpticalMode]
     device: str
     options: Mapping[str, Any]
@@ -44,7 +50,8 @@ class Models:
 
     def circles(self, shots: Photographs) -> np.ndarray:
         """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
-        return refine_circles(self.fitted.sensor, shots, self.fitted.state, device=self.device, options=self.options)
+        own = dataclasses.replace(shots, background=self.rest)
+        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
 
 
 def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
@@ -64,14 +71,24 @@ def fit_models(
     seed: int = 0,
     starts: int = 3,
     rounds: int = 3,
+    settle: bool = True,
+    prior: str | None = None,
     options: Mapping[str, Any] | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
     """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
 
+    ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
+    ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
+
     Raises as ``fit_lights``.
     """
     options = {} if options is None else options
+    settings = FitSettings() if settings is None else settings
+    shots = shots.settled(sensor) if settle else shots
+    if prior is None:
+        prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
+    settings = dataclasses.replace(settings, **STRENGTHS[prior])
     fitted = fit_lights(
         sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
     )
@@ -87,7 +104,7 @@ def fit_models(
             built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
         else:
             built[name] = PhongMode(sensor, background=background.astype(np.uint8), device=device)
-    return Models(fitted, built, device, options)
+    return Models(fitted, background, prior, built, device, options)
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.photographs import FAR, Photographs
 from raytac.errors import BackendError
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
@@ -13,8 +13,6 @@ __all__ = ["BOX_MARGIN", "noise_floor", "press_scores", "summary"]
 
 BOX_MARGIN = 15
 """Pixels that the box reaches beyond the labelled circle."""
-FAR = 3.0
-"""Radii from a contact's centre beyond which a press changes nothing."""
 
 
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:

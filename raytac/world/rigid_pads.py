@@ -200,7 +200,7 @@ class RigidPads:
         found, models, weight = [], self._models, self._models.inverse_weight
         some = [datas[b] for b in envs.tolist()]
         world_from_body = [body_poses(some, body.index) for body in self.bodies]
-        for name, pad in self.pads.items():
+        for sensor, (name, pad) in enumerate(self.pads.items()):
             world_from_pad = site_poses(some, pad.site)
             for i, body in enumerate(self.bodies):
                 compliance = weight[:, pad.body] + weight[:, body.index]
@@ -218,7 +218,11 @@ class RigidPads:
                         law = self._laws[b][name, i] = pad.overlap.law(touches, k)
                     contact = self._forms[name, i]
                     contact.frame[:], contact.pos[:] = frames[k], places[k]
-                    self._load(contact, pad, float(touches.depth[k]), law, float(compliance[b]), float(models.gel_friction[b, i]))
+                    friction = float(models.friction_on_gel[b, i])
+                    if np.isnan(friction):
+                        friction = float(models.gel_friction[b, sensor])
+                    depth, softer = float(touches.depth[k]), float(models.gel_stiffness[b, sensor])
+                    self._load(contact, depth, law, softer, float(compliance[b]), friction)
                     if mujoco.mj_addContact(models[b], datas[b], contact) != 0:
                         failed[b] = True
                     else:
@@ -235,20 +239,21 @@ class RigidPads:
         contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
         return contact
 
-    def _load(self, contact: mujoco.MjContact, pad: _Pad, depth: float, law: LoadLaw, compliance: float, friction: float) -> None:
-        """Stiffness and friction of a contact, from gel to body; a coefficient of NaN is the gel's own.
+    def _load(
+        self, contact: mujoco.MjContact, depth: float, law: LoadLaw, factor: float, compliance: float, friction: float
+    ) -> None:
+        """Stiffness and friction of a contact, from gel to body; ``factor`` of the modulus, to which the law is proportional.
 
         A contact of the direct form, stiffness s, impedance d, on a compliance A (MuJoCo's estimate of J M⁻¹ Jᵀ) is at rest a spring of
         K = s / ((1 − d) A): see ``contact_solref``.
         """
         contact.dist = -depth
-        natural = law.secant_stiffness(depth) * compliance
+        natural = factor * law.secant_stiffness(depth) * compliance
         loss = min(max((_RATE / float(self.model.opt.timestep)) ** 2 / natural, 1e-3), 0.5)  # 1 − d
         stiffness = natural * loss
         contact.solimp[:] = 1.0 - loss, 1.0 - loss, 1e-3, 0.5, 2.0
         contact.solref[:] = -stiffness, -2.0 * stiffness**0.5
         radius = law.contact_radius(depth)
-        friction = pad.spec.gelpad.friction if np.isnan(friction) else friction
         least = 1e-6  # MuJoCo wants them positive
         rolling = max(3.0 / 16.0 * _HYSTERESIS * radius, least)
         spin = max(3.0 * np.pi / 16.0 * friction * radius, least)

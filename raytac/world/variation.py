@@ -1,4 +1,4 @@
-"""Environments of one world that differ: masses, friction, and pads that do not sit where the drawing has them.
+"""Environments of one world that differ: masses, friction, gels, and pads that do not sit where the drawing has them.
 
 MuJoCo keeps such numbers in its model, of which a world has one for all environments. An environment that differs gets a model of its own,
 the scene's with these numbers changed; what MuJoCo derives from them (inverse weights) is computed anew.
@@ -32,6 +32,10 @@ class Variation:
     """Free body to factors (n,) of its mass and inertia."""
     friction: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Body to factors (n,) of the coefficients that the scene gives it, against gel and against all else; none that it leaves out."""
+    gel_stiffness: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Sensor to factors (n,) of its gel's Young's modulus."""
+    gel_friction: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Sensor to factors (n,) of its gel's own coefficient of friction, which holds for bodies that the scene gives none."""
     mounting: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Sensor to ``nominal_from_pad`` (n, 4, 4): where its pad is in the frame in which the scene has the pad."""
 
@@ -41,10 +45,14 @@ class EnvironmentModels:
 
     Attributes:
         inverse_weight: ``body_invweight0`` of translations [1/kg], (B, bodies of the model).
-        gel_friction: coefficients against gel (B, bodies of the scene); NaN is the gel's own.
+        friction_on_gel: coefficients against gel (B, bodies of the scene); NaN is the gel's own.
+        gel_stiffness: factors of the gels' moduli (B, sensors).
+        gel_friction: the gels' own coefficients (B, sensors).
     """
 
     inverse_weight: np.ndarray
+    friction_on_gel: np.ndarray
+    gel_stiffness: np.ndarray
     gel_friction: np.ndarray
 
     def __init__(self, composed: ComposedScene, num_envs: int) -> None:
@@ -54,7 +62,10 @@ class EnvironmentModels:
         given = [np.nan if (own := body.spec.friction_on_gel) is None else own for body in self._bodies]
         self._scene_friction = np.array(given, float)
         self.inverse_weight = np.repeat(composed.model.body_invweight0[None, :, 0], num_envs, axis=0)
-        self.gel_friction = np.repeat(self._scene_friction[None], num_envs, axis=0)
+        self.friction_on_gel = np.repeat(self._scene_friction[None], num_envs, axis=0)
+        self._scene_gel_friction = np.array([spec.gelpad.friction for spec in composed.sensor_specs])
+        self.gel_friction = np.repeat(self._scene_gel_friction[None], num_envs, axis=0)
+        self.gel_stiffness = np.ones_like(self.gel_friction)
         self._scratch: mujoco.MjData | None = None
 
     def __getitem__(self, env: int) -> mujoco.MjModel:
@@ -64,31 +75,38 @@ class EnvironmentModels:
         """Whether any of these environments has a model of its own."""
         return any(self._models[b] is not self._composed.model for b in envs)
 
-    def snapshot(self) -> tuple[list[mujoco.MjModel], np.ndarray, np.ndarray]:
+    def snapshot(self) -> tuple[list[mujoco.MjModel], list[np.ndarray]]:
         """What ``restore`` takes."""
-        return list(self._models), self.inverse_weight.copy(), self.gel_friction.copy()
+        return list(self._models), [values.copy() for values in self._numbers()]
 
-    def restore(self, before: tuple[list[mujoco.MjModel], np.ndarray, np.ndarray]) -> None:
+    def restore(self, before: tuple[list[mujoco.MjModel], list[np.ndarray]]) -> None:
         """As at a ``snapshot``."""
-        self._models[:], self.inverse_weight[:], self.gel_friction[:] = before
+        self._models[:] = before[0]
+        for values, old in zip(self._numbers(), before[1], strict=True):
+            values[:] = old
+
+    def _numbers(self) -> tuple[np.ndarray, ...]:
+        return self.inverse_weight, self.friction_on_gel, self.gel_stiffness, self.gel_friction
 
     def check(self, variation: Variation, count: int, *, rigid: bool) -> None:
         """Refuse what cannot be.
 
         Args:
             variation: of ``count`` environments.
-            rigid: whether pads are rigid: the solver of simulated ones has the same bodies in all environments.
+            rigid: whether pads are rigid: the solver of simulated ones has the same bodies and gels in all environments.
 
         Raises:
             InputError: a name that is not there, factors that are not positive and finite, poses that are not rigid, arrays of another
-                length, or bodies that differ with simulated pads.
+                length, or bodies or gels that differ with simulated pads.
         """
         free = [body.spec.name for body in self._bodies if body.spec.dynamics == "free"]
-        names = {"mass": free, "friction": list(self._composed.bodies), "mounting": [m.name for m in self._composed.sensors]}
+        sensors = [mounted.name for mounted in self._composed.sensors]
+        names = {"mass": free, "friction": list(self._composed.bodies)}
+        names |= dict.fromkeys(("gel_stiffness", "gel_friction", "mounting"), sensors)
         for what, known in names.items():
             given: Mapping[str, np.ndarray] = getattr(variation, what)
             if given and what != "mounting" and not rigid:
-                rule = "needs the rigid pad: the solver of simulated pads has the same bodies in all environments"
+                rule = "needs the rigid pad: the solver of simulated pads has the same bodies and gels in all environments"
                 raise InputError(f"variation.{what}", value=sorted(given), rule=rule)
             for name, values in given.items():
                 label = f"variation.{what}[{name!r}]"
@@ -109,7 +127,8 @@ class EnvironmentModels:
         """Give environments models with what is checked and theirs; what they had of their own before is gone."""
         for row, b in enumerate(envs):
             own = self._models[b] = copy(self._composed.model)
-            self.gel_friction[b] = self._scene_friction
+            self.friction_on_gel[b] = self._scene_friction
+            self.gel_stiffness[b], self.gel_friction[b] = 1.0, self._scene_gel_friction
             for i, body in enumerate(self._bodies):
                 name, index = body.spec.name, body.index
                 if name in variation.mass:
@@ -118,11 +137,15 @@ class EnvironmentModels:
                     own.body_inertia[index] *= factor
                 if name in variation.friction:
                     factor = float(variation.friction[name][row])
-                    self.gel_friction[b, i] *= factor
+                    self.friction_on_gel[b, i] *= factor
                     if body.spec.friction is not None:
                         first = int(own.body_geomadr[index])
                         own.geom_friction[first : first + int(own.body_geomnum[index]), 0] *= factor
-            for mounted in self._composed.sensors:
+            for i, mounted in enumerate(self._composed.sensors):
+                if mounted.name in variation.gel_stiffness:
+                    self.gel_stiffness[b, i] = variation.gel_stiffness[mounted.name][row]
+                if mounted.name in variation.gel_friction:
+                    self.gel_friction[b, i] *= variation.gel_friction[mounted.name][row]
                 if mounted.name in variation.mounting:
                     at = np.broadcast_to(variation.mounting[mounted.name], (len(envs), 4, 4))[row]
                     index = int(own.body(mounted.body).id)

@@ -11,7 +11,9 @@ from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
+from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import fit_lights, refine_circles
+from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
 from raytac.gel.surface import GelSurface
@@ -178,6 +180,42 @@ def test_parameters_and_light_file_are_inverse(sensor: SensorSpec) -> None:
     assert p.glow.min() > 0
 
 
+def test_ties_hold_at_mirrored_leds_and_nowhere_else(sensor: SensorSpec) -> None:
+    """LEDs at walls are alike and mirrored; one that moves, turns, narrows or brightens is told, its mirror image with it is not."""
+    walls = with_lights(sensor, leds_at_walls(sensor, "5,3,4"))
+    p = LightParameters.of(walls, np.full((8, 8, 3), 90.0))
+    x = np.concatenate([p.leds.ravel(), p.power.ravel(), np.zeros(9)])
+    ties = side_ties(p, len(x))
+    np.testing.assert_allclose(ties.off(x), 0, atol=1e-9)
+    last = {"red": 4, "green": 7, "blue": 11}
+    for layer, first in (("red", 0), ("green", 5), ("blue", 8)):
+        signs = (-1, 1, 1, -1, 1) if layer != "green" else (1, -1, 1, -1, 1)
+        for k, sign in enumerate(signs):
+            one, both = p.leds.copy(), p.leds.copy()
+            one[first, k] += 0.3
+            both[first, k] += 0.3
+            both[last[layer], k] += 0.3 * sign
+            moved = [np.concatenate([leds.ravel(), x[p.leds.size :]]) for leds in (one, both)]
+            assert np.abs(ties.off(moved[0])).max() > 0.2
+            np.testing.assert_allclose(ties.off(moved[1]), 0, atol=1e-9)
+    for k in (6 * 2 + 5, p.leds.size + 3 * 9):
+        assert np.abs(ties.off(x + 0.3 * np.eye(len(x))[k])).max() > 0.2
+
+
+def test_strong_ties_are_kept_and_weak_ones_are_not(sensor: SensorSpec) -> None:
+    """Lights whose red LEDs have other powers, lobes and distances from the middle: a fit with strong ties makes them alike."""
+    walls = with_lights(sensor, leds_at_walls(sensor, "2,1,1"))
+    led = dataclasses.replace(walls.lights.leds[0], position=(-9e-3, -9.5e-3, -6e-3), lobe=4.0, power=(4e-5, 0.0, 0.0))
+    uneven = with_lights(sensor, dataclasses.replace(walls.lights, leds=(led, *walls.lights.leds[1:])))
+    shots, true = direct(uneven, circles(6))
+    off = {}
+    for ties in (0.0, 1e8):
+        settings = FitSettings(fixed=("gamma", "stray", "slope"), samples=(60, 40), ties=ties)
+        problem = DirectFit(uneven, shots, true, settings, factor=4)
+        off[ties] = np.abs(problem.ties.off(problem.flat(problem.solve(true, 15)))).max()
+    assert off[1e8] < 0.02 < 1 < off[0.0]
+
+
 def test_a_start_at_the_walls_is_a_sensor(sensor: SensorSpec) -> None:
     lights = leds_at_walls(sensor, "3,1,4")
     assert [led.layer for led in lights.leds] == ["red"] * 3 + ["green"] + ["blue"] * 4
@@ -188,3 +226,15 @@ def test_a_start_at_the_walls_is_a_sensor(sensor: SensorSpec) -> None:
     for bad in ("3,2", "3,2,0", "a,b,c", "1,2,3,4"):
         with pytest.raises(InputError, match="three whole numbers"):
             leds_at_walls(sensor, bad)
+
+
+def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSpec) -> None:
+    """Lights that begin 3 mm from where they are: a prior that nails them there serves worse, and the choice says so."""
+    shots, true = direct(sensor, circles(8))
+    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0]))
+    start = with_parameters(sensor, moved, shots.background)
+    settings = FitSettings(fixed=("gamma", "slope", "stray"))
+    found, errors = choose_strength(start, shots, settings, candidates={"nailed": {"prior": 1e7}, "free": {"prior": 30.0}})
+    assert found == "free" and errors["free"] < 0.6 * errors["nailed"], errors
+    with pytest.raises(InputError, match="at least 8"):
+        choose_strength(start, shots.take(np.arange(7)), settings)

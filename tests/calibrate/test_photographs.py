@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.calibrate.photographs import read_photographs
+from raytac.calibrate.photographs import Photographs, read_photographs
 from raytac.errors import InputError
 from raytac.io.png import write_png
 from raytac.specs import SensorSpec, load_sensor
@@ -19,6 +19,20 @@ RADIUS = 3.155e-3
 @pytest.fixture(scope="module")
 def sensor() -> SensorSpec:
     return load_sensor("gelsight_mini")
+
+
+def test_the_settled_image_at_rest_is_the_mean_of_what_no_press_reaches(sensor: SensorSpec) -> None:
+    """Two presses of noise about 90 and a photograph of 84: means of three values far from both, of two or one where contacts are."""
+    rng = np.random.default_rng(0)
+    circles = np.array([[80.0, 60.0, 20.0], [240.0, 180.0, 20.0]])
+    presses = 90 + rng.integers(-5, 6, (2, 240, 320, 3)).astype(float)
+    presses[0, 60, 80], presses[1, 180, 240] = 250.0, 250.0
+    shots = Photographs(np.full((240, 320, 3), 84.0), presses, circles, np.full(2, RADIUS))
+    found = shots.settled(sensor)
+    np.testing.assert_array_equal(found.background[120, 160], np.rint((84 + presses[:, 120, 160].sum(0)) / 3))
+    np.testing.assert_array_equal(found.background[60, 80], np.rint((84 + presses[1, 60, 80]) / 2))
+    np.testing.assert_array_equal(found.background[180, 240], np.rint((84 + presses[0, 180, 240]) / 2))
+    np.testing.assert_array_equal(found.presses, presses)
 
 
 def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> None:

@@ -14,9 +14,18 @@ from tests.conftest import Shader
 
 def test_quick_is_one_scene_under_both_pads(tmp_path, monkeypatch):
     monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
+    drawn, draw = [], physics_sheet.sheet_figure
+    monkeypatch.setattr(physics_sheet, "sheet_figure", lambda *args: drawn.append(draw(*args)) or drawn[-1])
     assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere,coin").run() == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "sheet.png"]
     assert read_png(tmp_path / "sheet.png").shape[2] == 3
+    maps = [axis.images[0] for axis in drawn[0].axes if axis.images and axis.images[0].get_array().ndim == 2]
+    assert len(maps) == 3  # two indentations and their difference
+    for shown in maps:
+        (low, high), values = shown.get_clim(), shown.get_array()
+        assert low <= values.min() < values.max() <= high  # no scale cuts anything off
+    (low, high), off = maps[2].get_clim(), maps[2].get_array()
+    assert high == -low and high - np.abs(off).max() <= physics_sheet.STEP_MM
     read = read_metrics(tmp_path / "metrics.json")
     assert not any(key.startswith("coin") for key in read)
     metrics = {key: float(value) for key, value in read.items() if key.startswith("sphere")}

@@ -42,6 +42,7 @@ def make_table(*, upstream: bool = False) -> PolyTable:
         (2e-5, 3e-5),
         ShadowTable(np.arange(7) * 0.9, values, lengths, 0.0, 0.05e-3, 0, 0.9, 2.0, 0.2, 0.1, "drop"),
         gel_map=rng.uniform(0, 3, shape),
+        surround=rng.normal(size=(3, n, n, 6)),
         constants=TaximConstants(ring_dilations=3, shadow_sigma=1.5),
         provenance={"source": "test"},
     )
@@ -56,7 +57,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_table_comes_back_as_it_was(folder: Path) -> None:
     table, back = make_table(), load_calibration(folder)
     assert sorted(path.name for path in folder.iterdir()) == sorted(CALIBRATION_FILES)
-    for name in ("gradients", "covered", "background", "gel_map"):
+    for name in ("gradients", "covered", "background", "gel_map", "surround"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
     np.testing.assert_array_equal(back.rest_image, np.rint(table.background))  # type: ignore[arg-type]
     assert back.slopes_of == "displacement" and back.constants == table.constants and back.provenance == table.provenance

@@ -28,6 +28,14 @@ def network(seed: int = 0) -> MlpWeights:
     return MlpWeights(matrices, tuple(rng.normal(0, 0.1, b) for b in sizes[1:]), background)
 
 
+def _told_by_touch() -> tuple[MlpWeights, MlpWeights]:
+    """Two networks that differ where the object touches, and nowhere else."""
+    weights = network(1)
+    matrix = weights.matrices[0].copy()
+    matrix[:, -1] += 1.0
+    return weights, dataclasses.replace(weights, matrices=(matrix, *weights.matrices[1:]))
+
+
 def test_at_rest_it_shows_the_background() -> None:
     weights, spec = network(), make_sensor_spec()
     mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
@@ -40,28 +48,35 @@ def test_a_pixels_colour_is_the_networks() -> None:
     """Against a plain matrix product, on the slopes of the displacement that the mode itself sees."""
     weights, spec = network(1), make_sensor_spec()
     grid = grid_of(spec)
-    pressed = surface(grid, ball(grid)[0])
+    height, contact = ball(grid)
+    pressed = surface(grid, height, contact=contact)
     mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
     levels = mode.render_levels(pressed)[0]
     _, moved = mode.image_heights(pressed)
+    # Nodes in contact through every pixel's centre: the ball's disc, where the coat is deepest.
+    only = [
+        MlpMode(spec, calibration=one, resolution=RESOLUTION, device="cpu").render_levels(pressed)[0] for one in _told_by_touch()
+    ]
+    touched = (np.abs(only[0] - only[1]).max(axis=-1) > 1).astype(float)
+    assert 0.01 < touched.mean() < 0.5 and moved[0][touched > 0].min() > 0
     sy, sx = np.gradient(moved[0].astype(float))
     sy *= mode.pitch[0] / mode.pitch[1]
     width, height = RESOLUTION
     u, v = np.meshgrid((np.arange(width) + 0.5) * 2 / width - 1, (np.arange(height) + 0.5) * 2 / height - 1)
 
-    def net(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
-        x = np.stack(inputs(np, slope_x, slope_y, u, v, view_slope(spec)), axis=-1)
+    def net(slope_x: np.ndarray, slope_y: np.ndarray, touched: np.ndarray) -> np.ndarray:
+        x = np.stack(inputs(np, slope_x, slope_y, touched, u, v, view_slope(spec)), axis=-1)
         for k, (matrix, offset) in enumerate(zip(weights.matrices, weights.offsets, strict=True)):
             x = x @ matrix.T + offset
             x = np.maximum(x, 0) if k < 2 else x
         return x
 
-    expected = weights.background + LEVELS * (net(sx, sy) - net(0 * u, 0 * u))
+    expected = weights.background + LEVELS * (net(sx, sy, touched) - net(0 * u, 0 * u, 0 * u))
     inner = np.s_[2:-2, 2:-2]
     assert np.abs(levels - weights.background)[inner].max() > 10, "the press must show"
     np.testing.assert_allclose(levels[inner], expected[inner], atol=0.05)
-    own = np.stack(forward(np, weights, inputs(np, sx, sy, u, v, view_slope(spec))), axis=-1)
-    np.testing.assert_allclose(own, net(sx, sy), atol=1e-9)
+    own = np.stack(forward(np, weights, inputs(np, sx, sy, touched, u, v, view_slope(spec))), axis=-1)
+    np.testing.assert_allclose(own, net(sx, sy, touched), atol=1e-9)
 
 
 def test_files_come_back_or_are_refused(tmp_path: Path) -> None:

@@ -127,6 +127,27 @@ def test_uncovered_bins_are_told(spec: SensorSpec, grid: PadGrid) -> None:
     assert TaximMode(spec, calibration=unknown, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered is None
 
 
+def test_touched_pixels_and_those_around_have_sheets_of_their_own(spec: SensorSpec, grid: PadGrid) -> None:
+    """Where the ball touches it shows the first sheet's table, elsewhere the second's; the two seen apart tell which pixel is which."""
+    one = make_table(spec, shadow=False)
+    other = replace(one, gradients=-0.5 * one.gradients)
+    both = replace(one, surround=other.gradients)
+    first, second, found = (
+        TaximMode(spec, calibration=table, resolution=RESOLUTION, device="cpu").render_levels(pressed(grid))[0]
+        for table in (one, other, both)
+    )
+    apart = np.abs(first - second).max(axis=-1) > 1
+    inside = apart & (np.abs(found - first).max(axis=-1) < 1e-3)
+    around = apart & (np.abs(found - second).max(axis=-1) < 1e-3)
+    assert (inside | around)[apart].all() and inside.sum() > 100 and around.sum() > 100
+    row, column = np.nonzero(inside)
+    reach = np.hypot(row - row.mean(), column - column.mean())
+    again_row, again_column = np.nonzero(around)
+    assert np.quantile(reach, 0.98) < np.quantile(np.hypot(again_row - row.mean(), again_column - column.mean()), 0.02) + 2
+    with pytest.raises(InputError, match="gradients' shape"):
+        replace(one, surround=one.gradients[:, :4, :4])
+
+
 def test_a_failed_environment_is_black_and_alone(spec: SensorSpec, grid: PadGrid) -> None:
     surfaces = surface(grid, ball(grid)[0], np.full(grid.shape, np.nan), contact=ball(grid)[1])
     mode = TaximMode(spec, calibration=make_table(spec), resolution=RESOLUTION, device="cpu")

@@ -89,10 +89,17 @@ def test_no_panel_runs_into_another(without: tuple[str, ...], data: PreviewData,
 
 
 def test_traction_says_whether_it_lies_where_the_coat_was_at_rest(data: PreviewData, sensor_spec: SensorSpec) -> None:
-    now = replace(data, traction=np.zeros((*data.height.shape, 3)))
+    now = replace(data, traction=np.full((*data.height.shape, 3), -1.0))
     for shown, end in ((now, "[kPa]"), (replace(now, traction_at_rest=True), "[kPa], rest place")):
         found = [title for title in titles(shown, sensor_spec) if "traction" in title]
         assert len(found) == 2 and all(title.endswith(end) for title in found)
+
+
+def test_without_shear_there_is_no_black_panel_of_it(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    pressed = np.zeros((*data.height.shape, 3))
+    pressed[..., 2] = -1e3
+    found = [title for title in titles(replace(data, traction=pressed), sensor_spec) if "traction" in title]
+    assert len(found) == 1 and found[0].endswith("normal traction [kPa], no shear")
 
 
 def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: SensorSpec) -> None:

@@ -12,7 +12,8 @@ from raytac.calibrate.splits import by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.real_data import FROM_SCRATCH, OWN_LEDS, read_data
+from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
+from raytac.errors import InputError
 from raytac.io.png import write_png
 from raytac.report.real_figure import table_text
 from raytac.report.real_score import noise_floor, press_scores, summary
@@ -105,3 +106,9 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
     scratch, own = (read_data(data, "gelsight_mini", None, sides)[0].lights for sides in (FROM_SCRATCH, OWN_LEDS))
     assert scratch.source is None and [sum(led.layer == c for led in scratch.leds) for c in ("red", "green", "blue")] == [5, 3, 4]
     assert own == SENSOR.lights
+
+
+def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
+    assert prior_of(INNER) is None and prior_of("tied") == "tied"
+    with pytest.raises(InputError, match="inner, free, tied"):
+        prior_of("strong")

@@ -1,0 +1,81 @@
+"""How strongly priors hold a fit, chosen by cross-validation within the presses that are fitted to.
+
+Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
+halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a
+model is judged on have no part in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from raytac.calibrate.direct_fit import SIGMA, DirectFit, FitSettings, FitState
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state
+from raytac.errors import InputError
+from raytac.specs import SensorSpec
+
+__all__ = ["STRENGTHS", "choose_strength"]
+
+STRENGTHS: dict[str, dict[str, float]] = {
+    "free": {"prior": 30.0, "ties": 0.0, "rest_weight": 0.3},
+    "tied": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.3},
+    "tied-dark": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.1},
+    "tied-darkest": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.03},
+}
+"""Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
+CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
+"""What is chosen from: that LEDs of a side are alike is taken for granted, as sensors are built so."""
+SAMPLES = (90, 45)
+"""Pixels of a press that count here, inside and outside its circle: the choice needs fewer than the fit."""
+STEPS, CIRCLE_STEPS = 40, 6
+"""Most steps of a fit, and of that of the tested presses' circles."""
+
+
+def choose_strength(
+    sensor: SensorSpec,
+    shots: Photographs,
+    settings: FitSettings,
+    *,
+    candidates: Mapping[str, Mapping[str, float]] = CHOICES,
+    seed: int = 0,
+    tick: Callable[[str, float], None] | None = None,
+) -> tuple[str, dict[str, float]]:
+    """Name of the candidate with the least error, and the error of each: mean absolute residual [levels] in contacts of other halves.
+
+    Raises:
+        InputError: too few presses to halve.
+    """
+    if len(shots.circles) < 2 * FEWEST:
+        rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or name one with --prior"
+        raise InputError("presses", value=len(shots.circles), rule=rule)
+    few = dataclasses.replace(settings, samples=SAMPLES)
+    held = dataclasses.replace(few, fixed=tuple(SIGMA))
+    errors = {}
+    for name, values in candidates.items():
+        own, found = dataclasses.replace(few, **values), []
+        for train, test in _halves(shots.circles):
+            fitted, tested = shots.take(train), shots.take(test)
+            begin = first_state(sensor, fitted, own, seed)
+            state = DirectFit(sensor, fitted, begin, own, factor=FACTOR, seed=seed).solve(begin, STEPS)
+            start = FitState(state.p, state.slopes, tested.circles.copy())
+            problem = DirectFit(sensor, tested, start, held, factor=FACTOR, seed=seed)
+            off, _ = problem.residuals(problem.solve(start, CIRCLE_STEPS))
+            found.append(float(np.abs(off[problem.inside]).mean()))
+            if tick is not None:
+                tick(f"prior {name}", found[-1])
+        errors[name] = float(np.mean(found))
+    return min(errors, key=errors.__getitem__), errors
+
+
+def _halves(circles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(fitted, tested): the half with the smaller x and the other, the reverse, and the same by y."""
+    splits = []
+    for axis in (0, 1):
+        order = np.argsort(circles[:, axis], kind="stable")
+        a, b = np.sort(order[: len(order) // 2]), np.sort(order[len(order) // 2 :])
+        splits += [(a, b), (b, a)]
+    return splits
