@@ -81,7 +81,9 @@ def draw_panels(panels: Mapping[str, Sequence[Path]], path: Path, *, columns: in
         if k % columns:
             one.set_ylabel("")
         above = {"loc": "lower left", "bbox_to_anchor": (-0.02, 0.99), "ncols": 2}  # curves may be anywhere
-        one.legend(frameon=False, fontsize="x-small", handlelength=1.6, handletextpad=0.5, columnspacing=1.0, borderpad=0.2, **above)
+        one.legend(
+            frameon=False, fontsize="x-small", handlelength=1.6, handletextpad=0.5, columnspacing=1.0, borderpad=0.2, **above
+        )
     figure.savefig(path, dpi=200)
     return path
 
