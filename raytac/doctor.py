@@ -206,7 +206,7 @@ PROBES = (
     ),
     Probe(
         "denoiser", _DENOISER, False,
-        "CPU: pip install raytac[denoise]; CUDA: the driver's nvoptix.bin in /usr/share/nvidia (containers often lack it)",
+        "CPU: pip install 'raytac[denoise]'; CUDA: the driver's nvoptix.bin in /usr/share/nvidia (containers often lack it)",
         _no_denoiser,
     ),
     Probe("mujoco", _MUJOCO, True, "pip install 'mujoco>=4.0,<5'"),

@@ -21,7 +21,7 @@ def check_pyarrow() -> None:
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
-        raise BackendError(f"a manifest needs pyarrow ({error}): `pip install raytac[dataset]`") from error
+        raise BackendError(f"a manifest needs pyarrow ({error}): `pip install 'raytac[dataset]'`") from error
 
 
 def write_manifest(folder: Path, records: Iterable[ShardRecord]) -> Path:

@@ -65,7 +65,7 @@ def render_on_ray(
     try:
         import ray
     except ImportError as error:
-        raise BackendError(f"engine='ray' needs Ray ({error}): `pip install raytac[ray]`") from error
+        raise BackendError(f"engine='ray' needs Ray ({error}): `pip install 'raytac[ray]'`") from error
     if workers is not None and workers < 1:
         raise InputError("workers", value=workers, rule="must be a whole number >= 1")
     ours = not ray.is_initialized()

@@ -20,6 +20,12 @@ _CLOSE = 0.5e-6
 """Motions that differ by less are the same [m]."""
 _STICKS = 2e-6
 """What should stick and moves less against the object does [m]."""
+_SLIDING = 0.05
+"""With less than this share of it sticking, all of a contact slides."""
+_SURE, _LOST = 0.3, 0.5
+"""Share of the motion in contact that the fine contact may miss: below the first the exchange is whole, above the second there is none."""
+_LEAST = 1e-4
+"""Places that bear less than this share of the greatest pressure do not count as in contact."""
 _ROUNDS, _STEPS = 6, 10
 """So often the object is moved on, and so many steps of the search for the traction each time."""
 _HOLDS = 200
@@ -86,7 +92,8 @@ class Grip:
     with the pressure p of the fine contact: its edge slips as C. Cattaneo (1938) and R. D. Mindlin (J. Appl. Mech. 16, 1949) have it,
     one coefficient for all of the contact and in one go, without a history. D is a rigid motion, and such that the mean of A τ over the
     contact, shift and turn, weighted by p, is that of v weighted by the mesh's normal forces: on meshes of any fineness that mean is nearly
-    the same, and it saturates when all slips.
+    the same. Where all slides and the mean is still less, μ p is raised in proportion: small strain knows too little pressure. And where
+    the contact does not move as such a one would (a bar that ploughs its ends through the gel as it turns), less is exchanged, or nothing.
 
     A is the layer's compliance wave by wave, as if the pad were continued by its mirror image, and E is of a mesh whose sides are so too:
     both drag the gel by nearly the same force, so that the true sides stay in u.
@@ -141,11 +148,12 @@ class Grip:
                 return np.zeros_like(dragged)
             waves = found.waves
         layer = self._back(waves, (self._vertex_x, self._vertex_y)).reshape(2, -1)
+        trust = _trust(layer.T[touching], dragged[touching], load[touching]) if waves.any() else 1.0
         compliance = self._compliance[:, :, :, touching]
         here = np.ascontiguousarray(compliance[:, :, touching].transpose(1, 2, 0, 3).reshape(2 * touching.sum(), -1))
         force = _held(here, dragged[touching].T.ravel().astype(np.float32))
         mesh = product(compliance.transpose(1, 2, 0, 3).reshape(-1, len(force)), force[:, None]).reshape(2, -1)
-        return (layer - mesh).T.astype(float)
+        return trust * (layer - mesh).T.astype(float)
 
     def hold(self, pressure: np.ndarray, goal: RigidMotion, friction: float) -> Held | None:
         """Friction under a ``pressure`` [Pa], (Ny, Nx) on the contact's fine grid, that moves the skin in contact by ``goal`` on the mean.
@@ -158,12 +166,12 @@ class Grip:
             now = (place + moved).reshape(-1, 2)
             return sampled(pressure, self._contact.x, self._contact.y, *now.T).reshape(place.shape[:2])
 
-        borne = pressed(goal.at(place), place) > 0.0
+        borne = pressed(goal.at(place), place) > _LEAST * pressure.max()
         if not borne.any():
             return None
         margin = 2 + int(0.3 * np.abs(goal.at(place)[borne]).max() / _SPACING)
         rows, columns = (_span(np.asarray(borne.any(axis=k)), margin) for k in (1, 0))
-        place = place[rows, columns]
+        place, borne = place[rows, columns], borne[rows, columns]
         to = tuple(m[:, columns].T for m in self._to_x), tuple(m[:, rows] for m in self._to_y)
         back = tuple(m[:, columns] for m in self._from_x), tuple(m[rows] for m in self._from_y)
 
@@ -183,13 +191,16 @@ class Grip:
             waves, moved = answer(traction)
             held = Held(place, traction, bound, moved, waves)
             mean = RigidMotion.of(np.moveaxis(moved, 0, -1).reshape(-1, 2), place.reshape(-1, 2), bound.ravel())
-            off = goal.at(place[bound > 0.0]) - mean.at(place[bound > 0.0])
+            at = place[bound > 0.0]
+            off = goal.at(at) - mean.at(at)
             sticks = np.hypot(*traction) < 0.999 * bound
             slip = np.hypot(*(moved - wanted))[sticks].max(initial=0.0)
             if np.abs(off).max() < _CLOSE and slip < _STICKS:
                 break
+            if sticks.sum() < _SLIDING * len(at):
+                friction *= max(float((goal.at(at) ** 2).sum() / (goal.at(at) * mean.at(at)).sum()), 1.0)
             motion = motion.plus(goal, mean)
-            bound = friction * pressed(np.moveaxis(moved, 0, -1), place)
+            bound = friction * np.where(borne, pressed(np.moveaxis(moved, 0, -1), place), 0.0)
             if not (bound > 0.0).any():
                 break
         return held
@@ -222,6 +233,12 @@ class Grip:
         """Motion [m] (2, Ny, Nx) over lines."""
         (cosines_x, sines_x), (cosines_y, sines_y) = lines
         return np.stack([sandwich(cosines_y, waves[0], sines_x), sandwich(sines_y, waves[1], cosines_x)])
+
+
+def _trust(found: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> float:
+    """How far the exchange goes, in [0, 1], by what it leaves unexplained of the way that the mesh ``moved`` in contact."""
+    left, whole = (float(weight @ (field**2).sum(axis=1)) for field in (found - moved, moved))
+    return float(np.clip((_LOST - np.sqrt(left / whole)) / (_LOST - _SURE), 0.0, 1.0))
 
 
 def _within(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:

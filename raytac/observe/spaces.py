@@ -66,7 +66,7 @@ def gymnasium_space(specs: Mapping[str, ArraySpec | Mapping[str, Any]]) -> gymna
     try:
         from gymnasium import spaces
     except ImportError as error:
-        raise BackendError(f"spaces need Gymnasium ({error}): `pip install raytac[rl]`") from error
+        raise BackendError(f"spaces need Gymnasium ({error}): `pip install 'raytac[rl]'`") from error
     made: dict[str, Any] = {}
     for name, spec in specs.items():
         if isinstance(spec, ArraySpec):

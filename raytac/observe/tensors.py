@@ -19,7 +19,7 @@ def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
     try:
         import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it
     except ImportError as error:
-        raise BackendError(f"tensors need PyTorch ({error}): `pip install raytac[rl]`") from error
+        raise BackendError(f"tensors need PyTorch ({error}): `pip install 'raytac[rl]'`") from error
     return {
         name: as_tensors(value) if isinstance(value, Mapping) else torch.from_dlpack(value) for name, value in observation.items()
     }

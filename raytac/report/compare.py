@@ -131,7 +131,7 @@ class CompareSettings:
             validate_press(spec, load_press(scene))
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
-            raise BackendError(f"the report needs {', '.join(missing)}: `pip install raytac[report]`")
+            raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
         if self.uses_solver:
             check_solver("a comparison with pad or markers")
 

@@ -69,7 +69,7 @@ def ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     try:
         from skimage.metrics import structural_similarity
     except ImportError as error:
-        raise BackendError("SSIM needs scikit-image: `pip install raytac[report]`") from error
+        raise BackendError("SSIM needs scikit-image: `pip install 'raytac[report]'`") from error
     if min(image.shape[:2]) < 2 * SSIM_BORDER + 1:
         rule = f"must be at least {2 * SSIM_BORDER + 1} pixels a side, the window of SSIM"
         raise InputError("image", value=image.shape, rule=rule)
@@ -101,7 +101,7 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
         BackendError: ``flip-evaluator`` is not installed.
     """
     if not has_flip():
-        raise BackendError("FLIP needs the package flip-evaluator: `pip install raytac[report]`, or leave FLIP out")
+        raise BackendError("FLIP needs the package flip-evaluator: `pip install 'raytac[report]'`, or leave FLIP out")
     import flip_evaluator
 
     one, two = (np.ascontiguousarray(a, dtype=np.float32) / np.float32(255) for a in (reference, image))

@@ -193,7 +193,7 @@ def _mink() -> Any:
     try:
         import mink
     except ImportError as error:
-        raise BackendError(f"inverse kinematics needs mink ({error}): `pip install raytac[robots]`") from error
+        raise BackendError(f"inverse kinematics needs mink ({error}): `pip install 'raytac[robots]'`") from error
     return mink
 
 

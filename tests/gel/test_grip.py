@@ -10,7 +10,7 @@ import pytest
 
 from raytac.gel.coat_surface import CoatSurface
 from raytac.gel.fine_contact import FineContact
-from raytac.gel.grip import Grip, RigidMotion
+from raytac.gel.grip import Grip, RigidMotion, _trust
 from raytac.gel.layer_compliance import layer_shear
 from raytac.gel.pad import make_grid
 from raytac.gel.skin_motion import SkinMotion, _share
@@ -108,7 +108,7 @@ def test_slip_begins_at_the_edge_and_never_exceeds_friction(contact, grip):
     pressure, friction = dome(contact[0]), 0.4
     normal = pressure.sum() * 4e-8
     slipping, forces = [], []
-    for shift in (3e-5, 6e-5, 1.2e-4, 1e-2):
+    for shift in (3e-5, 6e-5, 1.2e-4):
         held = grip.hold(pressure, motion(shift), friction)
         size, inside = np.hypot(*held.traction), held.bound > 0.0
         assert (size <= held.bound * 1.0001).all() and size.max() > 0.0
@@ -119,8 +119,25 @@ def test_slip_begins_at_the_edge_and_never_exceeds_friction(contact, grip):
         slipping.append(slips.sum() / inside.sum())
         forces.append(held.traction[0].sum() * 4e-8)
         assert abs(held.traction[1].sum()) < 1e-3 * held.traction[0].sum()
-    assert np.all(np.diff(slipping) > 0.0) and slipping[-1] > 0.99
-    assert np.all(np.diff(forces) > 0.0) and forces[-1] == pytest.approx(friction * normal, rel=0.01)
+    assert np.all(np.diff(slipping) > 0.0) and slipping[-1] < 0.9
+    assert np.all(np.diff(forces) > 0.0) and forces[-1] < friction * normal
+
+
+def test_where_all_slides_friction_is_as_large_as_the_motion_says(contact, grip):
+    """A mean motion that μ p cannot reach: traction in proportion to pressure, and more of it."""
+    goal = motion(0.0, 6e-4)
+    held = grip.hold(dome(contact[0]), goal, 0.4)
+    inside = held.bound > 0.0
+    assert (np.hypot(*held.traction) > 0.999 * held.bound)[inside].mean() > 0.9
+    assert held.bound.max() > 1.2 * 0.4 * dome(contact[0]).max()
+    mean = RigidMotion.of(np.moveaxis(held.moved, 0, -1).reshape(-1, 2), held.place.reshape(-1, 2), held.bound.ravel())
+    assert mean.shift == pytest.approx(goal.shift, abs=0.03 * 6e-4)
+
+
+def test_less_is_exchanged_where_the_contact_moved_otherwise():
+    moved, weight = np.random.default_rng(0).normal(size=(30, 2)), np.ones(30)
+    shares = [_trust((1.0 - missed) * moved, moved, weight) for missed in (0.0, 0.29, 0.4, 0.51, 1.0)]
+    assert shares == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
 
 
 def test_the_mean_motion_is_the_one_asked_for_also_where_the_edge_slips(contact, grip):
@@ -135,7 +152,7 @@ def test_the_mean_motion_is_the_one_asked_for_also_where_the_edge_slips(contact,
 def dragged(contact, x=0.0, y=0.0, turn=0.0):
     """A linear solution of the mesh that is held down and sticks, and what the skin is shown to do with the exchange and without."""
     fine, skin, compliance = contact
-    touching = np.hypot(*REST[:, :2].T) < RADIUS + 0.5e-3
+    touching = np.hypot(*REST[:, :2].T) < 2.2e-3
     v = len(REST)
     load = np.where(touching, 1.0 - (np.hypot(*REST[:, :2].T) / 4e-3) ** 2, 0.0) / touching.sum()
     goal = motion(x, y, turn).at(REST[:, :2])

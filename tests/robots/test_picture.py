@@ -5,8 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+
+from raytac.io.png import read_png
+
+ROOT = Path(__file__).parents[2]
 
 _SCRIPT = """
 import sys
@@ -36,11 +42,25 @@ for make in (one_sensor_panda, two_finger_panda):
 """
 
 
+def _environment() -> dict[str, str]:
+    return {"MUJOCO_GL": "egl", **os.environ, "PYTHONPATH": os.pathsep.join(p for p in (str(ROOT), *sys.path) if p)}
+
+
 def test_every_link_and_a_sensor_are_seen():
     """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    environment.setdefault("MUJOCO_GL", "egl")
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=_environment(), capture_output=True, text=True, timeout=120)
     if done.returncode == 77 or "EGL" in done.stderr or "OpenGL" in done.stderr:
         pytest.skip(f"no offscreen OpenGL here: {(done.stdout + done.stderr).strip()[-200:]}")
     assert done.returncode == 0, done.stderr
+
+
+def test_the_picture_of_both_robots_is_drawn(tmp_path: Path):
+    command = [sys.executable, str(ROOT / "experiments/robot_picture.py"), "--quick", "--out", str(tmp_path)]
+    done = subprocess.run(command, env=_environment(), capture_output=True, text=True, timeout=120)
+    if "MuJoCo cannot draw here" in done.stderr or "OpenGL" in done.stderr:
+        pytest.skip(f"no offscreen OpenGL here: {done.stderr.strip()[-200:]}")
+    assert done.returncode == 0, done.stderr
+    picture = read_png(tmp_path / "robots.png").astype(int)
+    blue = (picture[..., 2] > picture[..., 0] + 60) & (picture[..., 2] > 100)  # the cube between the fingers, seen from near
+    assert 0.002 < blue[:, 3 * picture.shape[1] // 4 :].mean() < 0.2 and not blue[:, : picture.shape[1] // 2].any()
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
