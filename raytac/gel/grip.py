@@ -24,6 +24,8 @@ _SLIDING = 0.05
 """With less than this share of it sticking, all of a contact slides."""
 _SURE, _LOST = 0.3, 0.5
 """Share of the motion in contact that the fine contact may miss: below the first the exchange is whole, above the second there is none."""
+_SMALL = 20e-6
+"""Motion in contact [m] below which what is missed of it says little, so that a press off the middle is shown as one there is (a guess)."""
 _LEAST = 1e-4
 """Places that bear less than this share of the greatest pressure do not count as in contact."""
 _ROUNDS, _STEPS = 6, 10
@@ -148,7 +150,7 @@ class Grip:
                 return np.zeros_like(dragged)
             waves = found.waves
         layer = self._back(waves, (self._vertex_x, self._vertex_y)).reshape(2, -1)
-        trust = _trust(layer.T[touching], dragged[touching], load[touching]) if waves.any() else 1.0
+        trust = _trust(layer.T[touching], dragged[touching], load[touching])
         compliance = self._compliance[:, :, :, touching]
         here = np.ascontiguousarray(compliance[:, :, touching].transpose(1, 2, 0, 3).reshape(2 * touching.sum(), -1))
         force = _held(here, dragged[touching].T.ravel().astype(np.float32))
@@ -238,7 +240,8 @@ class Grip:
 def _trust(found: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> float:
     """How far the exchange goes, in [0, 1], by what it leaves unexplained of the way that the mesh ``moved`` in contact."""
     left, whole = (float(weight @ (field**2).sum(axis=1)) for field in (found - moved, moved))
-    return float(np.clip((_LOST - np.sqrt(left / whole)) / (_LOST - _SURE), 0.0, 1.0))
+    missed = np.sqrt(left / (whole + weight.sum() * _SMALL**2))
+    return float(np.clip((_LOST - missed) / (_LOST - _SURE), 0.0, 1.0))
 
 
 def _within(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:

@@ -117,9 +117,13 @@ def compare_real(
     if settings.regions:
         splits += [("left_right", by_half(presses)[0]), ("right_left", by_half(presses)[1])]
         splits += [("shallow_deep", shallow_to_deep(presses))]
+    least = FEWEST if settings.prior is not None else 2 * FEWEST  # a choice halves them again
     for kind, (train, _) in splits:  # now, and not after the fits before it
-        if len(train) < FEWEST:
-            raise InputError("presses", value=len(train), rule=f"are too few to fit the split {kind!r} to: at least {FEWEST}")
+        if len(train) < least:
+            rule = f"are too few to fit the split {kind!r} to: at least {least}"
+            if len(train) >= FEWEST:
+                rule += f", or {FEWEST} with a named prior"
+            raise InputError("presses", value=len(train), rule=rule)
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}

@@ -173,6 +173,9 @@ def test_simulated_pads_are_mounted_askew_too_and_bodies_are_drawn_once() -> Non
     many.reset(seed=3)
     pads = many.batch.world.state().world_from_pad["sensor"]
     assert np.abs(pads[0] - pads[1]).max() > 1e-5
+    models, ball = many.batch.world.models, many.batch.world.composed.bodies["ball"].index
+    usual = RollBallVectorEnv(1, physics="rigid", tactile=None).batch.world.model.body_mass[ball]
+    assert models[0].body_mass[ball] == models[1].body_mass[ball] != usual
     rigid = RollBallVectorEnv(2, **{**options, "physics": "rigid"})
     rigid.reset(seed=3)
     np.testing.assert_allclose(pads, rigid.batch.world.state().world_from_pad["sensor"], atol=1e-9)

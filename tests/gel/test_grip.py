@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +139,20 @@ def test_less_is_exchanged_where_the_contact_moved_otherwise():
     moved, weight = np.random.default_rng(0).normal(size=(30, 2)), np.ones(30)
     shares = [_trust((1.0 - missed) * moved, moved, weight) for missed in (0.0, 0.29, 0.4, 0.51, 1.0)]
     assert shares == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("squeezed", [0.0, 3e-6, 1e-5])
+def test_a_press_a_little_off_the_middle_is_shown_as_one_there(contact, grip, squeezed):
+    """What friction has kept back, with hardly a motion of the whole besides: there was a jump where that motion began to count."""
+    touching = np.hypot(*REST[:, :2].T) < 2.2e-3
+    load = np.where(touching, 1.0, 0.0)
+    pattern = np.where(touching[:, None], REST[:, :2] * np.hypot(*REST[:, :2].T)[:, None], 0.0)
+    pattern *= squeezed / np.abs(pattern).max()
+    shape = SimpleNamespace(pressure=dome(contact[0]))
+    moved = [pattern + np.array([shift, 0.0]) for shift in (0.0, 4.9e-7, 5.2e-7, 1e-6)]
+    shown = [grip.exchange(shape, one, touching, load, 0.6) for one in moved]  # type: ignore[arg-type]
+    assert np.abs(np.diff(shown, axis=0)).max() < 1e-6
+    assert np.abs(shown[-1]).max() > 0.9 * min(squeezed, 4e-6)
 
 
 def test_the_mean_motion_is_the_one_asked_for_also_where_the_edge_slips(contact, grip):

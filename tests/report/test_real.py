@@ -81,6 +81,17 @@ def test_data_that_cannot_be_fitted_are_refused_with_nothing_written(
     assert not out.exists() and not list(tmp_path.glob("*.partial"))
 
 
+def test_halves_too_small_to_choose_a_prior_in_are_told_before_any_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Six presses on either half of the pad are enough to fit to, but not for a choice that halves them again."""
+    (tmp_path / "data").mkdir()
+    command = ["compare-real", str(data_set(tmp_path / "data", count=12)), "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(command) == 2
+    assert "'left_right' to: at least 8, or 4 with a named prior" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists() and not list(tmp_path.glob("*.partial"))
+
+
 def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, data = tmp_path / "out", tmp_path / "data"
     data.mkdir()
