@@ -77,10 +77,13 @@ def draw_panels(panels: Mapping[str, Sequence[Path]], path: Path, *, columns: in
         one.set_visible(False)
     for k, (one, (title, runs)) in enumerate(zip(axes, found.items(), strict=False)):
         _draw(one, runs, "success")
-        one.set_title(title, fontsize="small", loc="left")
+        one.set_title(title, fontsize="small", loc="left", pad=18)
         if k % columns:
             one.set_ylabel("")
-        one.legend(frameon=False, fontsize="x-small", loc="best")
+        above = {"loc": "lower left", "bbox_to_anchor": (-0.02, 0.99), "ncols": 2}  # curves may be anywhere
+        one.legend(
+            frameon=False, fontsize="x-small", handlelength=1.6, handletextpad=0.5, columnspacing=1.0, borderpad=0.2, **above
+        )
     figure.savefig(path, dpi=200)
     return path
 
@@ -111,7 +114,7 @@ def _draw(axes: Axes, runs: Mapping[str, Sequence[Mapping[str, np.ndarray]]], ke
             axes.plot(1e-3 * run["steps"], factor * run[key], style, color=colour, alpha=0.45, linewidth=0.7)
         steps, values = _common([(run["steps"], factor * run[key]) for run in mine])
         name = {"none": "no touch", "task": "touch"}.get(kind, kind)
-        label = f"{name}, {len(mine)} seed{'s' if len(mine) > 1 else ''}"
+        label = f"{name} (n = {len(mine)})"
         axes.plot(1e-3 * steps, np.median(values, axis=0), style, color=colour, linewidth=2.0, label=label)
     if key == "success":
         axes.set_ylim(-3, 103)

@@ -81,5 +81,5 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
                 axis.set(xticks=[], yticks=[])
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
-        figure.savefig(path, dpi=115)
+        figure.savefig(path, dpi=110)
         plt.close(figure)

@@ -40,4 +40,6 @@ def test_what_is_timed_is_in_contact_and_moves() -> None:
     for surface in surfaces[1:]:
         assert surface.contact.any(axis=(1, 2)).all() and surface.batch == 3
         assert np.ptp(surface.contact_centre[:, 0]) > 1e-3
-    assert np.linalg.norm(surfaces[-1].pad_from_object[:, :2, 3] - surfaces[1].pad_from_object[:, :2, 3], axis=1).min() > 2e-4
+    first, last = surfaces[1].pad_from_object, surfaces[-1].pad_from_object
+    assert first is not None and last is not None
+    assert np.linalg.norm(last[:, :2, 3] - first[:, :2, 3], axis=1).min() > 2e-4
