@@ -4,7 +4,8 @@
 
 An edge (the cube of the scene "edge", along x, 0.8 mm deep) and a bar 3 mm wide with sharp rims (0.5 mm deep) are pressed into the GelSight
 Mini's pad. Both are the same all along x in the middle, so that a pad can be refined across y alone until nothing changes: the truth
-is the vertices of such a mesh, with cells of ``--cell-um`` at the sharp line (nothing is interpolated or corrected).
+is the vertices of such a mesh, with cells of ``--cell-um`` at the sharp line (nothing is interpolated or corrected), pressed until those
+on the line x = 0 are at the depth.
 
 ``--shapes ball``: a ball (4 mm) pressed lightly, to 0.33 N and to 0.3 mm, and 0.5 mm deep and then sheared by 0.4 mm or twisted by 10°, and
 what markers see of it. The truth is a pad with cells of four
@@ -22,7 +23,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ import tyro
 import ipc
 from raytac.errors import InputError, RaytacError
 from raytac.gel.coat_mesh import CoatMesh
+from raytac.gel.object_height import object_height
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
@@ -51,6 +53,8 @@ LOADS = {
     "twist": (StageSpec("indent", depth=0.5e-3), StageSpec("twist", twist=np.deg2rad(10.0))),
 }
 RANGES = {"near": (0.02e-3, 1e-3), "ring": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
+_DEEPER = 0.1e-3
+"""Room for a truth to be pressed deeper than the scene says [m]."""
 _GROWTH, _DOWN = 0.14, 0.25
 """How much a cell grows for each unit of distance from the sharp line, across and downwards."""
 
@@ -81,7 +85,7 @@ class Args(CommonOptions):
                 metrics |= marked(spec, levels, 4e-6 * self.cell_um)
             for shape in (shape for shape in shapes if shape != BALL):
                 mesh = refined(spec, SHAPES[shape], self.cell_um * 1e-6)
-                truth, metrics[f"{shape}.truth_force_n"], _ = pressed(spec, shape, mesh)
+                truth, metrics[f"{shape}.truth_force_n"], _ = pressed(spec, shape, mesh, as_truth=True)
                 metrics[f"{shape}.truth_vertices"] = len(mesh.tets.vertices)
                 for level in levels:
                     found, metrics[f"{shape}.{level}.force_n"], shown = pressed(spec, shape, pad_mesh(spec.gelpad, level))
@@ -102,14 +106,35 @@ Section = tuple[np.ndarray, np.ndarray]
 """y and z [m] along the line x = 0, y ascending."""
 
 
-def pressed(spec: SensorSpec, shape: str, mesh: PadMesh) -> tuple[Section, float, Section]:
-    """Vertices of the coat on x = 0, normal force [N], shown surface on x = 0."""
-    with tempfile.TemporaryDirectory() as folder:
-        pad = SoftPad(spec, scene(shape, Path(folder)), pitch=0.05e-3, pad=mesh)
-        state = pad.peak(pad.run())
-    assert pad.solver is not None
+def pressed(spec: SensorSpec, shape: str, mesh: PadMesh, *, as_truth: bool = False) -> tuple[Section, float, Section]:
+    """Vertices of the coat on x = 0, normal force [N], shown surface on x = 0.
+
+    ``as_truth``: pressed until those vertices are at the depth. A press ends by the clearance of all the contact, which a truth refined
+    across y alone has too wide at the ends of the object, where its cells along x are a millimetre long.
+    """
     rows, columns = mesh.coat.shape
-    line = pad.solver.scene.coat("pad")[0].reshape(rows, columns, 3)[:, columns // 2]
+    with tempfile.TemporaryDirectory() as folder:
+        wanted = scene(shape, Path(folder))
+        (stage,) = wanted.trajectory
+        assert stage.depth is not None
+        deeper = replace(wanted, trajectory=(stage, replace(stage, depth=stage.depth + _DEEPER)))
+        pad = SoftPad(spec, deeper, pitch=0.05e-3, pad=mesh)
+        state = next(state for state in pad.run() if state.stage == 0)
+        assert pad.solver is not None and state.reading is not None
+
+        def on_line(values: np.ndarray) -> np.ndarray:
+            return values[0].reshape(rows, columns, 3)[:, columns // 2]
+
+        if as_truth:
+            line, load = on_line(state.reading.vertices), -on_line(state.reading.forces)[:, 2]
+            even = np.linspace(-2e-3, 2e-3, 801)
+            under = object_height(pad.parts, state.reading.poses[0], np.array([-1e-5, 0.0, 1e-5]), even)[0, :, 1]
+            under = np.interp(line[:, 1], even, under, left=np.inf, right=np.inf)
+            there = np.isfinite(under) & (load > 0.0)
+            short = float((load[there] * (line[there, 2] - under[there])).sum() / load[there].sum())
+            (state,) = pad.follow(replace(stage, depth=stage.depth + short))
+    assert state.reading is not None
+    line = on_line(state.reading.vertices)
     shown = pad.surface(state).height[0][:, pad.grid.shape[1] // 2].astype(float)
     return (line[:, 1], line[:, 2]), float(state.normal_force[0]), (pad.grid.y, shown)
 

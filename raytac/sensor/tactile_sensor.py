@@ -179,8 +179,10 @@ class TactileSensor:
 
     @property
     def device_used(self) -> str:
-        """``cpu`` or ``cuda``: where the images are made; ``cpu`` if there are none."""
-        return self.optical_mode.device if self._optical_outputs else "cpu"
+        """``cpu`` or ``cuda``: where the images are made; without images where a simulated pad is solved, and ``cpu`` for a rigid one."""
+        if self._optical_outputs:
+            return self.optical_mode.device
+        return resolve_device(self.device, ray_tracing=False) if self.physics == "ipc" else "cpu"
 
     @property
     def _optical_outputs(self) -> tuple[str, ...]:

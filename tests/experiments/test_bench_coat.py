@@ -25,6 +25,8 @@ def test_markers_are_nearer_than_the_mesh(tmp_path):
         start = f"ball.{load}.coarse"
         assert found[f"{start}.markers_most_um"] < 0.5 * found[f"{start}.mesh_markers_most_um"]
         assert found[f"{start}.markers_um"] < found[f"{start}.mesh_markers_um"]
+    for load in ("shear", "twist"):
+        assert 0.0 < found[f"ball.{load}.coarse.markers_um"] < 0.4 * found[f"ball.{load}.truth.markers_um"]
     assert found["ball.force.coarse.force_n"] == pytest.approx(0.33, rel=0.01)
     assert found["ball.depth.coarse.force_n"] > found["ball.depth.truth.force_n"] > 0.3
     assert found["ball.depth.coarse.contact_mm2"] == pytest.approx(found["ball.depth.truth.contact_mm2"], rel=0.03)
