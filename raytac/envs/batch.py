@@ -17,6 +17,7 @@ from raytac.errors import InputError
 from raytac.gel.batch import rounded_envs
 from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
+from raytac.physics.rotation import inverse
 from raytac.robots.pose import pose_error
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld, chosen_physics
@@ -162,9 +163,10 @@ class TaskBatch:
         bodies = {name: np.stack([start.bodies[name] for start in drawn]) for name in names}
         variation = None if self._draws.is_none else self._draws.draw(envs)
         if variation is not None and self.task.stands_on is not None and self.task.stands_on in variation.mounting:
-            # What stands on the pad starts as far above it as it would were the pad mounted as it is drawn.
-            name, turn = self.task.stands_on, self._start_pads[self.task.stands_on][:3, :3]
-            bodies[self.task.body][:, :3, 3] += variation.mounting[name][:, :3, 3] @ turn.T
+            # What stands on the pad starts to the pad as it would were that mounted as it is drawn: above a tilted one, tilted too.
+            drawn_pad = self._start_pads[self.task.stands_on]
+            askew = drawn_pad @ variation.mounting[self.task.stands_on] @ inverse(drawn_pad)
+            bodies[self.task.body] = askew @ bodies[self.task.body]
         state = self.world.reset(envs, bodies=bodies, variation=variation)
         for b, start in zip(envs, drawn, strict=True):
             self._goal[b] = start.goal

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raytac.envs import BalancePoleVectorEnv, PushCubeEnv, PushCubeVectorEnv, RollBallVectorEnv
+from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
 from raytac.errors import InputError
@@ -147,6 +148,17 @@ def test_a_pole_stands_on_a_pad_that_is_mounted_askew() -> None:
     for _ in range(3):
         seen, *_, infos = many.step(np.zeros((4, 2), np.float32))
     assert not infos["failed"].any() and (np.abs(10.0 * seen["sensor_wrench"][:, 2] + 0.49) < 0.25).all()
+
+
+def test_a_pole_starts_to_a_turned_pad_as_to_a_straight_one() -> None:
+    """Its foot, 4 mm wide and off the pad's middle, was up to a millimetre inside a pad that was turned by 0.2 rad."""
+    places = []
+    for turn in (0.0, 0.2):
+        batch = TaskBatch(BalancePole(), num_envs=4, tactile=None, randomization=Randomization(pad_shift=1e-3, pad_turn=turn))
+        batch.reset(range(4), [np.random.default_rng(b) for b in range(4)])
+        state = batch.world.state()
+        places.append(np.linalg.inv(state.world_from_pad["sensor"]) @ state.world_from_body["pole"])
+    np.testing.assert_allclose(places[0], places[1], atol=1e-9)
 
 
 def test_variations_that_cannot_be_are_told_and_change_nothing() -> None:
