@@ -137,6 +137,8 @@ def test_a_fine_pad_has_cells_enough_for_the_shipped_ball():
 
 def test_without_images_the_device_is_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulated pad that was solved on CUDA is not said to have been on the CPU because nothing was rendered."""
-    monkeypatch.setattr("raytac.sensor.tactile_sensor.resolve_device", lambda device, ray_tracing=True: "cpu" if ray_tracing else "cuda")
+    monkeypatch.setattr(
+        "raytac.sensor.tactile_sensor.resolve_device", lambda device, ray_tracing=True: "cpu" if ray_tracing else "cuda"
+    )
     assert TactileSensor("gelsight_mini", physics="ipc", outputs=("height",)).device_used == "cuda"
     assert TactileSensor("gelsight_mini", outputs=("height",)).device_used == "cpu"
