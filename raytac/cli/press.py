@@ -17,6 +17,7 @@ from raytac.markers import MARKER_MODELS
 from raytac.report.press import run_press
 from raytac.sensor import INTEGRATORS, OPTICS, PADS, PHYSICS, TactileSensor, sensor_outputs
 from raytac.specs import load_press
+from raytac.specs.press import chosen_physics
 
 __all__ = ["PressArgs"]
 
@@ -69,7 +70,7 @@ class PressArgs(SolverOptions):
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         scene = load_press(self.scene)
-        physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
+        physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":
             self.prepare_solver("physics='ipc'")
         sensor = TactileSensor(

@@ -15,6 +15,7 @@ from raytac.physics.solver import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
 from raytac.sensor.options import check_whole
 from raytac.specs import PressScene, TaskScene, load_scene
+from raytac.specs.press import chosen_physics
 from raytac.specs.task import COUPLINGS
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class ViewArgs:
         if self.optics not in OPTICS:
             raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
         scene = load_scene(self.scene)
-        physics = self.physics or ("ipc" if self.pad is not None else scene.physics or "rigid")
+        physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":
             check_solver("physics='ipc'")
             if not self.verbose:

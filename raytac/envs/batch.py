@@ -19,8 +19,9 @@ from raytac.gel.pad import COARSEST_PITCH
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
 from raytac.physics.rotation import inverse
 from raytac.robots.pose import pose_error
+from raytac.specs.press import chosen_physics
 from raytac.specs.task_file import load_task
-from raytac.world.world import TactileWorld, chosen_physics
+from raytac.world.world import TactileWorld
 
 __all__ = ["Outcome", "TaskBatch"]
 
@@ -103,7 +104,7 @@ class TaskBatch:
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the sensor needs no markers: the force alone is asked of the probe.
         asked = ObservationSettings(("wrench",)) if settings is None else settings
-        rigid = chosen_physics(loaded, physics, pad) == "rigid"
+        rigid = chosen_physics(physics, pad, loaded.physics) == "rigid"
         shared = self.randomization  # what is drawn once for all environments
         if rigid:
             shared = replace(shared, youngs_modulus=0.0, friction=0.0)

@@ -35,7 +35,7 @@ from raytac.sensor.options import (
 )
 from raytac.sensor.pad import load_pad, pad_forces, reading_forces, state_surface
 from raytac.specs import PressScene, SensorSpec, validate_press
-from raytac.specs.press import PADS
+from raytac.specs.press import PADS, chosen_physics
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
@@ -130,7 +130,7 @@ class TactileSensor:
         self.spec = sensor_spec(sensor)
         self.integrator, self.spp = integrator, spp
         self._asked_physics, self._asked_pad = physics, pad
-        self.physics = physics or ("ipc" if pad is not None else "rigid")
+        self.physics = chosen_physics(physics, pad)
         self.resolution = size if size is not None else self.spec.camera.resolution
         warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.num_envs = device, num_envs
@@ -244,7 +244,7 @@ class TactileSensor:
             RaytacError: the object overlaps a simulated pad where it starts.
         """
         press = press_scene(scene)
-        self.physics = self._asked_physics or ("ipc" if self._asked_pad is not None else press.physics or "rigid")
+        self.physics = chosen_physics(self._asked_physics, self._asked_pad, press.physics)
         self._level = self._asked_pad or press.pad or PADS[0]
         self._pad = load_pad(
             self.spec,

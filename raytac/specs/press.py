@@ -7,7 +7,7 @@ from pathlib import Path
 
 from raytac.specs.sensor import Vec3
 
-__all__ = ["DYNAMICS", "MOVES", "PADS", "PHYSICS", "ObjectSpec", "PressScene", "StageSpec"]
+__all__ = ["DYNAMICS", "MOVES", "PADS", "PHYSICS", "ObjectSpec", "PressScene", "StageSpec", "chosen_physics"]
 
 MOVES = ("object", "case")
 """What a press can move; the other side stands still."""
@@ -17,6 +17,11 @@ PADS = ("coarse", "medium", "fine")
 """How finely a simulated pad can be cut."""
 DYNAMICS = ("kinematic", "affine", "soft")
 """What an object can be to a simulated pad: driven and rigid, free and near-rigid, or driven and soft."""
+
+
+def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
+    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
+    return physics or ("ipc" if pad is not None else scene or "rigid")
 
 
 @dataclass(frozen=True)

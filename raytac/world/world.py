@@ -25,7 +25,7 @@ from raytac.robots.impedance import JointImpedance
 from raytac.robots.pose import body_poses, site_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics, check_whole
-from raytac.specs.press import PADS
+from raytac.specs.press import PADS, chosen_physics
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
@@ -37,18 +37,13 @@ if TYPE_CHECKING:
     from raytac.physics.soft_scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
-__all__ = ["TactileWorld", "chosen_physics"]
+__all__ = ["TactileWorld"]
 
 _OVERLAP = 1e-4
 """How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
 
 _BEYOND = 1e-2
 """How far joints may start beyond their range [rad or m]: MuJoCo's limits give way, and a start may be recorded at one (a guess)."""
-
-
-def chosen_physics(scene: TaskScene, physics: str | None, pad: str | None) -> str:
-    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
-    return physics or ("ipc" if pad is not None else scene.physics or "rigid")
 
 
 class TactileWorld:
@@ -108,7 +103,7 @@ class TactileWorld:
         if coupling is not None and coupling not in COUPLINGS:
             raise InputError("coupling", value=coupling, rule="must be a known coupling", choices=COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
-        self.physics = chosen_physics(self.scene, physics, pad)
+        self.physics = chosen_physics(physics, pad, self.scene.physics)
         self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]
         self.coupling = coupling or self.scene.coupling
         self.num_envs, self.device, self.seed = num_envs, device, seed
