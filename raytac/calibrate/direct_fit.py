@@ -5,13 +5,13 @@ Residuals are those of the presses with the real background B as flat field, and
     I = encode((decode(B) − b) · L(pressed) / L(rest) + b),
 
 solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks (shadows, inter-reflection, the size
-of LEDs) can be given as ``extra`` light of every LED (``ray_fit``).
+of LEDs) can be given as ``extra`` light of every LED, with its slopes by the LED's place and height (``ray_fit``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +23,13 @@ from raytac.calibrate.photographs import Photographs, decode, encode
 from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
-__all__ = ["DirectFit", "FitSettings", "FitState", "Light"]
+__all__ = ["HEIGHT", "DirectFit", "ExtraLight", "FitSettings", "FitState", "Light"]
 
 SIGMA = {
     "place": 4.0,
     "aim": 0.6,
     "lobe": 2.0,
+    "height": 1.0,
     "power": 2.0,
     "glow": 0.5,
     "gamma": 0.5,
@@ -45,6 +46,10 @@ ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
+HEIGHT = 6
+"""Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
+HEIGHTS = 0.1, 6.0
+"""Least and greatest [mm]: an LED, and a light guide as high as a Mini's wall (a guess)."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
 
@@ -90,6 +95,32 @@ class Light:
     flat: np.ndarray
     rest: np.ndarray
 
+    @property
+    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All three, in that order."""
+        return self.pressed, self.flat, self.rest
+
+    def plus(self, other: Light, factor: np.ndarray | float = 1.0) -> Light:
+        """The sum with ``factor`` times another; one factor for all, or one an LED (L, 1, 1)."""
+        return Light(*(a + factor * b for a, b in zip(self.parts, other.parts, strict=True)))
+
+
+@dataclass(frozen=True)
+class ExtraLight:
+    """What direct light lacks, to first order about LEDs ``at`` (L, 7), a row as those of ``LightParameters.leds``."""
+
+    light: Light
+    at: np.ndarray
+    by_led: Mapping[int, Light]
+    """Slope of every LED's light by a column of its row; columns that are not named change nothing."""
+
+    def of(self, leds: np.ndarray) -> Light:
+        """The light of LEDs (L, 7)."""
+        found = self.light
+        for k, slope in self.by_led.items():
+            found = found.plus(slope, (leds[:, k] - self.at[:, k])[:, None, None])
+        return found
+
 
 class DirectFit:
     """The least-squares problem. Pixels are those near the circles of ``shots``, which also are the prior of the circles."""
@@ -102,7 +133,7 @@ class DirectFit:
         settings: FitSettings,
         *,
         factor: int = 2,
-        extra: Light | None = None,
+        extra: ExtraLight | None = None,
         seed: int = 0,
     ) -> None:
         """``factor``: images are means of factor × factor pixels; ``start`` is the prior of lights and imprint."""
@@ -155,13 +186,11 @@ class DirectFit:
 
     def total(self, p: LightParameters, light: Light) -> list[np.ndarray]:
         """Linear light (M, 3) in the pixels of presses, in the same at rest, over the image at rest."""
-        parts = self._with_extra(light)
+        parts = self._with_extra(p, light).parts
         return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in parts]
 
-    def _with_extra(self, light: Light) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if self.extra is None:
-            return light.pressed, light.flat, light.rest
-        return light.pressed + self.extra.pressed, light.flat + self.extra.flat, light.rest + self.extra.rest
+    def _with_extra(self, p: LightParameters, light: Light) -> Light:
+        return light if self.extra is None else light.plus(self.extra.of(p.leds))
 
     def images(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Levels of the presses' pixels (M, 3) and of the image at rest (K, 3)."""
@@ -175,7 +204,7 @@ class DirectFit:
 
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
-        per_led = [("place", 3), ("aim", 2), ("lobe", 1)] * len(p.leds)
+        per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1)] * len(p.leds)
         slopes = len(self.start.slopes)
         rest = [("power", p.power.size), ("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", slopes)]
         return per_led + rest
@@ -184,7 +213,9 @@ class DirectFit:
         return np.concatenate([np.full(n, SIGMA[name]) for name, n in self.blocks(p)])
 
     def free(self, p: LightParameters) -> np.ndarray:
-        return np.concatenate([np.full(n, name not in self.settings.fixed) for name, n in self.blocks(p)])
+        blind = () if self.extra is not None and HEIGHT in self.extra.by_led else ("height",)
+        held = (*self.settings.fixed, *blind)
+        return np.concatenate([np.full(n, name not in held) for name, n in self.blocks(p)])
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
@@ -194,14 +225,15 @@ class DirectFit:
         p = self.start.p
         cuts = np.cumsum([p.leds.size, p.power.size, 3, 6])
         leds, power, glow, response, slopes = np.split(x, cuts)
-        changed = dataclasses.replace(p, leds=leds.reshape(-1, 6), power=power.reshape(-1, 3), glow=glow, response=response)
+        changed = dataclasses.replace(p, leds=leds.reshape(p.leds.shape), power=power.reshape(-1, 3), glow=glow, response=response)
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], nothing negative."""
+        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], heights in ``HEIGHTS``, nothing negative."""
         p, half = state.p, 5e2 * np.array(self.sensor.case.size)
         leds, response = p.leds.copy(), p.response.copy()
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
+        leds[:, HEIGHT] = np.clip(leds[:, HEIGHT], *HEIGHTS)
         reach = 0.02 + _reach(p.template, leds)
         floor = 1e3 * self.sensor.case.floor_z
         leds[:, :3] = np.clip(leds[:, :3], reach + np.array([-half[0], -half[1], floor]), np.array([*half, CEILING]) - reach)
@@ -243,29 +275,33 @@ class DirectFit:
         total = self.total(p, light)
         image, rest = self.images(p, total)
         gains = self._gains(p, image, rest, total)
-        count, slopes = len(p.leds), len(state.slopes)
-        jac = np.empty((9 * count + 9 + slopes, image.size), np.float32)
+        (count, wide), slopes = p.leds.shape, len(state.slopes)
+        first = p.leds.size + p.power.size
+        jac = np.zeros((first + 9 + slopes, image.size), np.float32)
         rest_jac = np.zeros((len(jac), rest.size), np.float32)
 
         def column(k: int, pressed: np.ndarray, flat: np.ndarray, still: np.ndarray) -> None:
             jac[k] = (gains[0] * pressed - gains[1] * flat).ravel()
             rest_jac[k] = (gains[2] * still).ravel()
 
+        none, by_led = (np.zeros((1, 3)),) * 3, {} if self.extra is None else self.extra.by_led
         for led in range(count):
-            for k in range(6):
-                column(6 * led + k, *(part[led].by_led[k][:, None] * p.power[led] for part in leds))
-        parts = self._with_extra(light)
+            for k in range(wide):
+                of_extra = [part[led] for part in by_led[k].parts] if k in by_led else none
+                own = [part[led].by_led[k][:, None] if k < len(part[led].by_led) else 0.0 for part in leds]
+                column(wide * led + k, *((a + b) * p.power[led] for a, b in zip(own, of_extra, strict=True)))
+        parts = self._with_extra(p, light).parts
         for led in range(count):
             for c in range(3):
-                column(6 * count + 3 * led + c, *(part[led] * np.eye(3)[c] for part in parts))
+                column(p.leds.size + 3 * led + c, *(part[led] * np.eye(3)[c] for part in parts))
         for k in range(3):
             power = p.power[p.layer == k].sum(0) * self.even_gain
-            column(9 * count + k, *(case_light(g)[:, None] * power for g in geometries))
+            column(first + k, *(case_light(g)[:, None] * power for g in geometries))
         for k in range(6):
             response = p.response + STEP * np.eye(6)[k]
             other, other_rest = self.images(dataclasses.replace(p, response=response), total)
-            jac[9 * count + 3 + k] = ((other - image) / STEP).ravel()
-            rest_jac[9 * count + 3 + k] = ((other_rest - rest) / STEP).ravel()
+            jac[first + 3 + k] = ((other - image) / STEP).ravel()
+            rest_jac[first + 3 + k] = ((other_rest - rest) / STEP).ravel()
         by_point, by_normal = self._by_geometry(p, leds[0])
 
         def moved(slopes: np.ndarray, circles: np.ndarray, step: float) -> np.ndarray:
@@ -274,7 +310,7 @@ class DirectFit:
             return (gains[0] * change / step).ravel()
 
         for k in range(slopes):
-            jac[9 * count + 9 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
+            jac[first + 9 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
         circles = np.zeros((image.size, 3), np.float32)
         if self.settings.circles:
             for k in range(3):
@@ -395,5 +431,5 @@ def _reach(lights: LightsSpec, leds: np.ndarray) -> np.ndarray:
     (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(leds[:, k]), np.cos(leds[:, k])) for k in (3, 4))
     u = np.stack([-sin_a, cos_a, np.zeros(len(leds))], axis=1)
     v = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
-    size = 5e2 * np.array([led.size for led in lights.leds])
-    return size[:, :1] * np.abs(u) + size[:, 1:] * np.abs(v)
+    width = 5e2 * np.array([[led.size[0]] for led in lights.leds])
+    return width * np.abs(u) + 0.5 * leds[:, HEIGHT, None] * np.abs(v)

@@ -30,14 +30,15 @@ class LedLight:
     light: np.ndarray
     """D, (M,)."""
     by_led: np.ndarray
-    """By a row of ``LightParameters.leds``, (6, M): position [1/mm], azimuth and elevation [1/rad], lobe."""
+    """By the first six of a row of ``LightParameters.leds``, (6, M): position [1/mm], azimuth and elevation [1/rad], lobe; a point has no
+    height."""
     by_normal: np.ndarray
     """By the point's normal, (3, M). By the point itself it is minus that by the LED's position."""
 
 
 def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLight:
     """``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
-    azimuth, elevation, lobe = led[3:]
+    azimuth, elevation, lobe = led[3:6]
     (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
     axis, by_azimuth, by_elevation = np.array([[ce * ca, ce * sa, se], [-ce * sa, ce * ca, 0], [-se * ca, -se * sa, ce]])
     d = 1e-3 * led[:3, None] - seen.p

@@ -1,4 +1,4 @@
-"""What a fit of lights varies: every LED's place, aim, lobe and power, the case's even glow, and the camera's response."""
+"""What a fit of lights varies: every LED's place, aim, lobe, height and power, the case's even glow, and the camera's response."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class LightParameters:
     """What a fit varies of lights and camera, as arrays."""
 
     template: LightsSpec
-    """The light file that names, layers and sizes come from."""
+    """The light file that names, layers and widths come from."""
     leds: np.ndarray
-    """(L, 6): x, y, z [mm], azimuth, elevation [rad], lobe."""
+    """(L, 7): x, y, z [mm], azimuth, elevation [rad], lobe, height of the emitting face [mm]."""
     power: np.ndarray
     """(L, 3): what a coat at ``REFERENCE_DISTANCE`` that faces the LED reflects by its diffuse lobe, in full scales."""
     glow: np.ndarray
@@ -52,7 +52,7 @@ class LightParameters:
                 rule = "must be a camera channel, the LED's colour"
                 raise InputError("led.layer", value=led.layer, rule=rule, choices=CHANNELS)
             x, y, z = led.axis
-            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe])
+            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe, 1e3 * led.size[1]])
             power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
         stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
@@ -76,6 +76,7 @@ class LightParameters:
                     position=(float(row[0] / 1e3), float(row[1] / 1e3), float(row[2] / 1e3)),
                     axis=(float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4]))),
                     lobe=float(row[5]),
+                    size=(led.size[0], float(row[6] / 1e3)),
                     power=tuple(map(float, power / scale)),
                     glow=float(self.glow[layer] / _GLOW),
                 )

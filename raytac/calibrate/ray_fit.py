@@ -1,9 +1,8 @@
 """Lights fitted with the ray tracer as forward model, by defect correction.
 
 The ray tracer's image is direct light of points plus what that leaves out: shadows, the size of LEDs, inter-reflection, a specular coat.
-The rest is small and changes slowly, so that a few rounds suffice of: render once with every LED in a layer of its own, take the
-ray tracer's light minus the direct light, hold it, and fit again with it added (``direct_fit``). Where the rounds stop changing, the fit is
-that of the ray tracer itself, but for the rest's own derivatives.
+The rest is small, so that a few rounds suffice of: render with every LED in a layer of its own, take the ray tracer's light minus the direct
+light, and fit again with it added (``direct_fit``): held but for its slopes by the places and heights of LEDs, on which shadows depend.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState, Light
+from raytac.calibrate.direct_fit import HEIGHT, REST_FACTOR, SIGMA, DirectFit, ExtraLight, FitSettings, FitState, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
@@ -25,7 +24,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.raytrace import RayTracer
 from raytac.specs import SensorSpec
 
-__all__ = ["FEWEST", "Fitted", "brightened", "defect", "first_state", "fit_lights", "refine_circles"]
+__all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]
 
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
@@ -33,8 +32,10 @@ FACTOR = 2
 """Presses are fitted as means of so many pixels squared, which is also what the ray tracer renders."""
 FIRST, LATER = 100, 30
 """Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
-START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5])
-"""How far starts lie apart: mm, rad, lobe exponent."""
+START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
+"""How far starts lie apart: mm, rad, lobe exponent, mm."""
+STEPS = {0: 0.3, 1: 0.3, 2: 0.3, HEIGHT: 0.5}
+"""Steps [mm] of the slopes by an LED's place and height: shadows' edges are soft, and as wide on the pad."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
 ENVS = 16
@@ -89,8 +90,28 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, opti
     still = layers(GelSurface.at_rest(grid))[:, 0]
     by = REST_FACTOR * height // problem.shots.background.shape[0]
     rest = still.reshape(len(still), height // by, by, width // by, by, 3).mean((2, 4)).reshape(len(still), -1, 3)
-    direct = problem.light(p, problem.geometry(state))
-    return Light(pressed - direct.pressed, still[:, problem.row, problem.column] - direct.flat, rest - direct.rest)
+    return Light(pressed, still[:, problem.row, problem.column], rest).plus(problem.light(p, problem.geometry(state)), -1.0)
+
+
+def extra_light(
+    problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any], *, slopes: bool = True
+) -> ExtraLight:
+    """The defect with its slopes by the LEDs' places and heights, where shadows are cast (``slopes``: and wanted).
+
+    Every LED has a layer of its own, so that all move in one rendering: four more give all slopes, by differences and without
+    inter-reflection, which changes slowly.
+    """
+    found: dict[int, Light] = {}
+    if slopes and options.get("shadows", True):
+        direct = {**options, "bounce": False}
+        here = defect(problem, state, grid, device, direct)
+        for k, step in STEPS.items():
+            leds = state.p.leds.copy()
+            leds[:, k] += step
+            moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds))
+            there = defect(problem, moved, grid, device, direct)
+            found[k] = Light(*((b - a) / step for a, b in zip(here.parts, there.parts, strict=True)))
+    return ExtraLight(defect(problem, state, grid, device, options), state.p.leds.copy(), found)
 
 
 def fit_lights(
@@ -141,7 +162,7 @@ def fit_lights(
     costs = [cost]
     grid = make_grid(sensor.gelpad, GRID_PITCH)
     for k in range(rounds):
-        extra = defect(problem, state, grid, device, options or {})
+        extra = extra_light(problem, state, grid, device, options or {})
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
         state = problem.solve(state, LATER, told(f"all light, round {k + 1} of {rounds}"))
         costs.append(problem.cost(state, problem.residuals(state)))
@@ -170,9 +191,8 @@ def refine_circles(
     problem = DirectFit(sensor, shots, own, held, factor=FACTOR, seed=seed)
     own, grid = problem.solve(own, 8), make_grid(sensor.gelpad, GRID_PITCH)
     for _ in range(rounds):
-        problem = DirectFit(
-            sensor, shots, own, held, factor=FACTOR, extra=defect(problem, own, grid, device, options or {}), seed=seed
-        )
+        extra = extra_light(problem, own, grid, device, options or {}, slopes=False)
+        problem = DirectFit(sensor, shots, own, held, factor=FACTOR, extra=extra, seed=seed)
         # The prior is the label, not where direct light put the circle: DirectFit takes it from the photographs.
         own = problem.solve(own, 8)
     return own.circles

@@ -14,8 +14,9 @@ from raytac.calibrate.light_parameters import CHANNELS, LightParameters
 
 __all__ = ["Ties", "side_ties"]
 
-PLACE, AIM, LOBE, POWER = 1.0, 0.2, 1.0, 0.2
-"""How far LEDs are believed to be from mirrored places [mm] and aims [rad], and from the lobe and power [full scales] next to them."""
+PLACE, AIM, LOBE, HEIGHT, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
+"""How far LEDs are believed to be from mirrored places [mm] and aims [rad], and from the lobe, height [mm] and power [full scales] next to
+them."""
 
 LEAST = 1.0
 """How far [mm] the middle of a layer's LEDs must be from the pad's for them to be on one side of it."""
@@ -41,6 +42,7 @@ def side_ties(p: LightParameters, size: int) -> Ties:
     """
     rows: list[np.ndarray] = []
     offsets: list[float] = []
+    wide = p.leds.shape[1]
 
     def tie(sigma: float, offset: float, *terms: tuple[int, float]) -> None:
         row = np.zeros(size)
@@ -63,20 +65,21 @@ def side_ties(p: LightParameters, size: int) -> Ties:
                 a, b = own[k], own[nearest[k]]
                 if a > b:
                     continue
-                tie(PLACE, 0.0, *((6 * led + axis, float(across[axis])) for led in (a, b) for axis in (0, 1)))
+                tie(PLACE, 0.0, *((wide * led + axis, float(across[axis])) for led in (a, b) for axis in (0, 1)))
                 # Mirrored, an azimuth A becomes 2 φ − A with φ that of ``out``, up to whole turns.
                 turn, total = 2 * float(np.arctan2(out[1], out[0])), float(p.leds[a, 3] + p.leds[b, 3])
-                tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (6 * a + 3, 1), (6 * b + 3, 1))
+                tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (wide * a + 3, 1), (wide * b + 3, 1))
                 if a < b:
                     tie(
                         PLACE,
                         0.0,
-                        *((6 * led + axis, float(sign * out[axis])) for led, sign in ((a, 1), (b, -1)) for axis in (0, 1)),
+                        *((wide * led + axis, float(sign * out[axis])) for led, sign in ((a, 1), (b, -1)) for axis in (0, 1)),
                     )
-                    tie(PLACE, 0.0, (6 * a + 2, 1), (6 * b + 2, -1))
-                    tie(AIM, 0.0, (6 * a + 4, 1), (6 * b + 4, -1))
+                    tie(PLACE, 0.0, (wide * a + 2, 1), (wide * b + 2, -1))
+                    tie(AIM, 0.0, (wide * a + 4, 1), (wide * b + 4, -1))
         for a, b in itertools.pairwise(own):
-            tie(LOBE, 0.0, (6 * a + 5, 1), (6 * b + 5, -1))
+            tie(LOBE, 0.0, (wide * a + 5, 1), (wide * b + 5, -1))
+            tie(HEIGHT, 0.0, (wide * a + 6, 1), (wide * b + 6, -1))
             for c in range(3):
                 first = p.leds.size + c
                 tie(POWER, 0.0, (first + 3 * a, 1), (first + 3 * b, -1))

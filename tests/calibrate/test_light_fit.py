@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_fit import HEIGHT, DirectFit, ExtraLight, FitSettings, FitState, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
@@ -80,6 +80,14 @@ def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, known: tu
     p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]))
     state = dataclasses.replace(state, p=p)
     problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4)
+    plain, rng = problem.light(p, problem.geometry(state)), np.random.default_rng(4)
+
+    def some() -> Light:
+        """Up to a tenth of the direct light."""
+        return Light(*(0.1 * part.mean() * rng.uniform(size=part.shape) for part in plain.parts))
+
+    extra = ExtraLight(some(), p.leds + 0.1, {k: some() for k in (0, 1, 2, HEIGHT)})
+    problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4, extra=extra)
     jac, rest_jac, by_circle, _ = problem.jacobian(state)
     x, first = problem.flat(state), 0
     for name, count in problem.blocks(p):
@@ -105,7 +113,7 @@ def test_known_lights_are_found_again(sensor: SensorSpec, known: tuple[Photograp
     as their labels hold them back, and images to a quarter of a level."""
     shots, true = known
     rng = np.random.default_rng(1)
-    moved = dataclasses.replace(true.p, leds=true.p.leds + rng.normal(size=true.p.leds.shape) * [2, 2, 1, 0.1, 0.1, 0.4])
+    moved = dataclasses.replace(true.p, leds=true.p.leds + rng.normal(size=true.p.leds.shape) * [2, 2, 1, 0.1, 0.1, 0.4, 0])
     labels = true.circles + rng.normal(size=(6, 3)) * 0.3
     settings = FitSettings(fixed=("gamma", "stray", "slope"), samples=(150, 100))
     start = FitState(moved, true.slopes, labels)
@@ -126,7 +134,7 @@ def test_five_starts_end_at_the_same_error(sensor: SensorSpec, known: tuple[Phot
     shots, true = known
     rng, errors = np.random.default_rng(2), []
     for _ in range(5):
-        moved = true.p.leds + rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 1.0, 0.2, 0.2, 0.5]
+        moved = true.p.leds + rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0]
         problem = DirectFit(sensor, shots, true, FitSettings(fixed=("gamma",), samples=(150, 100)), factor=4)
         start = problem.inside_bounds(dataclasses.replace(true, p=dataclasses.replace(true.p, leds=moved)))
         errors.append(float(np.abs(problem.residuals(problem.solve(start, 100))[0]).mean()))
@@ -140,7 +148,7 @@ def test_the_ray_tracers_own_photographs_are_explained(sensor: SensorSpec) -> No
     train, test = shots.take(np.arange(8)), shots.take(np.arange(8, 10))
     p = LightParameters.of(sensor, shots.background)
     moved = dataclasses.replace(
-        p, leds=p.leds + np.random.default_rng(0).normal(size=p.leds.shape) * [1, 1, 0.3, 0.05, 0.05, 0.2]
+        p, leds=p.leds + np.random.default_rng(0).normal(size=p.leds.shape) * [1, 1, 0.3, 0.05, 0.05, 0.2, 0]
     )
     start = with_parameters(sensor, moved, shots.background)
     fitted = fit_lights(start, train, settings=FitSettings(fixed=("gamma",)), starts=1, rounds=2, device="cpu")
@@ -198,7 +206,7 @@ def test_ties_hold_at_mirrored_leds_and_nowhere_else(sensor: SensorSpec) -> None
             moved = [np.concatenate([leds.ravel(), x[p.leds.size :]]) for leds in (one, both)]
             assert np.abs(ties.off(moved[0])).max() > 0.2
             np.testing.assert_allclose(ties.off(moved[1]), 0, atol=1e-9)
-    for k in (6 * 2 + 5, p.leds.size + 3 * 9):
+    for k in (7 * 2 + 5, 7 * 2 + 6, p.leds.size + 3 * 9):
         assert np.abs(ties.off(x + 0.3 * np.eye(len(x))[k])).max() > 0.2
 
 
@@ -231,7 +239,7 @@ def test_a_start_at_the_walls_is_a_sensor(sensor: SensorSpec) -> None:
 def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSpec) -> None:
     """Lights that begin 3 mm from where they are: a prior that nails them there serves worse, and the choice says so."""
     shots, true = direct(sensor, circles(8))
-    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0]))
+    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0]))
     start = with_parameters(sensor, moved, shots.background)
     settings = FitSettings(fixed=("gamma", "slope", "stray"))
     found, errors = choose_strength(start, shots, settings, candidates={"nailed": {"prior": 1e7}, "free": {"prior": 30.0}})
