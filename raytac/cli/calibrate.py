@@ -69,8 +69,6 @@ class CalibrateArgs(SolverOptions):
         self._refuse_options_of_the_other()
         if self.what != "markers":
             return self._optics(start)
-        if self.pad not in PADS:
-            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         sensor = load_sensor(self.sensor)
         self.prepare_solver("calibrate markers")
         name = sensor.name + ("-quick" if self.quick else "")
@@ -100,8 +98,6 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        if self.holdout < 0 or self.holdout == 1:
-            raise InputError("holdout", value=self.holdout, rule="must be 0 or a whole number >= 2")
         sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides)
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
         for name in doubtful:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.direct_fit import SIGMA, FitSettings
 from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
@@ -18,6 +18,8 @@ from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
 from raytac.calibrate.table_fit import fit_table
+from raytac.device import DEVICES
+from raytac.errors import InputError
 from raytac.gel.pad import make_grid
 from raytac.optics.base import OpticalMode
 from raytac.optics.mlp import MlpMode
@@ -26,7 +28,7 @@ from raytac.optics.raytrace import RayTracer
 from raytac.optics.taxim import TaximMode
 from raytac.specs import SensorSpec
 
-__all__ = ["MODES", "Models", "fit_models", "images_of", "mode_times", "raytrace_mode"]
+__all__ = ["MODES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
 
 MODES = ("raytrace", "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
@@ -52,6 +54,34 @@ class Models:
         """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
         own = dataclasses.replace(shots, background=self.rest)
         return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
+
+
+def check_fit(
+    *,
+    modes: Sequence[str] = MODES,
+    prior: str | None = None,
+    fixed: Sequence[str] = (),
+    device: str = "auto",
+    starts: int = 1,
+    rounds: int = 0,
+) -> None:
+    """Refuse arguments of ``fit_models`` that it could not use, at once and not after a fit.
+
+    Raises:
+        InputError: an unknown mode, strength of priors, block of parameters or device, no start, or rounds below 0.
+    """
+    for name, values, rule, choices in (
+        ("modes", modes, "must be known modes", MODES),
+        ("prior", () if prior is None else (prior,), "must be a known strength, or None to choose it", tuple(STRENGTHS)),
+        ("fixed", fixed, "must be known blocks of parameters", tuple(SIGMA)),
+        ("device", (device,), "must be a known device", DEVICES),
+    ):
+        for value in values:
+            if value not in choices:
+                raise InputError(name, value=value, rule=rule, choices=choices)
+    for name, number, least in (("starts", starts, 1), ("rounds", rounds, 0)):
+        if int(number) != number or number < least:
+            raise InputError(name, value=number, rule=f"must be a whole number >= {least}")
 
 
 def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
@@ -81,10 +111,11 @@ def fit_models(
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
     ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
 
-    Raises as ``fit_lights``.
+    Raises as ``check_fit`` and ``fit_lights``.
     """
     options = {} if options is None else options
     settings = FitSettings() if settings is None else settings
+    check_fit(modes=modes, prior=prior, fixed=settings.fixed, device=device, starts=starts, rounds=rounds)
     shots = shots.settled(sensor) if settle else shots
     if prior is None:
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
