@@ -19,20 +19,21 @@ _PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_t
 
 
 def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples, *, n_bins: int = N_BINS) -> PolyTable:
-    """The table of ``samples`` over the real ``background`` (H, W, 3) [levels], one sheet for touched pixels and one for those around;
-    no shadows: balls alone tell too little of them."""
+    """The table of ``samples`` over the real ``background`` (H, W, 3) [levels]: one sheet for touched pixels, one for those around, and for
+    readers that know one alone (``PolyTable.one_sheet``) one of all samples; no shadows: balls alone tell too little of them."""
     height, width = background.shape[:2]
     i, j = slope_bins(samples.slope_x, samples.slope_y, n_bins)
     sheets = []
-    for own in (samples.touched, ~samples.touched):
+    for own in (samples.touched, ~samples.touched, np.ones(len(i), bool)):
         sums = BinSums(n_bins, (width, height))
         sums.add(i[own], j[own], samples.column[own], samples.row[own], samples.difference[own].astype(np.float32))
         sheets.append(sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE))
-    contact, surround = sheets
+    contact, surround, together = sheets
     return PolyTable(
         gradients=contact.gradients,
         covered=contact.covered,
         surround=surround.gradients,
+        one_sheet=together.gradients,
         background=background.astype(np.float32),
         pixel_pitch=sensor.camera.pitch_at((width, height)),
         slopes_of="displacement",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import PressSamples, press_samples
 from raytac.calibrate.table_fit import fit_table
 from raytac.gel.pad import make_grid
+from raytac.optics.calib_folder import load_calibration, save_calibration
 from raytac.optics.mlp import MlpMode
+from raytac.optics.table import polynomial_basis, slope_bins
 from raytac.optics.taxim import TaximMode
 from raytac.specs import load_sensor
 
@@ -76,3 +79,29 @@ def test_the_same_seed_gives_the_same_network(samples: PressSamples) -> None:
     a, b, c = (fit_mlp(SENSOR, background, few, seed=seed).matrices[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(a, b)
     assert np.abs(a - c).max() > 0.1
+
+
+def test_a_reader_of_one_sheet_gets_what_all_samples_say(samples: PressSamples, tmp_path: Path) -> None:
+    """``polycalib.npz`` alone, as upstream reads a folder, is nearer to the pixels around contacts than the touched sheet is."""
+    table = fit_table(SENSOR, np.full((240, 320, 3), 90.0), every(samples, 3))
+    save_calibration(table, tmp_path)
+    back = load_calibration(tmp_path)
+    for name in ("gradients", "surround", "one_sheet", "covered"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
+    (tmp_path / "raytac.npz").unlink()
+    upstream = load_calibration(tmp_path)
+    assert upstream.surround is None and upstream.one_sheet is None
+    seen = every(samples, 7)
+    i, j = slope_bins(seen.slope_x, seen.slope_y, table.n_bins)
+    basis = polynomial_basis(seen.column, seen.row)
+
+    def error(gradients: np.ndarray, own: np.ndarray) -> float:
+        found = np.einsum("cnk,nk->nc", gradients[:, i, j], basis)
+        return float(np.abs(found - seen.difference)[own].mean())
+
+    outside, inside = ~seen.touched, seen.touched
+    assert error(upstream.gradients, outside) < 0.7 * error(table.gradients, outside)
+    # What it gains there it pays for inside, where touched pixels shine: one sheet is a mean of two.
+    assert table.surround is not None
+    assert error(table.surround, outside) < error(upstream.gradients, outside)
+    assert error(table.gradients, inside) < error(upstream.gradients, inside)
