@@ -19,7 +19,7 @@ from raytac.specs.press import PADS
 
 __all__ = ["CalibrateArgs"]
 
-_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "starts", "rounds", "prior")
+_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
 _OF_MARKERS = ("pad", "quick", "verbose")
 
 
@@ -50,6 +50,8 @@ class CalibrateArgs(SolverOptions):
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
     """Whether the ray tracer casts shadows on the coat while it is fitted."""
+    shadow_table: Literal["none", "raytrace"] = "none"
+    """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     starts: int = 3
     """Places that a fit of direct light starts from; the best goes on."""
     rounds: int = 3
@@ -114,6 +116,7 @@ class CalibrateArgs(SolverOptions):
             rounds=self.rounds,
             prior=prior_of(self.prior),
             shadows=self.shadows,
+            shadow_table=self.shadow_table,
             device=self.device,
             seed=self.seed,
             start=start,

@@ -21,7 +21,7 @@ from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.mlp import MlpMode
 from raytac.optics.mlp_weights import save_mlp
 from raytac.optics.taxim import TaximMode
-from raytac.report.real_models import check_fit, fit_models, images_of
+from raytac.report.real_models import SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.files import available, find_file
@@ -52,6 +52,7 @@ def run_calibrate_optics(
     device: str,
     seed: int,
     start: float,
+    shadow_table: str = SHADOW_TABLES[0],
 ) -> list[Path]:
     """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
 
@@ -62,7 +63,9 @@ def run_calibrate_optics(
     """
     if model not in FITTED:
         raise InputError("model", value=model, rule="must be one that can be fitted", choices=FITTED)
-    check_fit(prior=prior, device=device, starts=starts, rounds=rounds)
+    if shadow_table != SHADOW_TABLES[0] and model != "taxim":
+        raise InputError("shadow_table", value=shadow_table, rule=f"belongs to the model 'taxim', not to {model!r}: leave it out")
+    check_fit(prior=prior, shadow_table=shadow_table, device=device, starts=starts, rounds=rounds)
     resolve_device(device)
     if int(holdout) != holdout or holdout < 0 or holdout == 1:
         raise InputError("holdout", value=holdout, rule="must be 0 or a whole number >= 2")
@@ -90,6 +93,7 @@ def run_calibrate_optics(
                 starts=starts,
                 rounds=rounds,
                 prior=prior,
+                shadow_table=shadow_table,
                 options={"shadows": shadows},
                 tick=tick,
             )
@@ -99,6 +103,7 @@ def run_calibrate_optics(
         metrics |= {
             "holdout": holdout,
             "shadows": int(shadows),
+            "shadow_table": shadow_table,
             "starts": starts,
             "rounds": rounds,
             "prior": models.prior,

@@ -148,20 +148,27 @@ def test_a_comparison_of_unknown_settings_cannot_be_set_up(name: str) -> None:
     assert said in str(told.value)
 
 
-@pytest.mark.parametrize("name", [*WRONG, "modes", "fixed"])
+@pytest.mark.parametrize("name", [*WRONG, "modes", "fixed", "shadow_table"])
 def test_a_fit_of_unknown_names_is_refused_at_once(name: str) -> None:
-    value, said = WRONG.get(name, (("raytrace", "ray"), "raytrace, taxim, mlp, phong"))
-    how: dict[str, Any] = {name: value}
-    if name == "fixed":
-        how, said = {"settings": FitSettings(fixed=("gama",))}, "gamma, stray"
+    own: dict[str, Any] = {
+        "modes": (("raytrace", "ray"), "raytrace, taxim, mlp, phong"),
+        "fixed": (("gama",), "gamma, stray"),
+        "shadow_table": ("pins", "none, raytrace"),
+    }
+    value, said = (WRONG | own)[name]
+    how: dict[str, Any] = {"settings": FitSettings(fixed=value)} if name == "fixed" else {name: value}
     with pytest.raises(InputError, match=name) as told:
         fit_models(SENSOR, shots(), **how)
     assert said in str(told.value)
 
 
-@pytest.mark.parametrize("name", [*WRONG, "model", "holdout"])
+@pytest.mark.parametrize("name", [*WRONG, "model", "holdout", "shadow_table"])
 def test_a_calibration_by_unknown_names_writes_nothing(name: str, tmp_path: Path) -> None:
-    own: dict[str, Any] = {"model": ("phong", "raytrace, taxim, mlp"), "holdout": (1, "0 or a whole number >= 2")}
+    own: dict[str, Any] = {
+        "model": ("phong", "raytrace, taxim, mlp"),
+        "holdout": (1, "0 or a whole number >= 2"),
+        "shadow_table": ("raytrace", "belongs to the model 'taxim'"),
+    }
     value, said = (WRONG | own)[name]
     how: dict[str, Any] = dict(model="raytrace", holdout=0, starts=1, rounds=0, prior=None, device="cpu") | {name: value}
     with pytest.raises(InputError, match=name) as told:
