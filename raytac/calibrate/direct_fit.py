@@ -60,7 +60,7 @@ class FitSettings:
 
     reach: float = 2.4
     """Pixels up to this many radii from a circle's centre count."""
-    ring_weight: float = 0.5
+    ring_weight: float = 1.5
     """Weight of a residual outside the labelled circle."""
     rest_weight: float = 0.3
     """Weight of the whole image at rest over that of the presses."""
@@ -225,7 +225,9 @@ class DirectFit:
         p = self.start.p
         cuts = np.cumsum([p.leds.size, p.power.size, 3, 6])
         leds, power, glow, response, slopes = np.split(x, cuts)
-        changed = dataclasses.replace(p, leds=leds.reshape(p.leds.shape), power=power.reshape(-1, 3), glow=glow, response=response)
+        changed = dataclasses.replace(
+            p, leds=leds.reshape(p.leds.shape), power=power.reshape(-1, 3), glow=glow, response=response
+        )
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:

@@ -11,7 +11,7 @@ from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 
-__all__ = ["CEILING", "CHANNELS", "LightParameters", "darkest", "leds_at_walls", "with_parameters"]
+__all__ = ["CEILING", "CHANNELS", "LightParameters", "darkest", "leds_at_walls", "leds_split", "with_parameters"]
 
 CHANNELS = ("red", "green", "blue")
 SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
@@ -20,6 +20,8 @@ DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
 """Highest z [mm] of an LED: below gel and a support plate of 1 mm, so that ``refraction.model = "slab"`` stays possible."""
+SPREAD = 1.5
+"""Width over which an LED is split, over its own: what lies in front of it, and its neighbours, make a row of them (a guess)."""
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -52,7 +54,9 @@ class LightParameters:
                 rule = "must be a camera channel, the LED's colour"
                 raise InputError("led.layer", value=led.layer, rule=rule, choices=CHANNELS)
             x, y, z = led.axis
-            leds.append([*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe, 1e3 * led.size[1]])
+            leds.append(
+                [*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe, 1e3 * led.size[1]]
+            )
             power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
         stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
@@ -106,6 +110,33 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
 def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
     """Linear light of the darkest pixel of every channel, (3,)."""
     return np.maximum(decode(background.reshape(-1, 3).min(0), gamma), 1e-6)
+
+
+def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
+    """A start for a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
+
+    Raises:
+        InputError: no whole number >= 1.
+    """
+    if int(count) != count or count < 1:
+        raise InputError("split", value=count, rule="must be a whole number >= 1")
+    if count == 1:
+        return sensor.lights
+    leds = []
+    for led in sensor.lights.leds:
+        width, along = SPREAD * led.size[0], np.array(led.edges[0])
+        for k in range(count):
+            place = np.array(led.position) + ((k + 0.5) / count - 0.5) * width * along
+            leds.append(
+                dataclasses.replace(
+                    led,
+                    name=f"{led.name}_{k + 1}",
+                    position=tuple(map(float, place)),
+                    size=(width / count, led.size[1]),
+                    power=tuple(p / count for p in led.power),
+                )
+            )
+    return dataclasses.replace(sensor.lights, leds=tuple(leds))
 
 
 def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:

@@ -34,7 +34,7 @@ FIRST, LATER = 100, 30
 """Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
 """How far starts lie apart: mm, rad, lobe exponent, mm."""
-STEPS = {0: 0.3, 1: 0.3, 2: 0.3, HEIGHT: 0.5}
+STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
 """Steps [mm] of the slopes by an LED's place and height: shadows' edges are soft, and as wide on the pad."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
@@ -50,7 +50,8 @@ class Fitted:
     """The sensor with its new lights and response."""
     state: FitState
     costs: tuple[float, ...]
-    """Cost of the least-squares problem after every round, the first with direct light alone."""
+    """Cost of the least-squares problem with the ray tracer's light before the first round and after every one; the least is taken. Without
+    rounds that with direct light alone."""
     start_errors: tuple[float, ...]
     """Mean absolute residual [levels] in the contacts after direct light from every start."""
 
@@ -98,19 +99,20 @@ def extra_light(
 ) -> ExtraLight:
     """The defect with its slopes by the LEDs' places and heights, where shadows are cast (``slopes``: and wanted).
 
-    Every LED has a layer of its own, so that all move in one rendering: four more give all slopes, by differences and without
+    Every LED has a layer of its own, so that all move in one rendering: eight more give all slopes, by central differences and without
     inter-reflection, which changes slowly.
     """
     found: dict[int, Light] = {}
     if slopes and options.get("shadows", True):
         direct = {**options, "bounce": False}
-        here = defect(problem, state, grid, device, direct)
         for k, step in STEPS.items():
-            leds = state.p.leds.copy()
-            leds[:, k] += step
-            moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds))
-            there = defect(problem, moved, grid, device, direct)
-            found[k] = Light(*((b - a) / step for a, b in zip(here.parts, there.parts, strict=True)))
+            ends = []
+            for way in (step, -step):
+                leds = state.p.leds.copy()
+                leds[:, k] += way
+                moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds))
+                ends.append(defect(problem, moved, grid, device, direct))
+            found[k] = Light(*((b - a) / (2 * step) for b, a in zip(ends[0].parts, ends[1].parts, strict=True)))
     return ExtraLight(defect(problem, state, grid, device, options), state.p.leds.copy(), found)
 
 
@@ -158,14 +160,20 @@ def fit_lights(
         off = problem.residuals(here)
         found.append((problem.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
-    cost, state = min(found, key=lambda pair: pair[0])
-    costs = [cost]
-    grid = make_grid(sensor.gelpad, GRID_PITCH)
+    _, state = min(found, key=lambda pair: pair[0])
+    grid, passed = make_grid(sensor.gelpad, GRID_PITCH), []
+    # A round's cost is known when the next has rendered what it found: the light that it was solved with is of first order only.
     for k in range(rounds):
         extra = extra_light(problem, state, grid, device, options or {})
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
+        passed.append((problem.cost(state, problem.residuals(state)), state))
         state = problem.solve(state, LATER, told(f"all light, round {k + 1} of {rounds}"))
-        costs.append(problem.cost(state, problem.residuals(state)))
+    if rounds:
+        extra = extra_light(problem, state, grid, device, options or {}, slopes=False)
+        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
+    passed.append((problem.cost(state, problem.residuals(state)), state))
+    _, state = min(passed, key=lambda pair: pair[0])
+    costs = [cost for cost, _ in passed]
     return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs), tuple(errors))
 
 

@@ -19,7 +19,7 @@ from raytac.specs.press import PADS
 
 __all__ = ["CalibrateArgs"]
 
-_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
+_OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
 _OF_MARKERS = ("pad", "quick", "verbose")
 
 
@@ -46,6 +46,8 @@ class CalibrateArgs(SolverOptions):
     sides: str = FROM_SCRATCH
     """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
     these were fitted to photographs that are tested on, errors are not of held-out presses."""
+    split: int = 1
+    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side, as LEDs behind a diffuser light like a row."""
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
@@ -100,7 +102,7 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides)
+        sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split)
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
         for name in doubtful:
             print(f"the circle of press {name} is doubtful")

@@ -36,6 +36,8 @@ class CompareRealArgs(CommonOptions):
     sides: str = FROM_SCRATCH
     """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
     these were fitted to photographs that are tested on, errors are not of held-out presses."""
+    split: int = 1
+    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side, as LEDs behind a diffuser light like a row."""
     regions: bool = True
     """Also fit to one half of the pad and to shallow presses, and test on the others."""
     ablations: bool = True
@@ -54,7 +56,7 @@ class CompareRealArgs(CommonOptions):
         began = time.perf_counter()
         from raytac.report.real import RealSettings, check_folds, compare_real
 
-        sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides)
+        sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides, self.split)
         check_folds(presses, self.folds)
         settings = RealSettings(
             folds=self.folds,

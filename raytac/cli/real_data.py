@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from raytac.calibrate.circles import with_found_circles
-from raytac.calibrate.light_parameters import leds_at_walls
+from raytac.calibrate.light_parameters import leds_at_walls, leds_split
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import STRENGTHS
@@ -14,7 +14,7 @@ from raytac.specs import SensorSpec, load_sensor, with_lights
 
 __all__ = ["FROM_SCRATCH", "INNER", "OWN_LEDS", "prior_of", "read_data"]
 
-FROM_SCRATCH = "5,3,4"
+FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own lights were
 fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
@@ -34,18 +34,22 @@ def prior_of(name: str) -> str | None:
 
 
 def read_data(
-    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str
+    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str, split: int = 1
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
     """The sensor, its fully visible presses as read and as floats, and the names of those whose circles were found but are doubtful.
 
-    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``.
+    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.
     """
     sensor = load_sensor(sensor_name)
     if sides != OWN_LEDS:
+        if split != 1:
+            raise InputError("split", value=split, rule=f"is for --sides {OWN_LEDS}: name the numbers of LEDs themselves")
         sensor = with_lights(sensor, leds_at_walls(sensor, sides))
+    elif split != 1:
+        sensor = with_lights(sensor, leds_split(sensor, split))
     presses = read_presses(data, ball_diameter=None if ball_diameter_mm is None else ball_diameter_mm / 1e3)
     presses, doubtful = with_found_circles(presses, sensor.camera.pixel_pitch[0])
     names = [name for name, bad in zip(presses.names, doubtful, strict=True) if bad]

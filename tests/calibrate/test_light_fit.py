@@ -9,10 +9,10 @@ import pytest
 
 from raytac.calibrate.direct_fit import HEIGHT, DirectFit, ExtraLight, FitSettings, FitState, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, with_parameters
+from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, leds_split, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
-from raytac.calibrate.ray_fit import fit_lights, refine_circles
+from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
 from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
@@ -208,6 +208,45 @@ def test_ties_hold_at_mirrored_leds_and_nowhere_else(sensor: SensorSpec) -> None
             np.testing.assert_allclose(ties.off(moved[1]), 0, atol=1e-9)
     for k in (7 * 2 + 5, 7 * 2 + 6, p.leds.size + 3 * 9):
         assert np.abs(ties.off(x + 0.3 * np.eye(len(x))[k])).max() > 0.2
+
+
+def test_a_split_led_is_a_row_of_the_same_light(sensor: SensorSpec) -> None:
+    lights = leds_split(sensor, 3)
+    assert len(lights.leds) == 9 and len({led.name for led in lights.leds}) == 9
+    validate_sensor(with_lights(sensor, lights))
+    for led, row in zip(sensor.lights.leds, (lights.leds[k : k + 3] for k in (0, 3, 6)), strict=True):
+        np.testing.assert_allclose(np.sum([one.power for one in row], axis=0), led.power)
+        np.testing.assert_allclose(np.mean([one.position for one in row], axis=0), led.position)
+        step = np.subtract(row[1].position, row[0].position)
+        np.testing.assert_allclose(np.abs(step @ np.array(led.edges[0])), row[0].size[0], err_msg="the row has no gaps")
+        assert np.linalg.norm(step) * 3 == pytest.approx(1.5 * led.size[0])
+    assert leds_split(sensor, 1) == sensor.lights
+    with pytest.raises(InputError, match="whole number >= 1"):
+        leds_split(sensor, 0)
+
+
+def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
+    """Shadows of LEDs 2 mm high that move by 0.4 mm or change their height: the slopes tell more than half of what changes, both ways."""
+    leds = tuple(dataclasses.replace(led, position=(*led.position[:2], -5.6e-3), size=(2e-3, 2e-3)) for led in sensor.lights.leds)
+    low = with_lights(sensor, dataclasses.replace(sensor.lights, leds=leds))
+    at = circles(3)
+    at[:, 2] = 40
+    blank = Photographs(np.full((240, 320, 3), 100.0), np.full((3, 240, 320, 3), 100.0), at, np.full(3, RADIUS))
+    state = FitState(LightParameters.of(low, blank.background), RIGID_PAD.copy(), at)
+    problem = DirectFit(low, blank, state, FitSettings(samples=(400, 400)), factor=2)
+    grid, options = make_grid(low.gelpad, 0.12e-3), {"bounce": False}
+    extra = extra_light(problem, state, grid, "cpu", options)
+    assert sorted(extra.by_led) == [0, 1, 2, HEIGHT]
+    for column, step in ((0, 0.4), (0, -0.4), (2, 0.4), (2, -0.4), (HEIGHT, -0.5)):
+        moved_leds = state.p.leds.copy()
+        moved_leds[:, column] += step
+        moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=moved_leds))
+        true = extra_light(problem, moved, grid, "cpu", options, slopes=False).light.pressed
+        held, followed = (np.abs(true - one.pressed).mean() for one in (extra.light, extra.of(moved_leds)))
+        assert held > 5e-5, f"column {column}: shadows must change"
+        assert followed < held / 2, f"column {column} by {step}: {followed / held:.2f} of the change is missed"
+    none = extra_light(problem, state, grid, "cpu", {"bounce": False, "shadows": False})
+    assert not none.by_led and np.abs(none.light.pressed).max() < 0.1 * np.abs(extra.light.pressed).max()
 
 
 def test_strong_ties_are_kept_and_weak_ones_are_not(sensor: SensorSpec) -> None:
