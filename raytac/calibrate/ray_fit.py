@@ -1,8 +1,9 @@
 """Lights fitted with the ray tracer as forward model, by defect correction.
 
 The ray tracer's image is direct light of points plus what that leaves out: shadows, the size of LEDs, inter-reflection, a specular coat.
-The rest is small, so that a few rounds suffice of: render with every LED in a layer of its own, take the ray tracer's light minus the direct
-light, and fit again with it added (``direct_fit``): held but for its slopes by the places and heights of LEDs, on which shadows depend.
+The rest is small, so that a few rounds suffice of: render with every LED in a layer of its own, take the ray tracer's light minus the
+direct light, and fit again with it added (``direct_fit``): held but for its slopes by the places and heights of LEDs, on which shadows
+depend.
 """
 
 from __future__ import annotations

@@ -121,7 +121,11 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
     data = data_set(tmp_path, count=6)
     assert CompareRealArgs(data=data).sides == CalibrateArgs(what=str(data)).sides == FROM_SCRATCH
     scratch, own = (read_data(data, "gelsight_mini", None, sides)[0].lights for sides in (FROM_SCRATCH, OWN_LEDS))
-    assert scratch.source is None and [sum(led.layer == c for led in scratch.leds) for c in ("red", "green", "blue")] == [5, 3, 4]
+    assert scratch.source is None and [sum(led.layer == c for led in scratch.leds) for c in ("red", "green", "blue")] == [
+        12,
+        8,
+        9,
+    ]
     assert own == SENSOR.lights
 
 
