@@ -2,7 +2,9 @@
 
 Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
 halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a
-model is judged on have no part in it.
+model is judged on have no part in it. Four halves tell little: another strength than the ``USUAL`` is taken only where it is better by
+more than the standard error of the difference (after the one-standard-error rule of L. Breiman, J. Friedman, R. Olshen, C. Stone,
+Classification and Regression Trees, 1984, section 3.4.3).
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ STRENGTHS: dict[str, dict[str, float]] = {
 """Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
 CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
 """What is chosen from: that LEDs of a side are alike is taken for granted, as sensors are built so."""
+USUAL = "tied-dark"
 SAMPLES = (90, 45)
 """Pixels of a press that count here, inside and outside its circle: the choice needs fewer than the fit."""
 STEPS, CIRCLE_STEPS = 40, 6
@@ -44,7 +47,10 @@ def choose_strength(
     seed: int = 0,
     tick: Callable[[str, float], None] | None = None,
 ) -> tuple[str, dict[str, float]]:
-    """Name of the candidate with the least error, and the error of each: mean absolute residual [levels] in contacts of other halves.
+    """Name of the candidate chosen, and the error of each: mean absolute residual [levels] in contacts of other halves.
+
+    That is the one with the least error, or ``USUAL`` if it is among the candidates and not worse by more than the standard error of the
+    difference.
 
     Raises:
         InputError: too few presses to halve.
@@ -67,8 +73,14 @@ def choose_strength(
             found.append(float(np.abs(off[problem.inside]).mean()))
             if tick is not None:
                 tick(f"prior {name}", found[-1])
-        errors[name] = float(np.mean(found))
-    return min(errors, key=errors.__getitem__), errors
+        errors[name] = np.array(found)
+    means = {name: float(found.mean()) for name, found in errors.items()}
+    best = min(means, key=means.__getitem__)
+    if USUAL in errors:
+        worse = errors[USUAL] - errors[best]
+        if worse.mean() <= worse.std(ddof=1) / np.sqrt(len(worse)):
+            best = USUAL
+    return best, means
 
 
 def _halves(circles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -283,5 +283,10 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     settings = FitSettings(fixed=("gamma", "slope", "stray"))
     found, errors = choose_strength(start, shots, settings, candidates={"nailed": {"prior": 1e7}, "free": {"prior": 30.0}})
     assert found == "free" and errors["free"] < 0.6 * errors["nailed"], errors
+    usual = {"tied-dark": {"prior": 31.0}, "free": {"prior": 30.0}}
+    found, errors = choose_strength(start, shots, settings, candidates=usual)
+    assert found == "tied-dark" and errors["free"] == pytest.approx(errors["tied-dark"], rel=0.05), "no difference: the usual one"
+    found, _ = choose_strength(start, shots, settings, candidates={"tied-dark": {"prior": 1e7}, "free": {"prior": 30.0}})
+    assert found == "free", "a clear difference beats custom"
     with pytest.raises(InputError, match="at least 8"):
         choose_strength(start, shots.take(np.arange(7)), settings)
