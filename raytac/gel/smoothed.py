@@ -123,7 +123,8 @@ class LocalField:
             if first > self._last:  # no Gaussian comes after it
                 total[_within(self._touched, window)] += values
                 continue
-            margin = self._reach * self._gaussians.sigma(first, self._last)
+            # A discrete Gaussian narrower than a node reaches farther for its width than a wide one.
+            margin = self._reach * self._gaussians.sigma(first, self._last) + 2.0 * max(self._gaussians.pitch)
             piece = around(self._touched, margin, self._gaussians.pitch, window)
             total[_within(piece, window)] += self._gaussians.apply(first, self._last, values, self._touched, piece)
         return total

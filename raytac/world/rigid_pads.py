@@ -174,7 +174,10 @@ class RigidPads:
             deeper = depth > deepest[rows_near]
             at = rows_near[deeper]
             deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at, i]
-            height[rows_near] = np.minimum(height[rows_near], under)
+            if len(rows_near) == len(datas):
+                height = np.minimum(height, under, out=under)
+            else:
+                height[rows_near] = np.minimum(height[rows_near], under)
         height[failed] = np.nan
         # From one body to another is no motion of either.
         before = self._pressed[name][rows]
