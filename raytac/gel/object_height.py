@@ -34,16 +34,16 @@ def object_height(
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError("pad_from_object", value=poses.shape, rule="must have shape (B, 4, 4)")
     height = np.full((len(poses), y.shape[-1], x.shape[-1]), np.inf)
-    finite = np.isfinite(poses).all(axis=(1, 2))
-    if not finite.all():
-        poses = np.where(finite[:, None, None], poses, np.eye(4))
+    lost = np.logical_not(np.isfinite(poses).all(axis=(1, 2)))
+    if lost.any():
+        poses = np.where(lost[:, None, None], np.eye(4), poses)
     count = max(_NODES // (height.shape[1] * height.shape[2]), 1)
     for start in range(0, len(poses), count):
         some = slice(start, start + count)
         own = (x, y) if x.ndim == 1 else (x[some], y[some])
         for part in parts:
             _lower_onto(height[some], part, poses[some] @ part.object_from_part, *own, below)
-    height[~finite] = np.nan
+    height[lost] = np.nan
     return height
 
 
