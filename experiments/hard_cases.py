@@ -41,7 +41,7 @@ class Args(CommonOptions):
 
 
 def main(args: Args) -> int:
-    from experiments.hard_figure import draw_last_states
+    from experiments.hard_figure import draw_last_states, state_of
 
     start, setup = time.perf_counter(), Setup(args.device, args.large)
     names = [n for n in args.cases.split(",") if n] or [*CASES, "random_presses"]
@@ -74,7 +74,9 @@ def main(args: Args) -> int:
     metrics |= {"cases.passed": passed, "cases.total": len(names)}
     common = {"experiment": "hard_cases", "device": args.device, "seed": args.seed, **versions((*VERSIONED, "warp-lang"))}
     with result_folder(args.out or Path("runs/hard_cases"), ("metrics.json", "hard_cases.png")) as folder:
-        draw_last_states({name: worst.world for name, worst in results.items() if worst.world}, folder / "hard_cases.png")
+        draw_last_states(
+            {name: state_of(worst.world) for name, worst in results.items() if worst.world}, folder / "hard_cases.png"
+        )
         write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - start})
     return 0 if passed == len(names) else 1
 

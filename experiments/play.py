@@ -10,12 +10,12 @@ evaluation: no training has seen them.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,6 +54,18 @@ class Args(CommonOptions):
     """Optical model of the sensors' images in the film; the policy is not shown them unless it was trained with them."""
 
 
+@dataclass(frozen=True)
+class Film:
+    """Pictures of an episode, one a step."""
+
+    frames: list[np.ndarray]
+    """8-bit pictures (H, W, 3): the scene, a third wider than it is high, then a column for each sensor."""
+    step: float
+    """Time from one picture to the next [s]."""
+    sensors: tuple[str, ...]
+    """Names of the sensors in the order of their columns."""
+
+
 def main(args: Args) -> dict[str, Metric]:
     """Play, and write all."""
     start = time.perf_counter()
@@ -67,12 +79,12 @@ def main(args: Args) -> dict[str, Metric]:
     with result_folder(out, names) as folder:
         if args.film:
             try:
-                frames = list(_frames(args, recipe))
+                film = _film(args, recipe)
             except BackendError as error:
                 print(f"no film: {error}", file=sys.stderr)
             else:
-                _write_film(frames, folder / ("film.mp4" if args.mp4 else "film.gif"))
-                _write_strip(frames, folder / "strip.png")
+                _write_film(film, folder / ("film.mp4" if args.mp4 else "film.gif"))
+                _write_strip(film, folder / "strip.png")
         if args.episodes:
             result = _rate(args, recipe)
             low, high = result.interval
@@ -134,8 +146,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
     return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
 
 
-def _frames(args: Args, recipe: Recipe | None) -> Iterator[np.ndarray]:
-    """Pictures of one episode, one a step."""
+def _film(args: Args, recipe: Recipe | None) -> Film:
     from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
     from raytac.envs.scripted import SCRIPTED
 
@@ -144,12 +155,12 @@ def _frames(args: Args, recipe: Recipe | None) -> Iterator[np.ndarray]:
         shown = ObservationSettings(("rgb", "markers"), resolution=(160, 120), optics=args.optics)
         env, policy = KINDS[args.task](1, tactile=shown, render_mode="rgb_array", device=args.device), SCRIPTED[args.task]
         env.reset(seed=seed)
-        for _ in range(env.batch.max_episode_steps):
-            yield _picture(env.render())
+        frames, ended = [], False
+        while not ended:
+            frames.append(_picture(env.render()))
             _, _, terminated, truncated, _ = env.step(np.clip(policy(env.batch), -1.0, 1.0))
-            if terminated[0] or truncated[0]:
-                return
-        return
+            ended = bool(terminated[0] or truncated[0])
+        return Film(frames, env.batch.control_timestep, tuple(env.batch.observers))
     settings = tactile_settings(recipe.tactile)
     told = KINDS[recipe.task].task.tactile if settings == "task" else () if settings is None else settings.modalities  # type: ignore[union-attr]
     if "rgb" in told:
@@ -161,14 +172,15 @@ def _frames(args: Args, recipe: Recipe | None) -> Iterator[np.ndarray]:
         learner = Learner(replace(recipe, num_envs=1), hidden=hidden, tactile=shown, render_mode="rgb_array", pitch=0.4e-3)
     learner.restore(Checkpoint.load(Path(args.policy)))
     learner.normaliser.training = False
-    env = learner.model.get_env()
-    assert env is not None
-    env.seed(seed)
-    observation, ended = env.reset(), False
+    seen, vectors = learner.model.get_env(), learner.base.env  # type: ignore[union-attr]
+    assert seen is not None
+    seen.seed(seed)
+    observation, frames, ended = seen.reset(), [], False
     while not ended:
-        yield _picture(learner.base.env.render())  # type: ignore[union-attr]
-        observation, _, done, _ = env.step(learner.predict(observation))  # type: ignore[arg-type]
+        frames.append(_picture(vectors.render()))
+        observation, _, done, _ = seen.step(learner.predict(observation))  # type: ignore[arg-type]
         ended = bool(done[0])
+    return Film(frames, vectors.batch.control_timestep, tuple(vectors.batch.observers))
 
 
 def _picture(pictures: tuple[np.ndarray, ...] | None) -> np.ndarray:
@@ -176,32 +188,59 @@ def _picture(pictures: tuple[np.ndarray, ...] | None) -> np.ndarray:
     return pictures[0]
 
 
-def _write_film(frames: list[np.ndarray], path: Path, step: float = 0.02) -> None:
+def _write_film(film: Film, path: Path) -> None:
     """All frames as MP4, at the speed of life; every third as GIF, which can show no more."""
     from PIL import Image
 
     if path.suffix == ".gif":
-        images = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=96) for frame in frames[::3]]
-        images[0].save(path, save_all=True, append_images=images[1:], duration=round(3e3 * step), loop=0)
+        images = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=96) for frame in film.frames[::3]]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=round(3e3 * film.step), loop=0)
         return
-    height, width = (2 * (n // 2) for n in frames[0].shape[:2])  # the usual format of colours wants even numbers
+    height, width = (2 * (n // 2) for n in film.frames[0].shape[:2])  # the usual format of colours wants even numbers
     command = [
-        "ffmpeg", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(1.0 / step),
+        "ffmpeg", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(1.0 / film.step),
         "-i", "-", "-pix_fmt", "yuv420p", "-y", str(path),
     ]  # fmt: skip
-    raw = b"".join(np.ascontiguousarray(frame[:height, :width]).tobytes() for frame in frames)
+    raw = b"".join(np.ascontiguousarray(frame[:height, :width]).tobytes() for frame in film.frames)
     done = subprocess.run(command, input=raw, capture_output=True, check=False)
     if done.returncode:
         raise BackendError(f"ffmpeg could not write {path.name}: {done.stderr.decode(errors='replace').strip()}")
 
 
-def _write_strip(frames: list[np.ndarray], path: Path, count: int = 4) -> None:
-    """Some frames, two beside each other, in the order in which one reads."""
-    from PIL import Image
+def moments(film: Film, count: int) -> np.ndarray:
+    """Numbers of ``count`` frames, the first and the last among them, between which the scene changes alike; where nothing changes, time
+    counts."""
+    scene = 4 * film.frames[0].shape[0] // 3
+    change = [np.abs(b[:, :scene].astype(int) - a[:, :scene]).mean() for a, b in itertools.pairwise(film.frames)]
+    way = np.cumsum([0.0, *(np.array(change) + 1e-9)])
+    found = np.searchsorted(way, np.linspace(0.0, way[-1], count))
+    return np.append(found[:-1], len(film.frames) - 1)
 
-    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, count).round().astype(int)]
-    rows = [np.concatenate(chosen[i : i + 2], axis=1) for i in range(0, count, 2)]
-    Image.fromarray(np.concatenate(rows)).save(path)
+
+def _write_strip(film: Film, path: Path, count: int = 4) -> None:
+    """Moments of the episode, as much change in the scene from each to the next, two beside each other in the order in which one reads."""
+    from matplotlib.figure import Figure
+
+    height, width = film.frames[0].shape[:2]
+    scene = 4 * height // 3
+    gap, above, below = 0.12, 0.26, 0.24  # inches
+    wide, high = width / 100, height / 100  # at 150 dots an inch: text is finer than pictures
+    rows = -(-count // 2)
+    size = 2 * wide + gap, rows * (above + high + below)
+    figure = Figure(figsize=size)
+    for k, i in enumerate(moments(film, count)):
+        row, column = divmod(k, 2)
+        left, bottom = column * (wide + gap), size[1] - row * (above + high + below) - above - high
+        axes = figure.add_axes((left / size[0], bottom / size[1], wide / size[0], high / size[1]))
+        axes.imshow(film.frames[i], interpolation="lanczos", extent=(0, width, height, 0))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(f"({'abcdefgh'[k]}) t = {film.step * i:.2f} s", loc="left", fontsize=11, pad=4)
+        axes.text(scene / 2, height + 5, "scene", ha="center", va="top", fontsize=9)
+        share = (width - scene) / max(1, len(film.sensors))
+        for n, name in enumerate(film.sensors):
+            middle = scene + (n + 0.5) * share
+            axes.text(middle, height + 5, f"{name} (markers × 4)", ha="center", va="top", fontsize=9)
+    figure.savefig(path, dpi=150)
 
 
 if __name__ == "__main__":

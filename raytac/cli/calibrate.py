@@ -19,7 +19,7 @@ from raytac.specs.press import PADS
 
 __all__ = ["CalibrateArgs"]
 
-_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "starts", "rounds", "prior")
+_OF_DATA = ("model", "ball_diameter_mm", "sides", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
 _OF_MARKERS = ("pad", "quick", "verbose")
 
 
@@ -50,6 +50,8 @@ class CalibrateArgs(SolverOptions):
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
     """Whether the ray tracer casts shadows on the coat while it is fitted."""
+    shadow_table: Literal["none", "raytrace"] = "none"
+    """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     starts: int = 3
     """Places that a fit of direct light starts from; the best goes on."""
     rounds: int = 3
@@ -69,8 +71,6 @@ class CalibrateArgs(SolverOptions):
         self._refuse_options_of_the_other()
         if self.what != "markers":
             return self._optics(start)
-        if self.pad not in PADS:
-            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         sensor = load_sensor(self.sensor)
         self.prepare_solver("calibrate markers")
         name = sensor.name + ("-quick" if self.quick else "")
@@ -100,8 +100,6 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        if self.holdout < 0 or self.holdout == 1:
-            raise InputError("holdout", value=self.holdout, rule="must be 0 or a whole number >= 2")
         sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides)
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
         for name in doubtful:
@@ -118,6 +116,7 @@ class CalibrateArgs(SolverOptions):
             rounds=self.rounds,
             prior=prior_of(self.prior),
             shadows=self.shadows,
+            shadow_table=self.shadow_table,
             device=self.device,
             seed=self.seed,
             start=start,

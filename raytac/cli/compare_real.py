@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
-from raytac.errors import InputError
 from raytac.io.options import CommonOptions
 
 __all__ = ["CompareRealArgs"]
@@ -57,8 +56,6 @@ class CompareRealArgs(CommonOptions):
 
         sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides)
         check_folds(presses, self.folds)
-        if self.tested is not None and not 1 <= self.tested <= self.folds:
-            raise InputError("tested", value=self.tested, rule=f"must be 1 to {self.folds}, the number of folds")
         settings = RealSettings(
             folds=self.folds,
             tested=self.tested,

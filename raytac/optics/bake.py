@@ -8,7 +8,7 @@ image at rest are what the bin's polynomial is fitted to (docs/taxim-table.md, *
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -21,11 +21,11 @@ from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.bake_shadow import ShadowSums
 from raytac.optics.bake_views import Calibration, Views
 from raytac.optics.calib_folder import load_calibration
-from raytac.optics.table import PolyTable, TaximConstants, slope_bins
+from raytac.optics.table import PolyTable, ShadowTable, TaximConstants, slope_bins
 from raytac.optics.table_cache import cached, keep, table_folder
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Baked", "bake", "bake_table", "baked_table", "calibrate"]
+__all__ = ["Baked", "bake", "bake_shadow", "bake_table", "baked_table", "calibrate"]
 
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
@@ -132,14 +132,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
             add_samples(sums, views, at.rest_image)
             bar.update(len(views.rgb))
         fit = sums.solve(neighbours=settings.neighbours, ridge=settings.ridge)
-        shadow = None
-        if settings.pins:
-            _, deepest = settings.depth_range(sensor.gelpad.thickness)
-            shades = ShadowSums(2 * _PLAIN.ring_dilations, deepest, camera.resolution)
-            for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
-                shades.add(views, cast, at.rest_image)
-                bar.update(3 * len(views.rgb))
-            shadow = shades.table()
+        shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if settings.pins else None
     width, height = camera.resolution
     table = PolyTable(
         gradients=fit.gradients,
@@ -161,6 +154,23 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
         },
     )
     return Baked(table, fit, images, at)
+
+
+def bake_shadow(
+    at: Calibration,
+    *,
+    settings: BakeSettings | None = None,
+    seed: int = 0,
+    tick: Callable[[int], object] = lambda count: None,
+) -> ShadowTable:
+    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is told how many images were rendered, six a pin in all."""
+    settings = BakeSettings() if settings is None else settings
+    _, deepest = settings.depth_range(at.sensor.gelpad.thickness)
+    shades = ShadowSums(2 * _PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)
+    for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
+        shades.add(views, cast, at.rest_image)
+        tick(3 * len(views.rgb))
+    return shades.table()
 
 
 def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:

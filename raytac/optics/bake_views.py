@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -45,13 +46,14 @@ class Calibration:
         device: str = "auto",
         resolution: tuple[int, int] | None = None,
         seed: int = 0,
-        shadows: bool = True,
+        flat_field: np.ndarray | None = None,
     ) -> None:
-        """Raises as ``RayTracer``."""
+        """``flat_field`` and errors as of ``RayTracer``."""
         self.sensor = sensor
-        self.tracer = RayTracer(sensor, resolution=resolution, outputs=("rgb",), device=device, seed=seed)
+        options: dict[str, Any] = {"resolution": resolution, "outputs": ("rgb",), "device": device, "flat_field": flat_field}
+        self.tracer = RayTracer(sensor, seed=seed, **options)
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
-        options = {"resolution": resolution, "outputs": ("rgb",), "device": device, "bounce": False}
+        options["bounce"] = False
         self._direct = [RayTracer(sensor, shadows=shadows, **options) for shadows in (True, False)]
         self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""

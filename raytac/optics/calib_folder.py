@@ -7,8 +7,9 @@
 ``gelmap.npy``     (H, W) height of the gel at rest [px], larger is farther from the camera; may be missing
 ``shadowTable.npz``  ``shadowDirections`` (n_dir,), ``shadowTable`` (3, n_dir, n_depth) objects: lists of numbers; may be missing
 ``params.json``    ``sensor`` (``pixmm``, ``num_bins``, ``h``, ``w``) and ``simulator``, as the PyPI package ``taxim`` has it
-``raytac.npz``     what the files above cannot say of a table of raytac's own: ``background``, ``covered``, and ``surround``, the
-                   coefficients (3, n, n, 6) of pixels that are not touched; settings are in ``params.json`` under ``raytac``
+``raytac.npz``     what the files above cannot say of a table of raytac's own: ``background``, ``covered``, and of a table of two sheets
+                   ``surround`` and ``gradients``, the coefficients (3, n, n, 6) of pixels that are not touched and of those that are;
+                   ``polycalib.npz`` then holds one sheet for both. Settings are in ``params.json`` under ``raytac``
 =================  ===================================================================================================
 
 Everything is checked while it is read: kind, shape, size and finiteness. Pickled lists go through ``restricted_pickle``.
@@ -61,20 +62,21 @@ def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> Po
     params = read_params(folder / "params.json", pixel_pitch, gradients.shape[1], f0.shape)
     gel_map = _gel_map(folder / "gelmap.npy", f0.shape[:2]) if (folder / "gelmap.npy").exists() else None
     shadow = _shadow(folder / "shadowTable.npz", params.shadow) if (folder / "shadowTable.npz").exists() else None
-    covered, background, surround = None, None, None
+    own: dict[str, np.ndarray] = {}
     if (folder / "raytac.npz").exists():
-        covered, background, surround = _own_arrays(folder / "raytac.npz", gradients.shape[1], f0.shape)
+        own = _own_arrays(folder / "raytac.npz", gradients.shape[1], f0.shape)
     try:
         return PolyTable(
-            gradients=gradients,
-            covered=covered,
-            background=processed_background(f0, params.constants) if background is None else background,
+            gradients=own.get("gradients", gradients),
+            covered=own.get("covered"),
+            background=own["background"] if own else processed_background(f0, params.constants),
             pixel_pitch=params.pixel_pitch,
             shadow=shadow,
             slopes_of=params.slopes_of,
             rest_image=f0,
             gel_map=gel_map,
-            surround=surround,
+            surround=own.get("surround"),
+            one_sheet=gradients if "gradients" in own else None,
             constants=params.constants,
             provenance=params.provenance,
         )
@@ -139,17 +141,19 @@ def _gel_map(path: Path, shape: tuple[int, int]) -> np.ndarray:
     return check_numbers(path, "", npy_array(path, "", data), shape).astype(np.float64)
 
 
-def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
+def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """``background``, and those of ``covered``, ``surround`` and ``gradients`` that are there."""
     names = npz_names(path)
-    arrays = npz_arrays(path, ("background", *(name for name in ("covered", "surround") if name in names)))
-    surround = arrays.get("surround")
-    if surround is not None:
-        surround = check_numbers(path, "surround", surround, (3, n, n, 6)).astype(np.float64)
+    arrays = npz_arrays(path, ("background", *(name for name in ("covered", "surround", "gradients") if name in names)))
+    if "gradients" in arrays and "surround" not in arrays:
+        raise CalibrationError("must come with the array 'surround'", file=path, key="gradients", value=arrays["gradients"].shape)
+    for name in {"surround", "gradients"} & set(arrays):
+        arrays[name] = check_numbers(path, name, arrays[name], (3, n, n, 6)).astype(np.float64)
     covered = arrays.get("covered")
     if covered is not None and (covered.shape != (n, n) or covered.dtype != np.bool_):
         value = f"{covered.dtype} {covered.shape}"
         raise CalibrationError(f"must be bool of shape {(n, n)}", file=path, key="covered", value=value)
-    return covered, check_numbers(path, "background", arrays["background"], shape).astype(np.float32), surround
+    return arrays | {"background": check_numbers(path, "background", arrays["background"], shape).astype(np.float32)}
 
 
 def _shadow(path: Path, settings: dict[str, Any]) -> ShadowTable:
@@ -206,11 +210,13 @@ def save_calibration(table: PolyTable, folder: str | Path) -> None:
     if rest is None:
         rest = np.clip(np.rint(table.background), 0, 255).astype(np.uint8)
     with result_folder(Path(folder), CALIBRATION_FILES) as work:
-        gradients: dict[str, Any] = {f"grad_{c}": table.gradients[k] for k, c in enumerate(_BGR)}
+        for_one = table.gradients if table.one_sheet is None else table.one_sheet
+        gradients: dict[str, Any] = {f"grad_{c}": for_one[k] for k, c in enumerate(_BGR)}
         np.savez(work / "polycalib.npz", bins=np.int64(table.n_bins), **gradients)
         np.savez(work / "dataPack.npz", f0=rest[..., ::-1], img_size=np.array(rest.shape))
         np.save(work / "gelmap.npy", np.zeros((height, width)) if table.gel_map is None else table.gel_map)
-        own: dict[str, Any] = {name: getattr(table, name) for name in ("covered", "surround") if getattr(table, name) is not None}
+        names = ("covered", "surround") if table.one_sheet is None else ("covered", "surround", "gradients")
+        own: dict[str, Any] = {name: getattr(table, name) for name in names if getattr(table, name) is not None}
         np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **own)
         if table.shadow is not None:
             _save_shadow(work / "shadowTable.npz", table.shadow)

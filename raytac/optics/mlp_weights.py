@@ -24,8 +24,22 @@ from raytac.errors import CalibrationError
 from raytac.optics.npy_file import check_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_size", "view_slope"]
+__all__ = [
+    "FORMAT",
+    "INPUTS",
+    "LEVELS",
+    "VERSION",
+    "MlpWeights",
+    "forward",
+    "inputs",
+    "load_mlp",
+    "save_mlp",
+    "view_size",
+    "view_slope",
+]
 
+FORMAT, VERSION = "raytac mlp", 1
+"""What a file says that it is. The version goes up whenever inputs, arithmetic or arrays change what they mean."""
 INPUTS = 16
 LEVELS = 100.0
 """Levels that an output of 1 stands for."""
@@ -43,7 +57,7 @@ class MlpWeights:
     provenance: dict[str, str] = field(default_factory=dict)
     """``sensor`` names the sensor that it was fitted to."""
     view: tuple[float, float] | None = None
-    """Width and height of the pad in that sensor's view [m]; None where it is not known, as in files that do not hold it."""
+    """Width and height of the pad in that sensor's view [m]; None where it is not known."""
 
 
 def view_size(sensor: SensorSpec) -> tuple[float, float]:
@@ -84,19 +98,21 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
     arrays |= {f"offset_{k}": b.astype(np.float32) for k, b in enumerate(weights.offsets)}
     if weights.view is not None:
         arrays["view"] = np.array(weights.view)
-    np.savez(path, background=weights.background.astype(np.float32), provenance=json.dumps(weights.provenance), **arrays)
+    arrays |= {"format": FORMAT, "version": np.int64(VERSION), "provenance": json.dumps(weights.provenance)}
+    np.savez(path, background=weights.background.astype(np.float32), **arrays)
 
 
 def load_mlp(path: str | Path) -> MlpWeights:
     """A network that ``save_mlp`` wrote; ``path`` may be the folder of ``raytac calibrate``, with ``mlp.npz`` in it.
 
     Raises:
-        CalibrationError: a file that is missing, damaged, or holds other arrays.
+        CalibrationError: a file that is missing, damaged, of another version, or holds other arrays.
     """
     path = Path(path)
     path = path / "mlp.npz" if path.is_dir() else path
     if not path.is_file():
         raise CalibrationError("must be a file mlp.npz, or a folder that holds one", file=path)
+    _check_version(path)
     count = sum(name.startswith("matrix_") for name in npz_names(path))
     if not 1 <= count <= 16:
         raise CalibrationError("must hold 1 to 16 layers, matrix_0 and on", file=path, value=count)
@@ -117,8 +133,22 @@ def load_mlp(path: str | Path) -> MlpWeights:
     return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), _provenance(path), _view(path))
 
 
+def _check_version(path: Path) -> None:
+    names = npz_names(path)
+    told = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
+    found = {name: str(array.reshape(())) if array.size == 1 else f"{array.dtype} {array.shape}" for name, array in told.items()}
+    if not found and "matrix_0" in names:
+        found = {"format": FORMAT, "version": "0, of before files said it"}
+    for key, expected in (("format", FORMAT), ("version", str(VERSION))):
+        if found.get(key) != expected:
+            rule = (
+                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it anew"
+            )
+            raise CalibrationError(rule, file=path, key=key, value=found.get(key, "missing"))
+
+
 def _provenance(path: Path) -> dict[str, str]:
-    """What the file says of itself; earlier ones say nothing."""
+    """What the file says of itself; it may say nothing."""
     if "provenance" not in npz_names(path):
         return {}
     text = npz_arrays(path, ("provenance",))["provenance"]

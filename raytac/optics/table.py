@@ -142,6 +142,9 @@ class PolyTable:
     surround: np.ndarray | None = None
     """Coefficients where the object does not touch, as ``gradients``, which then hold for touched pixels alone: the apex of a press and the
     skirt around it have slopes alike but not colours. None: one sheet serves both (upstream)."""
+    one_sheet: np.ndarray | None = None
+    """Beside ``surround``: coefficients as ``gradients`` for all pixels alike. Not used here; a folder gives them to readers that know one
+    sheet (``calib_folder``). None: such readers get ``gradients``."""
     constants: TaximConstants = TaximConstants()
     provenance: dict[str, str] = field(default_factory=dict)
     """Where the table came from, text by name: ``source``, ``sensor``, ``fill``, …"""
@@ -152,9 +155,12 @@ class PolyTable:
             raise InputError("gradients", value=shape, rule="must have shape (3, n_bins, n_bins, 6), n_bins >= 2")
         if not np.isfinite(self.gradients).all():
             raise InputError("gradients", value=self.gradients.dtype, rule="must be finite")
-        if self.surround is not None and (self.surround.shape != shape or not np.isfinite(self.surround).all()):
-            rule = f"must be finite and of the gradients' shape {shape}, or None"
-            raise InputError("surround", value=self.surround.shape, rule=rule)
+        for name in ("surround", "one_sheet"):
+            sheet = getattr(self, name)
+            if sheet is not None and (sheet.shape != shape or not np.isfinite(sheet).all()):
+                raise InputError(name, value=sheet.shape, rule=f"must be finite and of the gradients' shape {shape}, or None")
+        if self.one_sheet is not None and self.surround is None:
+            raise InputError("one_sheet", value=self.one_sheet.shape, rule="must be None without surround: gradients are the one")
         if self.covered is not None and (self.covered.shape != shape[1:3] or self.covered.dtype != np.bool_):
             value = f"{self.covered.dtype} {self.covered.shape}"
             raise InputError("covered", value=value, rule=f"must be bool of shape {shape[1:3]}, or None")

@@ -7,12 +7,11 @@ the same command run again goes on where it stopped.
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,13 +19,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
-from raytac.errors import BackendError, InputError, RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
-from raytac.markers.fots import marker_motion_of
-from raytac.physics.solver import check_solver
-from raytac.report.image_error import METRICS, SSIM_BORDER, has_flip, image_errors, psnr, rmse
+from raytac.report.compare_settings import CompareSettings
+from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
 from raytac.report.machine import machine
 from raytac.report.marker_error import PAD as MARKER_PAD
@@ -38,107 +36,23 @@ from raytac.report.row_store import Row, RowStore, Value, row_key
 from raytac.report.surfaces import press_peaks
 from raytac.report.timing import moving, timed_within
 from raytac.report.tracers import Tracers
-from raytac.sensor import LARGEST_SIDE, PADS
-from raytac.specs import load_press, load_sensor, validate_press
+from raytac.specs import load_sensor
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
 
-__all__ = ["BATCH", "REGIONS", "CompareSettings", "Comparison", "run_comparison"]
+__all__ = ["BATCH", "REGIONS", "Comparison", "run_comparison"]
 
 REGIONS = ("frame", "contact", "ring", "box")
 """Parts of an image over which errors are taken, as ``raytac.report.image_error.regions`` makes them."""
 BATCH = {"cpu": 8, "cuda": 64}
 """Environments of the batched timing where none are asked for."""
-SPP = (1, 4, 16, 64)
-"""Samples a pixel of the sampled modes."""
 TURNS = 6
 """Surfaces that take turns in a timing."""
 CODE = ("raytac.report.image_error", "raytac.report.timing")
 """Modules on which every row depends, besides those of its mode."""
 DISTRIBUTIONS = ("numpy", "mitsuba", "drjit", "mitsuba-oidn", "scikit-image", "flip-evaluator", "taxim", "jax")
 """Packages whose version is part of a row's key."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareSettings:
-    """What to compare."""
-
-    sensor: str = "gelsight_mini"
-    scenes: tuple[str, ...] = ("sphere", "coin", "pins")
-    resolutions: tuple[tuple[int, int], ...] = ((320, 240),)
-    """(width, height) of the images [px]."""
-    device: str = "auto"
-    seed: int = 0
-    reference_spp: int = 1024
-    """Samples a pixel of the reference, half of them in each of its halves."""
-    spp: tuple[int, ...] = SPP
-    """Samples a pixel at which the sampled modes are measured."""
-    batch: int | None = None
-    """Environments of the batched timing; None is ``BATCH`` of the device."""
-    frames: int = 60
-    """Timed frames a figure, fewer for a mode that would need more than ``budget_s``."""
-    budget_s: float = 10.0
-    """Longest time for one timing [s], as far as three frames allow."""
-    quick: bool = False
-    """Fewer modes."""
-    pad: str | None = None
-    """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
-    markers: bool = False
-    """Measure the marker models against surface tracking too, on the simulated pad of level ``pad``, else ``marker_error.PAD``."""
-
-    def quickened(self) -> CompareSettings:
-        """The first scene at 80 x 60 pixels with few samples, frames and modes."""
-        small = {"scenes": self.scenes[:1], "resolutions": ((80, 60),), "reference_spp": 32, "spp": (1, 4), "batch": 2}
-        return replace(self, **small, frames=3, budget_s=0.5, quick=True)
-
-    def check(self) -> None:
-        """Refuse what cannot be run, before anything is computed or written.
-
-        Raises:
-            InputError: a number or a resolution out of range, two scenes of one name, or a sensor without the marker motion that
-                ``markers`` needs.
-            SpecError: an unknown sensor or scene, or a file that breaks a rule.
-            BackendError: a package of the ``report`` extra is missing, or the solver's where ``pad`` or ``markers`` need it.
-        """
-        for name, value, lowest in (
-            ("reference spp", self.reference_spp, 2),
-            ("frames", self.frames, 3),
-            ("batch", 2 if self.batch is None else self.batch, 2),
-            ("spp", min(self.spp, default=0), 1),
-        ):
-            if value < lowest:
-                raise InputError(name, value=value, rule=f"must be at least {lowest}")
-        if self.pad is not None and self.pad not in PADS:
-            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
-        if not self.budget_s > 0:
-            raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
-        if not 0 <= self.seed < 2**32:
-            raise InputError("seed", value=self.seed, rule="must be a whole number in [0, 2^32)")
-        for size in self.resolutions:
-            if min(size) <= 2 * SSIM_BORDER or max(size) > LARGEST_SIDE:
-                rule = f"must have sides from {2 * SSIM_BORDER + 1} (the window of SSIM) to {LARGEST_SIDE} pixels"
-                raise InputError("resolution", value=f"{size[0]}x{size[1]}", rule=rule)
-        if not self.resolutions or not self.scenes:
-            raise InputError("scenes, resolutions", value=(self.scenes, self.resolutions), rule="must name at least one each")
-        stems = [Path(scene).stem for scene in self.scenes]
-        if len(set(stems)) < len(stems):
-            raise InputError("scenes", value=self.scenes, rule="must have different names, since rows are named after them")
-        spec = load_sensor(self.sensor)
-        if self.markers:
-            marker_motion_of(spec)
-        for scene in self.scenes:
-            validate_press(spec, load_press(scene))
-        missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
-        if missing:
-            raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
-        if self.uses_solver:
-            check_solver("a comparison with pad or markers")
-
-    @property
-    def uses_solver(self) -> bool:
-        """Whether anything is pressed into the simulated pad."""
-        return self.markers or self.pad is not None
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from raytac.device import resolve_device
+from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.markers.calibration import PUBLISHED
 from raytac.report.machine import machine
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
+from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -69,9 +71,12 @@ def run_calibrate_markers(
     Raises:
         RaytacError: a press did not settle.
         SpecError: a press fits nowhere on this sensor.
-        InputError: ``out`` cannot be written.
+        InputError: an unknown ``pad`` or ``device``, or ``out`` cannot be written.
         BackendError: the solver or Dr.Jit cannot run.
     """
+    if pad not in PADS:
+        raise InputError("pad", value=pad, rule="must be a known level", choices=PADS)
+    solver = resolve_device(device, ray_tracing=False)
     from tqdm import tqdm
 
     from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
@@ -81,7 +86,6 @@ def run_calibrate_markers(
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
-        solver = resolve_device(device, ray_tracing=False)
         store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=tqdm.write)
         pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress, store=store)
         press_s = time.perf_counter() - began

@@ -101,46 +101,49 @@ def write_preview(path: Path, data: PreviewData, sensor: SensorSpec, *, dpi: int
 
 
 def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
-    """A figure 7.16 inches wide (two columns of a paper), three panels a row; maps in mm at one scale."""
-    panels: list[Callable[[Axes], None]] = [
-        lambda axes: _object_panel(axes, data),
-        lambda axes: _indentation_panel(axes, data),
-        lambda axes: _image_panel(axes, data),
-        lambda axes: _section_panel(axes, data, sensor),
-    ]
-    if data.rgb is None:
-        # The section's long label has no room beside a colour bar: it comes before the indentation, as elsewhere at the left edge.
-        panels = [panels[0], panels[3], panels[1]]
+    """A figure 7.16 inches wide (two columns of a paper), three panels a row; maps in mm at one scale.
+
+    The section begins the last row and is as wide as leaves no place empty, one to three panels.
+    """
+    maps: list[Callable[[Axes], None]] = [lambda axes: _object_panel(axes, data), lambda axes: _indentation_panel(axes, data)]
+    if data.rgb is not None:
+        maps.append(lambda axes: _image_panel(axes, data))
     if data.normals is not None:
-        panels.append(lambda axes: _normals_panel(axes, data))
+        maps.append(lambda axes: _normals_panel(axes, data))
     if data.rgb is not None and data.rest_rgb is not None:
-        panels.append(lambda axes: _difference_panel(axes, data))
+        maps.append(lambda axes: _difference_panel(axes, data))
     if data.markers is not None:
-        panels.append(lambda axes: _marker_panel(axes, data))
+        maps.append(lambda axes: _marker_panel(axes, data))
     if data.traction is not None:
-        panels.append(lambda axes: _pressure_panel(axes, data))
+        maps.append(lambda axes: _pressure_panel(axes, data))
         if _is_sheared(data):
-            panels.append(lambda axes: _shear_panel(axes, data))
+            maps.append(lambda axes: _shear_panel(axes, data))
+    rows = -(-(len(maps) + 1) // 3)
+    panels = [(draw, 1) for draw in maps]
+    # Its long label has no room beside a colour bar: at the left edge, or beside the object, which has none.
+    panels.insert(max(1, 3 * (rows - 1)), (lambda axes: _section_panel(axes, data, sensor), 3 * rows - len(maps)))
     with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
-        return _lay_out(panels, data)
+        return _lay_out(panels, rows, data)
 
 
-def _lay_out(panels: list[Callable[[Axes], None]], data: PreviewData) -> Figure:
-    """Place the panels by hand, so that they line up whatever their labels are."""
+def _lay_out(panels: list[tuple[Callable[[Axes], None], int]], rows: int, data: PreviewData) -> Figure:
+    """Place the panels, each with its width in columns, by hand, so that they line up whatever their labels are."""
     left, right, bottom, top = data.extent_mm
     wide = 1.62  # leaves room for a colour bar's figures at the right edge
     high = wide * float(np.clip((bottom - top) / (right - left), 0.5, 1.3))
     margin, between, above, below, heading = 0.46, 0.74, 0.22, 0.36, 0.24  # inches
-    rows = -(-len(panels) // 3)
     width, total = 7.16, heading + rows * (above + high + below)
     figure = Figure(figsize=(width, total))
     figure.text(margin / width, 1.0 - 0.55 * heading / total, data.title, fontsize=8.5, va="center", weight="bold")
-    for index, draw in enumerate(panels):
-        row, column = divmod(index, 3)
+    place = 0
+    for index, (draw, span) in enumerate(panels):
+        row, column = divmod(place, 3)
         x, y = margin + column * (wide + between), total - heading - (row + 1) * (above + high) - row * below
-        axes = figure.add_axes((x / width, y / total, wide / width, high / total))
+        across = span * wide + (span - 1) * between
+        axes = figure.add_axes((x / width, y / total, across / width, high / total))
         draw(axes)
         axes.set_title(f"({'abcdefghi'[index]}) {axes.get_title(loc='left')}", loc="left")
+        place += span
     return figure
 
 
@@ -305,7 +308,8 @@ def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
     left, right = data.extent_mm[:2]
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]")
     axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
-    stretch = abs((data.extent_mm[2] - data.extent_mm[3]) / (high - low))
+    box = axes.get_window_extent()
+    stretch = (box.height / (high - low)) / (box.width / (right - left))
     y_mm = round(y_mm, 1) + 0.0  # no "−0.0"
     axes.set_title(f"section y = {y_mm:.1f} mm".replace("-", "−"), loc="left")
     axes.set_ylabel(f"z [mm], stretched {stretch:.1f} ×")

@@ -18,10 +18,11 @@ from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses
 from raytac.calibrate.ray_fit import FEWEST
 from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.report.real_models import MODES, Models, fit_models, images_of, mode_times
+from raytac.report.real_models import MODES, Models, check_fit, fit_models, images_of, mode_times
 from raytac.report.real_score import noise_floor, press_scores, summary
 from raytac.specs import SensorSpec
 
@@ -103,6 +104,11 @@ class RealSettings:
     device: str = "auto"
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        check_fit(prior=self.prior, device=self.device, starts=self.starts, rounds=self.rounds)
+        if self.tested is not None and not 1 <= self.tested <= self.folds:
+            raise InputError("tested", value=self.tested, rule=f"must be 1 to {self.folds}, the number of folds")
+
 
 def compare_real(
     sensor: SensorSpec, presses: RealPresses, shots: Photographs, out: Path, settings: RealSettings, *, began: float | None = None
@@ -110,8 +116,10 @@ def compare_real(
     """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``; ``shots`` are the fully visible ``presses``.
 
     Raises:
-        InputError: a split that leaves too few presses.
+        InputError: a split that leaves too few presses, or a folder that cannot be written.
+        BackendError: the ray tracer cannot run on ``settings.device``.
     """
+    resolve_device(settings.device)
     began = time.perf_counter() if began is None else began
     splits: list[tuple[str, Split]] = [("press", split) for split in by_press(len(presses), settings.folds)[: settings.tested]]
     if settings.regions:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.ray_fit import Fitted
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
@@ -20,7 +21,7 @@ from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.mlp import MlpMode
 from raytac.optics.mlp_weights import save_mlp
 from raytac.optics.taxim import TaximMode
-from raytac.report.real_models import fit_models, images_of
+from raytac.report.real_models import SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.files import available, find_file
@@ -28,6 +29,8 @@ from raytac.specs.lights_text import lights_text
 
 __all__ = ["OUTLIER", "run_calibrate_optics", "sensor_text"]
 
+FITTED = ("raytrace", "taxim", "mlp")
+"""Models that photographs are fitted by; Phong's has nothing to fit."""
 OUTLIER = 2.0
 """A press whose contact error is so many times the median is reported as an outlier."""
 FILES = (*CALIBRATION_FILES, "mlp.npz", "lights.toml", "sensor.toml", "circles.csv", "metrics.json")
@@ -49,13 +52,23 @@ def run_calibrate_optics(
     device: str,
     seed: int,
     start: float,
+    shadow_table: str = SHADOW_TABLES[0],
 ) -> list[Path]:
     """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
 
     Raises:
-        InputError: too few presses, fewer than ``holdout`` too, or a folder that cannot be written.
+        InputError: an unknown model, device or strength of priors, ``holdout`` of 1 or less than 0, too few presses, fewer than
+            ``holdout`` too, or a folder that cannot be written.
         BackendError: the ray tracer cannot run on ``device``.
     """
+    if model not in FITTED:
+        raise InputError("model", value=model, rule="must be one that can be fitted", choices=FITTED)
+    if shadow_table != SHADOW_TABLES[0] and model != "taxim":
+        raise InputError("shadow_table", value=shadow_table, rule=f"belongs to the model 'taxim', not to {model!r}: leave it out")
+    check_fit(prior=prior, shadow_table=shadow_table, device=device, starts=starts, rounds=rounds)
+    resolve_device(device)
+    if int(holdout) != holdout or holdout < 0 or holdout == 1:
+        raise InputError("holdout", value=holdout, rule="must be 0 or a whole number >= 2")
     if holdout > len(shots.presses):
         rule = f"are too few to hold out every {holdout}th: name a smaller holdout, or 0 for none"
         raise InputError("presses", value=len(shots.presses), rule=rule)
@@ -80,6 +93,7 @@ def run_calibrate_optics(
                 starts=starts,
                 rounds=rounds,
                 prior=prior,
+                shadow_table=shadow_table,
                 options={"shadows": shadows},
                 tick=tick,
             )
@@ -89,6 +103,7 @@ def run_calibrate_optics(
         metrics |= {
             "holdout": holdout,
             "shadows": int(shadows),
+            "shadow_table": shadow_table,
             "starts": starts,
             "rounds": rounds,
             "prior": models.prior,

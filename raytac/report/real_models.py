@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.direct_fit import SIGMA, FitSettings
 from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
-from raytac.calibrate.table_fit import fit_table
+from raytac.calibrate.table_fit import fit_table, with_cast_shadows
+from raytac.device import DEVICES
+from raytac.errors import InputError
 from raytac.gel.pad import make_grid
 from raytac.optics.base import OpticalMode
 from raytac.optics.mlp import MlpMode
@@ -26,10 +28,12 @@ from raytac.optics.raytrace import RayTracer
 from raytac.optics.taxim import TaximMode
 from raytac.specs import SensorSpec
 
-__all__ = ["MODES", "Models", "fit_models", "images_of", "mode_times", "raytrace_mode"]
+__all__ = ["MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
 
 MODES = ("raytrace", "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
+SHADOW_TABLES = ("none", "raytrace")
+"""Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
 GRID_PITCH = 0.06e-3
 """Spacing of the pad's nodes [m], about a pixel's."""
 
@@ -54,6 +58,36 @@ class Models:
         return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
 
 
+def check_fit(
+    *,
+    modes: Sequence[str] = MODES,
+    prior: str | None = None,
+    fixed: Sequence[str] = (),
+    shadow_table: str = SHADOW_TABLES[0],
+    device: str = "auto",
+    starts: int = 1,
+    rounds: int = 0,
+) -> None:
+    """Refuse arguments of ``fit_models`` that it could not use, at once and not after a fit.
+
+    Raises:
+        InputError: an unknown mode, strength of priors, block of parameters, source of shadows or device, no start, or rounds below 0.
+    """
+    for name, values, rule, choices in (
+        ("modes", modes, "must be known modes", MODES),
+        ("prior", () if prior is None else (prior,), "must be a known strength, or None to choose it", tuple(STRENGTHS)),
+        ("fixed", fixed, "must be known blocks of parameters", tuple(SIGMA)),
+        ("shadow_table", (shadow_table,), "must be a known source of shadows", SHADOW_TABLES),
+        ("device", (device,), "must be a known device", DEVICES),
+    ):
+        for value in values:
+            if value not in choices:
+                raise InputError(name, value=value, rule=rule, choices=choices)
+    for name, number, least in (("starts", starts, 1), ("rounds", rounds, 0)):
+        if int(number) != number or number < least:
+            raise InputError(name, value=number, rule=f"must be a whole number >= {least}")
+
+
 def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
     """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
     height, width = background.shape[:2]
@@ -73,18 +107,29 @@ def fit_models(
     rounds: int = 3,
     settle: bool = True,
     prior: str | None = None,
+    shadow_table: str = SHADOW_TABLES[0],
     options: Mapping[str, Any] | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
     """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
+    ``shadow_table``: one of ``SHADOW_TABLES``.
     ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
 
-    Raises as ``fit_lights``.
+    Raises as ``check_fit`` and ``fit_lights``.
     """
     options = {} if options is None else options
     settings = FitSettings() if settings is None else settings
+    check_fit(
+        modes=modes,
+        prior=prior,
+        fixed=settings.fixed,
+        shadow_table=shadow_table,
+        device=device,
+        starts=starts,
+        rounds=rounds,
+    )
     shots = shots.settled(sensor) if settle else shots
     if prior is None:
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
@@ -93,13 +138,21 @@ def fit_models(
         sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
     )
     state, background, built = fitted.state, shots.background, {}
+
+    def told(images: int) -> None:
+        if tick is not None:
+            tick(f"{images} images of shadows", fitted.costs[-1])
+
     if {"taxim", "mlp"} & set(modes):
         samples = press_samples(sensor, shots, state.circles, state.slopes, device=device)
     for name in modes:
         if name == "raytrace":
             built[name] = raytrace_mode(fitted.sensor, background, device, options)
         elif name == "taxim":
-            built[name] = TaximMode(sensor, calibration=fit_table(sensor, background, samples), device=device)
+            table = fit_table(sensor, background, samples)
+            if shadow_table == "raytrace":
+                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
+            built[name] = TaximMode(sensor, calibration=table, device=device)
         elif name == "mlp":
             built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
         else:

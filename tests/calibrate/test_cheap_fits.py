@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,13 @@ from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import PressSamples, press_samples
-from raytac.calibrate.table_fit import fit_table
+from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.gel.pad import make_grid
+from raytac.optics.bake_settings import BakeSettings
+from raytac.optics.bake_shadow import NOTHING
+from raytac.optics.calib_folder import load_calibration, save_calibration
 from raytac.optics.mlp import MlpMode
+from raytac.optics.table import PolyTable, polynomial_basis, slope_bins
 from raytac.optics.taxim import TaximMode
 from raytac.specs import load_sensor
 
@@ -76,3 +81,53 @@ def test_the_same_seed_gives_the_same_network(samples: PressSamples) -> None:
     a, b, c = (fit_mlp(SENSOR, background, few, seed=seed).matrices[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(a, b)
     assert np.abs(a - c).max() > 0.1
+
+
+def test_a_reader_of_one_sheet_gets_what_all_samples_say(samples: PressSamples, tmp_path: Path) -> None:
+    """``polycalib.npz`` alone, as upstream reads a folder, is nearer to the pixels around contacts than the touched sheet is."""
+    table = fit_table(SENSOR, np.full((240, 320, 3), 90.0), every(samples, 3))
+    save_calibration(table, tmp_path)
+    back = load_calibration(tmp_path)
+    for name in ("gradients", "surround", "one_sheet", "covered"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
+    (tmp_path / "raytac.npz").unlink()
+    upstream = load_calibration(tmp_path)
+    assert upstream.surround is None and upstream.one_sheet is None
+    seen = every(samples, 7)
+    i, j = slope_bins(seen.slope_x, seen.slope_y, table.n_bins)
+    basis = polynomial_basis(seen.column, seen.row)
+
+    def error(gradients: np.ndarray, own: np.ndarray) -> float:
+        found = np.einsum("cnk,nk->nc", gradients[:, i, j], basis)
+        return float(np.abs(found - seen.difference)[own].mean())
+
+    outside, inside = ~seen.touched, seen.touched
+    assert error(upstream.gradients, outside) < 0.7 * error(table.gradients, outside)
+    # What it gains there it pays for inside, where touched pixels shine: one sheet is a mean of two.
+    assert table.surround is not None
+    assert error(table.surround, outside) < error(upstream.gradients, outside)
+    assert error(table.gradients, inside) < error(upstream.gradients, inside)
+
+
+def test_cast_shadows_are_levels_of_the_photographs() -> None:
+    """Of a linear camera: over a background of twice the levels, shadows are twice as deep, and they end in the same places."""
+    response = dataclasses.replace(SENSOR.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))
+    lit, settings, found = dataclasses.replace(SENSOR, response=response), BakeSettings(pins=32), []
+    for level in (60.0, 120.0):
+        background = np.full((60, 80, 3), level, np.float32)
+        table = PolyTable(
+            np.zeros((3, 4, 4, 6)), None, background, SENSOR.camera.pitch_at((80, 60)), provenance={"source": "test"}
+        )
+        cast = with_cast_shadows(table, lit, device="cpu", settings=settings)
+        assert cast.shadow is not None and cast.background is background and "ray tracer" in cast.provenance["shadow"]
+        length = cast.shadow.values.shape[-1]
+        known = (np.arange(length) < cast.shadow.lengths[..., None]) & (cast.shadow.values != NOTHING)
+        found.append((known, cast.shadow.values))
+    shortest = min(values.shape[-1] for _, values in found)
+    (dim, once), (bright, twice) = ((known[..., :shortest], values[..., :shortest]) for known, values in found)
+    both = dim & bright
+    assert both.sum() > 50 and once[both].min() < -30
+    # Fewer pixels of the dim one are more than two levels darker for their shadow.
+    assert both.sum() > 0.8 * dim.sum()
+    ratio = (twice / np.where(both, once, 1))[both & (once < -10)]
+    np.testing.assert_allclose(np.quantile(ratio, [0.1, 0.5, 0.9]), 2.0, atol=0.15)

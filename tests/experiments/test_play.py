@@ -17,7 +17,7 @@ from raytac.io.metrics import read_metrics
 pytest.importorskip("stable_baselines3")
 
 from experiments import training_curves
-from experiments.play import Args, main
+from experiments.play import Args, Film, main, moments
 from experiments.ppo_learner import Checkpoint, Learner, Recipe
 from experiments.training_curves import draw_curves
 
@@ -52,6 +52,23 @@ def test_what_is_shown_in_a_film_is_hidden_from_the_policy() -> None:
     seen, same = (learner.normaliser.observation_space for learner in (rich, poor))
     assert seen == same and "sensor_markers" in rich.base.observation_space.spaces  # type: ignore[attr-defined]
     assert "sensor_markers" not in rich.normaliser.reset()
+
+
+def test_a_strip_shows_moments_that_differ() -> None:
+    """Nothing moves for 60 of 100 frames, then a bar of the scene goes its way; what sensors show does not count."""
+    frames = []
+    for k in range(100):
+        frame = np.full((30, 60, 3), 255, np.uint8)
+        at = max(0, (k - 60) // 2)
+        frame[:, at : at + 4] = 0
+        frame[:, 40:] = 37 * k % 255
+        frames.append(frame)
+    found = moments(Film(frames, 0.02, ("sensor",)), 4)
+    assert found[0] == 0 and found[-1] == 99
+    assert found[1:3] == pytest.approx([60 + 40 / 3, 60 + 80 / 3], abs=3)
+    still = Film(frames[:1] * 31, 0.02, ("sensor",))
+    assert moments(still, 4).tolist() == [0, 10, 20, 30]
+    assert moments(Film(frames[:1], 0.02, ()), 4).tolist() == [0, 0, 0, 0]
 
 
 def test_bad_input(tmp_path: Path) -> None:

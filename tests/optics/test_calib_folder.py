@@ -43,6 +43,7 @@ def make_table(*, upstream: bool = False) -> PolyTable:
         ShadowTable(np.arange(7) * 0.9, values, lengths, 0.0, 0.05e-3, 0, 0.9, 2.0, 0.2, 0.1, "drop"),
         gel_map=rng.uniform(0, 3, shape),
         surround=rng.normal(size=(3, n, n, 6)),
+        one_sheet=rng.normal(size=(3, n, n, 6)),
         constants=TaximConstants(ring_dilations=3, shadow_sigma=1.5),
         provenance={"source": "test"},
     )
@@ -57,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_table_comes_back_as_it_was(folder: Path) -> None:
     table, back = make_table(), load_calibration(folder)
     assert sorted(path.name for path in folder.iterdir()) == sorted(CALIBRATION_FILES)
-    for name in ("gradients", "covered", "background", "gel_map", "surround"):
+    for name in ("gradients", "covered", "background", "gel_map", "surround", "one_sheet"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
     np.testing.assert_array_equal(back.rest_image, np.rint(table.background))  # type: ignore[arg-type]
     assert back.slopes_of == "displacement" and back.constants == table.constants and back.provenance == table.provenance
@@ -82,10 +83,11 @@ def test_a_table_comes_back_as_it_was(folder: Path) -> None:
 def test_the_files_are_upstreams(folder: Path) -> None:
     """Names, shapes and the order of the channels, as ``numpy`` alone reads them."""
     table = make_table()
+    assert table.one_sheet is not None
     with np.load(folder / "polycalib.npz") as arrays:
         assert int(arrays["bins"]) == 8
-        np.testing.assert_array_equal(arrays["grad_r"], table.gradients[2])  # upstream's r is blue
-        np.testing.assert_array_equal(arrays["grad_b"], table.gradients[0])
+        np.testing.assert_array_equal(arrays["grad_r"], table.one_sheet[2])  # upstream's r is blue
+        np.testing.assert_array_equal(arrays["grad_b"], table.one_sheet[0])
     with np.load(folder / "dataPack.npz") as arrays:
         np.testing.assert_array_equal(arrays["f0"][..., 0], np.rint(table.background[..., 2]))
     with np.load(folder / "shadowTable.npz", allow_pickle=True) as arrays:
@@ -196,6 +198,8 @@ BAD: list[tuple[str, Callable[[Path], Any], list[str]]] = [
     ("many rays", lambda f: edit_params(f, "simulator", fan_precision=1e-5), ["at most 64 rays"]),
     ("unknown setting", lambda f: edit_params(f, "raytac", slope_of="height"), ["raytac.slope_of"]),
     ("unknown surface", lambda f: edit_params(f, "raytac", slopes_of="depth"), ["slopes_of", "displacement"]),
+    ("one of two sheets", lambda f: rewrite(f / "raytac.npz", surround=None), ["gradients", "'surround'"]),
+    ("sheet", lambda f: rewrite(f / "raytac.npz", gradients=np.zeros((3, 8, 8, 5))), ["gradients", "(3, 8, 8, 6)"]),
     ("coverage", lambda f: rewrite(f / "raytac.npz", covered=np.zeros((8, 8))), ["covered", "bool"]),
 ]
 

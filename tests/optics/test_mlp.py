@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,19 @@ import pytest
 from raytac.errors import CalibrationError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics.mlp import MlpMode
-from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, forward, inputs, load_mlp, save_mlp, view_size, view_slope
+from raytac.optics.mlp_weights import (
+    FORMAT,
+    INPUTS,
+    LEVELS,
+    VERSION,
+    MlpWeights,
+    forward,
+    inputs,
+    load_mlp,
+    save_mlp,
+    view_size,
+    view_slope,
+)
 from raytac.sensor import TactileSensor
 from tests.conftest import make_sensor_spec
 from tests.optics.scenes import ball, grid_of, surface
@@ -107,3 +120,26 @@ def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
         load_mlp(tmp_path / "broken.npz")
     with pytest.raises(InputError, match="must name a network"):
         MlpMode(make_sensor_spec(), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"version": np.int64(VERSION + 1)}, f"'{VERSION + 1}'"),
+        ({"version": np.zeros(3)}, "float64 (3,)"),
+        ({"version": None}, "missing"),
+        ({"format": "other net"}, "other net"),
+        ({"format": None, "version": None}, "0, of before files said it"),
+    ],
+)
+def test_files_of_another_version_are_refused_by_both_names(changes: dict[str, Any], found: str, tmp_path: Path) -> None:
+    """And not by an array that happens to have another shape."""
+    path = tmp_path / "mlp.npz"
+    save_mlp(network(), path)
+    with np.load(path) as arrays:
+        content: dict[str, Any] = {name: arrays[name] for name in arrays.files} | changes
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+    with pytest.raises(CalibrationError) as told:
+        load_mlp(path)
+    ours = FORMAT if changes.get("format") else str(VERSION)
+    assert found in str(told.value) and f"must be {ours!r}" in str(told.value) and "raytac calibrate" in str(told.value)

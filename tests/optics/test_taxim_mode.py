@@ -144,8 +144,11 @@ def test_touched_pixels_and_those_around_have_sheets_of_their_own(spec: SensorSp
     reach = np.hypot(row - row.mean(), column - column.mean())
     again_row, again_column = np.nonzero(around)
     assert np.quantile(reach, 0.98) < np.quantile(np.hypot(again_row - row.mean(), again_column - column.mean()), 0.02) + 2
-    with pytest.raises(InputError, match="gradients' shape"):
-        replace(one, surround=one.gradients[:, :4, :4])
+    for name in ("surround", "one_sheet"):
+        with pytest.raises(InputError, match=f"{name}.*gradients' shape"):
+            replace(both, **{name: one.gradients[:, :4, :4]})
+    with pytest.raises(InputError, match="one_sheet"):
+        replace(one, one_sheet=other.gradients)
 
 
 def test_a_failed_environment_is_black_and_alone(spec: SensorSpec, grid: PadGrid) -> None:

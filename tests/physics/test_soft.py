@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,33 +10,11 @@ from scipy.ndimage import map_coordinates
 
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
-from raytac.physics.load_law import LoadLaw
 from raytac.physics.rigid import RigidPad
 from raytac.physics.soft import SoftPad
-from raytac.physics.soft_contact import SoftContact
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
 from raytac.physics.soft_reading import UNSOLVED, UnsolvedContactWarning
-from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
-
-SENSOR = load_sensor("gelsight_mini")
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-RADIUS = 4e-3
-PITCH = 0.2e-3
-FRICTIONLESS = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.0))
-
-
-def press(*stages, kind="sphere", position=(0.0, 0.0), moves="object", **settings):
-    params = {"sphere": {"radius": RADIUS}, "cylinder": {"radius": 3e-3, "length": 4e-3}, "none": {}}[kind]
-    return PressScene("test", ObjectSpec(kind, params, (*position, 0.0), IDENTITY, 0.05, **settings), stages, moves)
-
-
-def indent(depth=None, force=None):
-    return StageSpec("indent", depth=depth, force=force)
-
-
-def soft(scene, sensor=SENSOR, **settings):
-    return SoftPad(sensor, scene, pitch=PITCH, **settings)
+from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft
 
 
 @pytest.fixture(scope="module")
@@ -163,35 +140,6 @@ def test_a_release_leaves_the_pad_at_rest(pressed):
     assert not pad.surface(last).contact.any() and np.isnan(pad.surface(last).contact_centre).all()
 
 
-@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
-def test_a_release_keeps_coulombs_law_and_never_pulls(kind):
-    """At every state, the pad sheared: friction within its cone, no force that holds the object back, no vertex in tension."""
-    pad = soft(press(indent(0.6e-3), StageSpec("shear", shear=(0.0, 0.5e-3)), StageSpec("release"), kind=kind))
-    released = [state for state in pad.run(8) if state.kind == "release"]
-    loaded = [state for state in released if state.normal_force[0] > 0.0]
-    assert len(loaded) >= 2
-    assert max(np.linalg.norm(s.shear_force[0]) / s.normal_force[0] for s in loaded) > 0.3  # the law has something to bound
-    for state in released:
-        force = pad.wrench(state)[0, :3]
-        assert force[2] <= 1e-4
-        assert np.linalg.norm(force[:2]) <= 1.02 * SENSOR.gelpad.friction * -force[2] + 1e-4
-        assert state.reading is not None and state.reading.forces[..., 2].max() <= 1e-4
-    assert released[-1].normal_force[0] == 0.0
-
-
-@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
-def test_a_depth_is_approached_without_passing_it(kind):
-    """The states on the way go deeper one by one, bear more one by one, and end at the depth."""
-    pad = soft(press(indent(0.5e-3), kind=kind))
-    states = list(pad.run(16))[1:]
-    depth, force = (np.array([getattr(state, name)[0] for state in states]) for name in ("depth", "normal_force"))
-    assert depth.max() <= 0.5e-3 + 2e-6 and depth[-1] == pytest.approx(0.5e-3, abs=2e-6)
-    assert (np.diff(depth) > 0.0).all() and (np.diff(force[force > 0.0]) > 0.0).all()
-    commanded = 0.5e-3 * np.arange(1, 17) / 16
-    touching = force > 1e-3
-    assert touching.sum() >= 15 and np.abs(depth - commanded)[touching].max() < 12e-6
-
-
 def test_running_again_forgets_the_press(pressed):
     pad, states = pressed
     again = list(pad.run(2))
@@ -217,102 +165,6 @@ def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
     rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
     around = (rho > 2.5e-3) & (rho < 5e-3)
     assert np.abs(one.height[0] - two.height[0])[around].mean() > 5e-6
-
-
-def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
-    pad = soft(press(indent(force=1.0), StageSpec("shear", shear=(0.2e-3, 0.0))))
-    states = list(pad.run())
-    for state in states[1:]:
-        assert not state.failed[0] and state.normal_force[0] == pytest.approx(1.0, rel=0.01)
-    assert states[1].depth[0] > 0.3e-3
-    wrench = pad.wrench(states[2])[0]
-    assert 0.05 < wrench[0] < 1.0 and abs(wrench[1]) < 0.01 * wrench[0]  # along the drag, within Coulomb's cone
-
-
-@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
-def test_a_lowered_force_keeps_coulombs_law(kind):
-    """Sheared until it slides, then let up: the force asked for, friction within its cone and less as the force goes, no pull."""
-    sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.3))
-    pad = soft(press(indent(force=1.5), StageSpec("shear", shear=(0.0, 0.5e-3)), indent(force=0.3), kind=kind), sensor)
-    states = list(pad.run(3))[1:]
-    sheared, lowered = states[3:6], states[6:]
-    assert sheared[-1].shear_force[0, 1] > 0.25 * sheared[-1].normal_force[0]
-    for state, force in zip(lowered, (1.1, 0.7, 0.3), strict=True):
-        assert not state.failed[0] and state.normal_force[0] == pytest.approx(force, rel=1e-3)
-        assert state.shear_force[0, 1] > 0.0
-        assert state.reading is not None and state.reading.forces[..., 2].max() <= 1e-3 * force
-    for state in (*sheared, *lowered):
-        assert np.linalg.norm(state.shear_force[0]) <= 1.02 * 0.3 * state.normal_force[0]
-    dragged = [state.shear_force[0, 1] for state in (sheared[-1], *lowered)]
-    depths = [state.depth[0] for state in (sheared[-1], *lowered)]
-    assert (np.diff(dragged) < 0.0).all() and (np.diff(depths) < 0.0).all()
-
-
-@pytest.mark.parametrize("make", [soft, lambda scene: RigidPad(SENSOR, scene, pitch=PITCH)], ids=["soft", "rigid"])
-def test_a_force_after_a_depth_begins_from_what_is_borne_and_forgets_no_shear(make):
-    scene = press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0)), indent(force=0.7))
-    pad = make(scene)
-    states = list(pad.run(4))
-    sheared, eased = states[8], states[9:]
-    assert sheared.normal_force[0] > 0.75
-    way = [sheared.normal_force[0], *(state.normal_force[0] for state in eased)]
-    assert (np.diff(way) < 0.0).all() and way[-1] == pytest.approx(0.7, rel=1e-3)  # and never off the pad in between
-    assert eased[-1].shear_force[0, 0] > 0.6 * sheared.shear_force[0, 0] > 0.1
-
-
-def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
-    """The contact's stiffness is known from the states before: six steps of the solver a state at most, on the mean."""
-    steps = []
-    drive = SoftContact.drive
-    monkeypatch.setattr(SoftContact, "drive", lambda self, *args: steps.append(1) or drive(self, *args))
-    pad = soft(press(indent(force=1.0)))
-    states = list(pad.run(8))[1:]
-    assert [state.normal_force[0] for state in states] == pytest.approx(list(np.arange(1, 9) / 8), rel=1e-3)
-    assert 8 <= len(steps) <= 6 * 8
-
-
-def test_friction_is_coulombs():
-    """A flat face dragged until all of it slides; its rim ploughs a little. Without friction, a ball drags next to nothing."""
-    sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.2))
-    pad = soft(press(indent(0.4e-3), StageSpec("shear", shear=(1.0e-3, 0.0)), kind="cylinder"), sensor)
-    state = pad.peak(pad.run())
-    assert state.shear_force[0, 0] == pytest.approx(0.2 * state.normal_force[0], rel=0.1)
-    pad = soft(press(indent(0.5e-3), StageSpec("shear", shear=(0.5e-3, 0.0))), FRICTIONLESS)
-    state = pad.peak(pad.run())
-    assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
-
-
-def test_twist_turns_with_the_object():
-    pad = soft(press(indent(0.4e-3), StageSpec("twist", twist=math.radians(4.0)), kind="cylinder"))
-    state = pad.peak(pad.run())
-    assert state.twist_torque[0] > 1e-4 and np.abs(state.shear_force[0]).max() < 1e-3 * state.normal_force[0]
-    coat = pad.surface(state).coat
-    assert coat is not None
-    here = np.linalg.norm(coat.mesh.rest[:, :2], axis=1) < 2e-3
-    x, y = coat.mesh.rest[here, :2].T
-    turned = (x * coat.displacement[0, here, 1] - y * coat.displacement[0, here, 0]).sum() / (x**2 + y**2).sum()
-    assert turned == pytest.approx(math.radians(4.0), rel=0.1)
-
-
-def test_a_depth_is_kept_through_shear_and_twist():
-    """The clearance changes while gel is drawn along; what is at the depth is the coat, in every state."""
-    stages = indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), StageSpec("shear", shear=(0.4e-3, 0.0))
-    pad = soft(press(*stages, kind="cylinder"))
-    for state in list(pad.run(2))[2:]:
-        assert state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
-        assert pad.surface(state).indentation.max() == pytest.approx(0.5e-3, abs=4e-6)
-
-
-def test_a_flat_face_imprints_flat_under_twist():
-    """No pits under the rim, no holes in the contact, nothing in the object: what the coat's cells of a millimetre used to leave."""
-    pad = SoftPad(SENSOR, press(indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), kind="cylinder"), pitch=0.1e-3)
-    surface = pad.surface(pad.peak(pad.run()))
-    under = pad.object_height(surface)
-    assert under is not None and (under - surface.height).min() > -1e-8
-    rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
-    assert surface.contact[0][rho < 2.9e-3].all() and not surface.contact[0][rho > 3.1e-3].any()
-    assert np.ptp(surface.height[0][rho < 2.9e-3]) < 2e-6
-    assert surface.indentation.max() < 0.5e-3 + 4e-6
 
 
 def test_a_straight_edge_leaves_a_straight_furrow():
@@ -362,61 +214,6 @@ def test_case_and_object_give_the_same_press():
     )
 
 
-def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
-    scene = press(indent(0.4e-3))
-    offsets = np.array([[0.0, 0.0], [2e-3, -1e-3], [np.nan, 0.0]])
-    many = soft(scene, num_envs=3, offsets=offsets)
-    state = many.peak(many.run())
-    assert list(state.failed) == [False, False, True] and np.isnan(state.depth[2])
-    assert np.isnan(many.surface(state).height[2]).all() and np.isfinite(many.surface(state).height[:2]).all()
-    for b in range(2):
-        one = soft(scene, offsets=offsets[b : b + 1])
-        alone = one.peak(one.run())
-        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 1e-6
-        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=1e-3)
-
-
-def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
-    turns = np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(0.6), 0.0, math.sin(0.6), 0.0]])
-    shears = np.array([[0.1e-3, 0.0], [0.0, -0.2e-3]])
-    stages = indent(0.4e-3), StageSpec("shear", shear=(1e-3, 1e-3))
-    many = soft(press(*stages, kind="cylinder"), num_envs=2, rotations=turns, shears=shears)
-    state = many.peak(many.run())
-    for b in range(2):
-        scene = press(indent(0.4e-3), StageSpec("shear", shear=tuple(shears[b])), kind="cylinder")
-        one = soft(replace(scene, object=replace(scene.object, quaternion=tuple(turns[b]))))
-        alone = one.peak(one.run())
-        # A batch takes as many steps as the longest of its ways asks for.
-        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 3e-6
-        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=5e-3)
-        assert alone.shear_force[0] == pytest.approx(state.shear_force[b], rel=0.03, abs=2e-3)
-    assert state.normal_force[1] < 0.5 * state.normal_force[0]  # on its rim
-
-
-def test_every_environment_has_its_depth():
-    depths = np.array([0.2e-3, 0.4e-3])
-    pad = soft(press(indent(0.3e-3)), num_envs=2, depths=depths)
-    state = pad.peak(pad.run())
-    assert state.depth == pytest.approx(depths, abs=2e-6) and state.normal_force[1] > 2 * state.normal_force[0]
-
-
-def test_a_resting_weight_presses_with_its_weight():
-    pad = soft(press(indent(force=0.3), StageSpec("release"), dynamics="affine"))
-    states = list(pad.run())
-    assert not states[1].failed[0]
-    assert states[1].normal_force[0] == pytest.approx(0.3, rel=0.01)
-    assert 0.0 < states[1].depth[0] < 1e-3
-    assert not pad.surface(states[2]).contact.any()
-
-
-def test_free_objects_lie_where_their_offsets_put_them():
-    offsets = np.array([[0.0, 0.0], [3e-3, 1e-3]])
-    pad = soft(press(indent(force=0.3), dynamics="affine"), num_envs=2, offsets=offsets)
-    state = pad.peak(pad.run())
-    assert not state.failed.any() and state.normal_force == pytest.approx([0.3, 0.3], rel=0.01)
-    assert np.abs(pad.surface(state).contact_centre - offsets).max() < 0.4e-3  # the second rolls a little down the dome
-
-
 @pytest.mark.slow
 def test_a_soft_object_gives_way():
     """A ball as soft as the gel shares the depth with it; needs pytetwild, whose mesh is kept in the user's cache."""
@@ -441,42 +238,11 @@ def test_the_rigid_pad_refuses_a_soft_object():
         RigidPad(SENSOR, press(indent(0.4e-3), dynamics="soft", youngs_modulus=2e5), pitch=PITCH)
 
 
-def test_force_against_depth_is_the_bonded_layers():
-    """Without friction, small strain, cells of 0.4 mm in the middle: Dimitriadis' law of a sphere on a bonded layer, as in LoadLaw.
-
-    The exponent of force over depth is met within 5 %. The force itself is up to 12 % too large, since the contact's radius has 2.5 cells;
-    with five it is within 5 % (tests/ipc/test_statics.py).
-    """
-    fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
-    scene = press(indent(0.15e-3), indent(0.3e-3))
-    pad = soft(scene, FRICTIONLESS, pad=pad_mesh(SENSOR.gelpad, fine))
-    force = [state.normal_force[0] for state in pad.run()][1:]
-    x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
-    gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)
-    law = LoadLaw(gap + SENSOR.gelpad.sag(x, y), 1e-5**2, SENSOR.gelpad)
-    slope = math.log(force[1] / force[0]) / math.log(2.0)
-    expected = math.log(law.force(0.3e-3) / law.force(0.15e-3)) / math.log(2.0)
-    assert slope == pytest.approx(expected, rel=0.05)
-    assert law.force(0.3e-3) < force[1] < 1.12 * law.force(0.3e-3)
-
-
 def test_an_untouched_pad_needs_no_solver():
     pad = soft(press(kind="none"))
     state = pad.peak(pad.run())
     assert np.array_equal(pad.surface(state).height[0], pad.grid.rest.astype(np.float32))
     assert not pad.wrench(state).any() and not pad.traction(state).any() and pad.object_height(pad.surface(state)) is None
-
-
-def test_where_one_environment_of_a_batch_leaves_the_pad_is_told_before_the_solver_starts():
-    sheared = press(indent(0.4e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.1))
-    with pytest.raises(InputError, match=r"shears = .*in environment 2, in trajectory\[1\]: no part of the object") as caught:
-        soft(sheared, num_envs=3, shears=np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, -40e-3]]))
-    assert caught.value.value == [0.0, -40e-3]
-    with pytest.raises(InputError, match=r"offsets = .*in environment 1, at the start: no part"):
-        soft(sheared, num_envs=2, offsets=np.array([[0.0, 0.0], [40e-3, 0.0]]))
-    far = press(indent(0.4e-3), StageSpec("shear", shear=(40e-3, 0.0)))
-    with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = \[40\.0, 0\.0\]"):
-        soft(far)
 
 
 def test_bad_input_is_named():

@@ -16,8 +16,9 @@ from raytac.gel.surface import GelSurface
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 from raytac.optics.base import OpticalMode, OpticsImages
-from raytac.report.compare import CompareSettings, run_comparison
+from raytac.report.compare import run_comparison
 from raytac.report.compare_report import FILES, write_comparison
+from raytac.report.compare_settings import CompareSettings
 from raytac.report.modes import Mode, Setting, comparison_modes
 
 for package in ("skimage", "jinja2", "pyarrow"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from raytac.gel.surface import GelSurface
 from raytac.io.png import read_png
@@ -88,6 +89,26 @@ def test_no_panel_runs_into_another(without: tuple[str, ...], data: PreviewData,
             assert a == b or not first.overlaps(second), (a, b)
 
 
+@pytest.mark.parametrize(
+    ("without", "pressed", "sheared", "span"),
+    [((), False, False, 1), ((), True, False, 3), ((), True, True, 2), (("normals",), False, False, 2)],
+)
+def test_the_section_leaves_no_place_empty(
+    without: tuple[str, ...], pressed: bool, sheared: bool, span: int, data: PreviewData, sensor_spec: SensorSpec
+) -> None:
+    """Right edges of the last panel of every row agree, and so does what the section says of its stretch, however wide it is."""
+    traction = np.zeros((*data.height.shape, 3))
+    traction[..., 2], traction[..., 0] = -1e3, 10.0 * sheared
+    figure = draw_preview(replace(data, traction=traction if pressed else None, **dict.fromkeys(without)), sensor_spec)
+    boxes = [axes.get_position() for axes in figure.axes if axes.get_title(loc="left")]
+    edges = {round(box.y0, 6): max(b.x1 for b in boxes if abs(b.y0 - box.y0) < 1e-6) for box in boxes}
+    assert len(edges) == -(-(len(boxes) + span - 1) // 3) and np.ptp(list(edges.values())) < 1e-9
+    (section,) = (axes for axes in figure.axes if "section" in axes.get_title(loc="left"))
+    column = boxes[0].width + (boxes[1].x0 - boxes[0].x1)
+    assert section.get_position().width == pytest.approx(boxes[0].width + (span - 1) * column)
+    check_stretch(section)
+
+
 def test_traction_says_whether_it_lies_where_the_coat_was_at_rest(data: PreviewData, sensor_spec: SensorSpec) -> None:
     now = replace(data, traction=np.full((*data.height.shape, 3), -1.0))
     for shown, end in ((now, "[kPa]"), (replace(now, traction_at_rest=True), "[kPa], rest place")):
@@ -108,8 +129,8 @@ def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: Sens
     assert "y = 0.0 mm" in title
 
 
-def test_the_axis_of_the_section_says_how_far_it_is_stretched(data: PreviewData, sensor_spec: SensorSpec) -> None:
-    (axes,) = (axes for axes in draw_preview(data, sensor_spec).axes if "section" in axes.get_title(loc="left"))
+def check_stretch(axes: Axes) -> None:
+    """The label of a section's axis is the ratio of its scales."""
     box, (left, right), (low, high) = axes.get_position(), axes.get_xlim(), axes.get_ylim()
     width, height = axes.figure.get_size_inches()  # type: ignore[union-attr]
     stretch = (box.height * height / (high - low)) / (box.width * width / (right - left))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.splits import by_press
 from raytac.cli import main
@@ -15,7 +17,11 @@ from raytac.cli.compare_real import CompareRealArgs
 from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
 from raytac.errors import InputError
 from raytac.io.png import write_png
+from raytac.report.markers import run_calibrate_markers
+from raytac.report.real import RealSettings
+from raytac.report.real_calibration import run_calibrate_optics
 from raytac.report.real_figure import table_text
+from raytac.report.real_models import fit_models
 from raytac.report.real_score import noise_floor, press_scores, summary
 from raytac.specs import load_sensor
 
@@ -123,3 +129,56 @@ def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
     assert prior_of(INNER) is None and prior_of("tied") == "tied"
     with pytest.raises(InputError, match="inner, free, tied"):
         prior_of("strong")
+
+
+WRONG: dict[str, Any] = {
+    "prior": ("strong", "free, tied, tied-dark, tied-darkest"),
+    "device": ("gpu", "auto, cpu, cuda"),
+    "starts": (0, "whole number >= 1"),
+    "rounds": (-1, "whole number >= 0"),
+}
+"""Values that a fit cannot use, and what must be said of them."""
+
+
+@pytest.mark.parametrize("name", [*WRONG, "tested"])
+def test_a_comparison_of_unknown_settings_cannot_be_set_up(name: str) -> None:
+    value, said = WRONG.get(name, (6, "must be 1 to 5"))
+    with pytest.raises(InputError, match=name) as told:
+        RealSettings(**{name: value})
+    assert said in str(told.value)
+
+
+@pytest.mark.parametrize("name", [*WRONG, "modes", "fixed", "shadow_table"])
+def test_a_fit_of_unknown_names_is_refused_at_once(name: str) -> None:
+    own: dict[str, Any] = {
+        "modes": (("raytrace", "ray"), "raytrace, taxim, mlp, phong"),
+        "fixed": (("gama",), "gamma, stray"),
+        "shadow_table": ("pins", "none, raytrace"),
+    }
+    value, said = (WRONG | own)[name]
+    how: dict[str, Any] = {"settings": FitSettings(fixed=value)} if name == "fixed" else {name: value}
+    with pytest.raises(InputError, match=name) as told:
+        fit_models(SENSOR, shots(), **how)
+    assert said in str(told.value)
+
+
+@pytest.mark.parametrize("name", [*WRONG, "model", "holdout", "shadow_table"])
+def test_a_calibration_by_unknown_names_writes_nothing(name: str, tmp_path: Path) -> None:
+    own: dict[str, Any] = {
+        "model": ("phong", "raytrace, taxim, mlp"),
+        "holdout": (1, "0 or a whole number >= 2"),
+        "shadow_table": ("raytrace", "belongs to the model 'taxim'"),
+    }
+    value, said = (WRONG | own)[name]
+    how: dict[str, Any] = dict(model="raytrace", holdout=0, starts=1, rounds=0, prior=None, device="cpu") | {name: value}
+    with pytest.raises(InputError, match=name) as told:
+        run_calibrate_optics(SENSOR, shots(), ("0", "1"), tmp_path / "out", data="none", shadows=False, seed=0, start=0.0, **how)
+    assert said in str(told.value) and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "said"), [("pad", "coarse, medium, fine"), ("device", "auto, cpu, cuda")])
+def test_a_calibration_of_markers_by_unknown_names_writes_nothing(name: str, said: str, tmp_path: Path) -> None:
+    how: dict[str, Any] = {"pad": "coarse", "device": "cpu"} | {name: "none"}
+    with pytest.raises(InputError, match=name) as told:
+        run_calibrate_markers(SENSOR, tmp_path / "out", quick=True, seed=0, start=0.0, **how)
+    assert said in str(told.value) and not list(tmp_path.iterdir())

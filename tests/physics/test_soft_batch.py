@@ -1,0 +1,80 @@
+"""Environments of the soft pad and objects that lie free on it: each is what it would be alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytac.errors import InputError, SpecError
+from raytac.specs.press import StageSpec
+from tests.physics.soft_presses import indent, press, soft
+
+
+def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
+    scene = press(indent(0.4e-3))
+    offsets = np.array([[0.0, 0.0], [2e-3, -1e-3], [np.nan, 0.0]])
+    many = soft(scene, num_envs=3, offsets=offsets)
+    state = many.peak(many.run())
+    assert list(state.failed) == [False, False, True] and np.isnan(state.depth[2])
+    assert np.isnan(many.surface(state).height[2]).all() and np.isfinite(many.surface(state).height[:2]).all()
+    for b in range(2):
+        one = soft(scene, offsets=offsets[b : b + 1])
+        alone = one.peak(one.run())
+        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 1e-6
+        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=1e-3)
+
+
+def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
+    turns = np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(0.6), 0.0, math.sin(0.6), 0.0]])
+    shears = np.array([[0.1e-3, 0.0], [0.0, -0.2e-3]])
+    stages = indent(0.4e-3), StageSpec("shear", shear=(1e-3, 1e-3))
+    many = soft(press(*stages, kind="cylinder"), num_envs=2, rotations=turns, shears=shears)
+    state = many.peak(many.run())
+    for b in range(2):
+        scene = press(indent(0.4e-3), StageSpec("shear", shear=tuple(shears[b])), kind="cylinder")
+        one = soft(replace(scene, object=replace(scene.object, quaternion=tuple(turns[b]))))
+        alone = one.peak(one.run())
+        # A batch takes as many steps as the longest of its ways asks for.
+        assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 3e-6
+        assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=5e-3)
+        assert alone.shear_force[0] == pytest.approx(state.shear_force[b], rel=0.03, abs=2e-3)
+    assert state.normal_force[1] < 0.5 * state.normal_force[0]  # on its rim
+
+
+def test_every_environment_has_its_depth():
+    depths = np.array([0.2e-3, 0.4e-3])
+    pad = soft(press(indent(0.3e-3)), num_envs=2, depths=depths)
+    state = pad.peak(pad.run())
+    assert state.depth == pytest.approx(depths, abs=2e-6) and state.normal_force[1] > 2 * state.normal_force[0]
+
+
+def test_a_resting_weight_presses_with_its_weight():
+    pad = soft(press(indent(force=0.3), StageSpec("release"), dynamics="affine"))
+    states = list(pad.run())
+    assert not states[1].failed[0]
+    assert states[1].normal_force[0] == pytest.approx(0.3, rel=0.01)
+    assert 0.0 < states[1].depth[0] < 1e-3
+    assert not pad.surface(states[2]).contact.any()
+
+
+def test_free_objects_lie_where_their_offsets_put_them():
+    offsets = np.array([[0.0, 0.0], [3e-3, 1e-3]])
+    pad = soft(press(indent(force=0.3), dynamics="affine"), num_envs=2, offsets=offsets)
+    state = pad.peak(pad.run())
+    assert not state.failed.any() and state.normal_force == pytest.approx([0.3, 0.3], rel=0.01)
+    assert np.abs(pad.surface(state).contact_centre - offsets).max() < 0.4e-3  # the second rolls a little down the dome
+
+
+def test_where_one_environment_of_a_batch_leaves_the_pad_is_told_before_the_solver_starts():
+    sheared = press(indent(0.4e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.1))
+    with pytest.raises(InputError, match=r"shears = .*in environment 2, in trajectory\[1\]: no part of the object") as caught:
+        soft(sheared, num_envs=3, shears=np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, -40e-3]]))
+    assert caught.value.value == [0.0, -40e-3]
+    with pytest.raises(InputError, match=r"offsets = .*in environment 1, at the start: no part"):
+        soft(sheared, num_envs=2, offsets=np.array([[0.0, 0.0], [40e-3, 0.0]]))
+    far = press(indent(0.4e-3), StageSpec("shear", shear=(40e-3, 0.0)))
+    with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = \[40\.0, 0\.0\]"):
+        soft(far)
