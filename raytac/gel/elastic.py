@@ -6,6 +6,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.gaussian import GaussianBlur
+from raytac.gel.smoothed import ComposedGaussians, LocalField, Piece, SmoothedField, WholeField, around
 from raytac.gel.surface import GelSurface, PadGrid
 
 __all__ = ["CONTACT_RULES", "CONTACT_SCALE", "FINAL_SIGMA", "PYRAMID_SIGMAS", "ElasticSurround"]
@@ -65,7 +66,10 @@ class ElasticSurround:
         finest = _FINEST * min(grid.pitch)
         self._pyramid = [GaussianBlur(grid.shape, grid.pitch, s) for s in sigmas if s > finest]
         self._final = GaussianBlur(grid.shape, grid.pitch, final_sigma) if final_sigma > finest else None
+        kept = [blur.sigma for blur in (*self._pyramid, *([] if self._final is None else [self._final]))]
+        self._composed = ComposedGaussians(grid.shape, grid.pitch, kept)
         self._reach = _REACH * float(np.sqrt(np.square([*sigmas, final_sigma]).sum()))
+        self._rest = grid.rest.astype(np.float32)
 
     def surface(self, object_height: np.ndarray, pad_from_object: np.ndarray | None = None) -> GelSurface:
         """Deformed surface under an object.
@@ -78,52 +82,56 @@ class ElasticSurround:
         height = np.empty((batch, *self.grid.shape), np.float32)
         contact = np.zeros(height.shape, bool)
         centre = np.full((batch, 2), np.nan)
-        rest = self.grid.rest.astype(np.float32)
         for b in range(batch):  # one by one: an environment's result must not depend on its neighbours
-            overlap = (self.grid.rest - object_height[b]).astype(np.float32)
+            overlap = np.subtract(self.grid.rest, object_height[b]).astype(np.float32)
             deepest = overlap.max()
             if np.isnan(deepest):
                 height[b] = np.nan
-            elif deepest <= 0.0:
-                height[b] = rest
-            else:
-                window = self._window(overlap)
-                height[b] = rest
-                displacement, contact[b][window] = self._displacement(overlap[window], deepest, window)
+                continue
+            height[b] = self._rest
+            if deepest > 0.0:
+                touched = _touched(overlap)
+                window = around(touched, self._reach, self.grid.pitch, (slice(0, overlap.shape[0]), slice(0, overlap.shape[1])))
+                overlap = overlap[touched]
+                displacement, contact[b][touched] = self._displacement(overlap, deepest, touched, window)
                 height[b][window] -= displacement
-                centre[b] = self._centroid(overlap[window], contact[b][window], window)
+                centre[b] = self._centroid(overlap, contact[b][touched], touched)
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
-    def _window(self, overlap: np.ndarray) -> tuple[slice, slice]:
-        """Rows and columns that an object moves."""
-        touched = overlap > 0.0
-        found = []
-        for axis, pitch in ((0, self.grid.pitch[1]), (1, self.grid.pitch[0])):
-            line = np.flatnonzero(touched.any(axis=1 - axis))
-            margin = int(np.ceil(self._reach / pitch))
-            found.append(slice(max(int(line[0]) - margin, 0), min(int(line[-1]) + margin + 1, overlap.shape[axis])))
-        return found[0], found[1]
-
-    def _displacement(self, overlap: np.ndarray, deepest: float, window: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
-        """w [m] and the contact, both of the shape of the window."""
+    def _displacement(self, overlap: np.ndarray, deepest: float, touched: Piece, window: Piece) -> tuple[np.ndarray, np.ndarray]:
+        """w [m] on the window, and the contact where the object has touched the resting gel; ``overlap`` is that there."""
         pressed = np.maximum(overlap, 0.0)
         full = overlap > self.contact_scale * deepest
-        moved = pressed
-        for blur in self._pyramid:
-            moved = blur(moved, window)
-            if self.contact_rule == "unilateral":
-                np.maximum(moved, pressed, out=moved)
-            else:
-                np.copyto(moved, pressed, where=full)
+        field, moved = self._field(pressed, touched, window), pressed
+        for _ in self._pyramid:
+            moved = field.smooth()
+            moved = np.maximum(moved, pressed) if self.contact_rule == "unilateral" else np.where(full, pressed, moved)
+            field.impose(moved)
         # Where the overlap is constant the Gaussians keep it, up to rounding: without slack, rounding would decide the contact. The
         # deepest node is always within it, since no Gaussian exceeds the maximum.
         slack = np.float32(max(_ROUNDING * float(deepest), float(np.finfo(np.float32).tiny)))
         contact = (overlap > 0.0) & (moved <= pressed + slack) if self.contact_rule == "unilateral" else full
-        return (moved if self._final is None else self._final(moved, window)), contact
+        return field.over(window), contact
 
-    def _centroid(self, overlap: np.ndarray, contact: np.ndarray, window: tuple[slice, slice]) -> tuple[float, float]:
+    def _field(self, pressed: np.ndarray, touched: Piece, window: Piece) -> SmoothedField:
+        """The cheaper way for this contact: locally, if it is narrower than what it moves on either side."""
+        widths = (pitch * (line.stop - line.start) for line, pitch in zip(touched, reversed(self.grid.pitch), strict=True))
+        if self._composed.fits and max(widths) <= self._reach:
+            return LocalField(pressed, touched, self._composed, len(self._pyramid), self._final is not None, _REACH)
+        return WholeField(pressed, touched, window, self._pyramid, self._final)
+
+    def _centroid(self, overlap: np.ndarray, contact: np.ndarray, window: Piece) -> tuple[float, float]:
         """Overlap-weighted centre (x, y) [m] of the contact, both of the shape of the window."""
         weight = np.where(contact, overlap, 0.0).astype(float)
         total = weight.sum()
         x, y = self.grid.x[window[1]], self.grid.y[window[0]]
         return float(weight.sum(axis=0) @ x / total), float(weight.sum(axis=1) @ y / total)
+
+
+def _touched(overlap: np.ndarray) -> Piece:
+    """Rows and columns in which the object overlaps the resting gel."""
+    mask = overlap > 0.0
+    rows = np.flatnonzero(mask.any(axis=1))
+    band = slice(int(rows[0]), int(rows[-1]) + 1)
+    columns = np.flatnonzero(mask[band].any(axis=0))
+    return band, slice(int(columns[0]), int(columns[-1]) + 1)

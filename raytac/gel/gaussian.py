@@ -6,7 +6,7 @@ import numpy as np
 
 from raytac.gel.product import product
 
-__all__ = ["GaussianBlur", "gaussian_matrix"]
+__all__ = ["GaussianBlur", "fast_gaussian_matrix", "gaussian_matrix"]
 
 _LOW_RANK_FROM = 6.0
 """Width [nodes] from which the truncated cosine basis beats the banded product (measured on a 399 × 328 grid, two cores)."""
@@ -24,6 +24,14 @@ def gaussian_matrix(nodes: int, width: float) -> np.ndarray:
     """
     synthesis, analysis = _cosine_basis(nodes, width)
     return synthesis @ analysis
+
+
+def fast_gaussian_matrix(nodes: int, width: float) -> np.ndarray:
+    """``gaussian_matrix`` as ``GaussianBlur`` has it, float32: without what lies below its tail threshold."""
+    if width < _LOW_RANK_FROM:
+        return _band(nodes, width)[0].astype(np.float32)
+    synthesis, analysis = _cosine_basis(nodes, width, tail=_TAIL)
+    return (synthesis @ analysis).astype(np.float32)
 
 
 class GaussianBlur:
@@ -58,6 +66,18 @@ def _operator(nodes: int, width: float) -> _Operator:
     if width >= _LOW_RANK_FROM:
         synthesis, analysis = _cosine_basis(nodes, width, tail=_TAIL)
         return synthesis.astype(np.float32), analysis.astype(np.float32)
+    matrix, reach = _band(nodes, width)
+    step = min(max(2 * reach, 24), nodes)
+    blocks: _Operator = []
+    for start in range(0, nodes, step):
+        rows = slice(start, min(start + step, nodes))
+        columns = slice(max(start - reach, 0), min(rows.stop + reach, nodes))
+        blocks.append((rows, columns, matrix[rows, columns].astype(np.float32)))
+    return blocks
+
+
+def _band(nodes: int, width: float) -> tuple[np.ndarray, int]:
+    """The matrix (nodes, nodes), and how far from its diagonal it is not 0."""
     kernel = _kernel(width)
     reach = min(len(kernel) // 2, nodes - 1)
     kernel = kernel[len(kernel) // 2 - reach : len(kernel) // 2 + reach + 1]
@@ -66,13 +86,7 @@ def _operator(nodes: int, width: float) -> _Operator:
     for offset, weight in zip(range(-reach, reach + 1), kernel / kernel.sum(), strict=True):
         mirrored = np.abs(row + offset)
         np.add.at(matrix, (row, np.where(mirrored > nodes - 1, 2 * (nodes - 1) - mirrored, mirrored)), weight)
-    step = min(max(2 * reach, 24), nodes)
-    blocks: _Operator = []
-    for start in range(0, nodes, step):
-        rows = slice(start, min(start + step, nodes))
-        columns = slice(max(start - reach, 0), min(rows.stop + reach, nodes))
-        blocks.append((rows, columns, matrix[rows, columns].astype(np.float32)))
-    return blocks
+    return matrix, reach
 
 
 def _piece(operator: _Operator, kept: slice) -> _Operator:

@@ -8,11 +8,11 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.part import Part
-from raytac.gel.primitives import UNDERSIDES, bounds
+from raytac.gel.primitives import UNDERSIDES, bounds, radius_about_origin
 from raytac.gel.rasterize import lowest_of_triangles
 from raytac.gel.relief import looks_down, relief_underside
 
-__all__ = ["object_bounds", "object_height"]
+__all__ = ["object_bounds", "object_height", "object_radius"]
 
 
 _NODES = 32768
@@ -26,16 +26,17 @@ def object_height(
 
     ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending; (B, Nx), (B, Ny) where every
     environment has its own. The object is the union of its ``parts``: the minimum of their undersides (exact for primitives, exact linear
-    interpolation for meshes). ``below`` [m] saves work: parts and triangles that lie wholly above it may be left out (their nodes read
-    ``inf``). Nothing is cut off at the pad: a part that reaches through it still shows its underside. A pose that is not finite gives NaN
-    in its environment alone. Raises ``InputError`` for poses of another shape.
+    interpolation for meshes). ``below`` [m] saves work: what lies above it may be left out (its nodes read ``inf``). Nothing is cut off
+    at the pad: a part that reaches through it still shows its underside. A pose that is not finite gives NaN in its environment alone.
+    Raises ``InputError`` for poses of another shape.
     """
     poses = np.asarray(pad_from_object, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError("pad_from_object", value=poses.shape, rule="must have shape (B, 4, 4)")
     height = np.full((len(poses), y.shape[-1], x.shape[-1]), np.inf)
     lost = np.logical_not(np.isfinite(poses).all(axis=(1, 2)))
-    poses = np.where(lost[:, None, None], np.eye(4), poses)
+    if lost.any():
+        poses = np.where(lost[:, None, None], np.eye(4), poses)
     count = max(_NODES // (height.shape[1] * height.shape[2]), 1)
     for start in range(0, len(poses), count):
         some = slice(start, start + count)
@@ -50,6 +51,18 @@ def object_bounds(parts: Sequence[Part], pad_from_object: np.ndarray) -> tuple[n
     """Axis-aligned box (lower, upper), each (3,) [m], in the pad frame, that holds the object at one pose (4, 4)."""
     boxes = [_part_bounds(part, pad_from_object @ part.object_from_part) for part in parts]
     return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+
+
+def object_radius(parts: Sequence[Part]) -> float:
+    """Radius [m] of a ball about the object's origin that holds it; inf for a half-space."""
+    return max(_part_radius(part) for part in parts)
+
+
+def _part_radius(part: Part) -> float:
+    if part.vertices is not None:
+        placed = part.vertices @ part.object_from_part[:3, :3].T + part.object_from_part[:3, 3]
+        return float(np.linalg.norm(placed, axis=1).max())
+    return float(np.linalg.norm(part.object_from_part[:3, 3])) + radius_about_origin(part.kind, part.size)
 
 
 def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,21 +86,41 @@ def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray
         chosen = np.flatnonzero(low[:, 2] <= below)
         if not len(chosen):
             return
+        if len(chosen) < len(poses):
+            poses, low, high = poses[chosen], low[chosen], high[chosen]
         rows, columns = slice(None), slice(None)
         if x.ndim == 1:
-            near, far = low[chosen].min(axis=0), high[chosen].max(axis=0)
+            near, far = _box_below(part, poses, low, high, below)
             rows, columns = _span(y, near[1], far[1]), _span(x, near[0], far[0])
             local_x, local_y = x[None, columns], y[None, rows]
         else:
-            local_x, local_y = x[chosen], y[chosen]
+            local_x, local_y = (x, y) if len(chosen) == len(lowest) else (x[chosen], y[chosen])
         if local_x.size and local_y.size:
-            some = slice(None) if len(chosen) == len(poses) else chosen
-            underside = UNDERSIDES[part.kind](part.size, poses[some], local_x[:, None, :], local_y[:, :, None])
-            lowest[some, rows, columns] = np.minimum(lowest[some, rows, columns], underside)
+            underside = UNDERSIDES[part.kind](part.size, poses, local_x[:, None, :], local_y[:, :, None])
+            if len(chosen) == len(lowest):
+                window = lowest[:, rows, columns]
+                np.minimum(window, underside, out=window)
+            else:
+                lowest[chosen, rows, columns] = np.minimum(lowest[chosen, rows, columns], underside)
         return
     for b, (pose, window) in enumerate(zip(poses, lowest, strict=True)):
         own = (x, y) if x.ndim == 1 else (x[b], y[b])
         _lower_surface_onto(window, part, pose, *own, below)
+
+
+def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest x, y (2,) [m] of what is lower than ``below`` of a primitive at poses (n, 4, 4) in boxes ``low`` to ``high``."""
+    near, far = low[:, :2].min(axis=0), high[:, :2].max(axis=0)
+    radius = radius_about_origin(part.kind, part.size)
+    if np.isfinite(below) and np.isfinite(radius):
+        # In a ball about the origin, what is lower than a plane beneath its centre lies in a disc.
+        above = np.maximum(poses[:, 2, 3] - below, 0.0)
+        reach = np.sqrt(np.maximum(radius**2 - above * above, 0.0))[:, None]
+        near, far = (
+            np.maximum(near, (poses[:, :2, 3] - reach).min(axis=0)),
+            np.minimum(far, (poses[:, :2, 3] + reach).max(axis=0)),
+        )
+    return near, far
 
 
 def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["UNDERSIDES", "bounds", "line_in_part"]
+__all__ = ["UNDERSIDES", "bounds", "line_in_part", "radius_about_origin"]
 
 Underside = Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Interval = tuple[np.ndarray, np.ndarray]
@@ -56,6 +56,19 @@ def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.nda
         tip_low, tip_high = centre + size[2] * axis - size[2], centre + size[2] * axis + size[2]
         return np.minimum(tip_low, base - size[0] * across), np.maximum(tip_high, base + size[0] * across)
     return centre - half, centre + half
+
+
+def radius_about_origin(kind: str, size: tuple[float, ...]) -> float:
+    """Radius [m] of the smallest ball about a primitive's origin that holds it; inf for a plane."""
+    if kind == "plane":
+        return np.inf
+    if kind in ("sphere", "ellipsoid"):
+        return max(size)
+    if kind in ("capsule", "torus"):
+        return size[0] + size[1]
+    if kind == "cone":  # its tip's sphere touches the origin and ends within the rim's ball
+        return max(float(np.hypot(size[0], size[1])), 2.0 * size[2])
+    return float(np.linalg.norm(size))  # cylinder, box
 
 
 def _plane(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.n
     """a @ b, float32, in pieces along the longer free side small enough to stay on the calling thread."""
     rows, inner = a.shape
     columns = b.shape[1]
+    if rows * inner * columns <= _ONE_THREAD:
+        return np.matmul(a, b, out=out)
     out = np.empty((rows, columns), np.float32) if out is None else out
     if rows >= columns:
         step = max(_ONE_THREAD // (inner * columns), 1)

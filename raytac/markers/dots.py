@@ -25,11 +25,21 @@ def dot_ink(grid: PadGrid, centres: np.ndarray, radius: float) -> np.ndarray:
     kx, ky = int(np.ceil(radius / dx)) + 1, int(np.ceil(radius / dy)) + 1
     column, row = np.rint((x - grid.x[0]) / dx).astype(int), np.rint((y - grid.y[0]) / dy).astype(int)
     columns, rows = column[:, None] + np.arange(-kx, kx + 1), row[:, None] + np.arange(-ky, ky + 1)
-    ex, ey = grid.x[0] + columns * dx - x[:, None], grid.y[0] + rows * dy - y[:, None]
-    apart = np.sqrt(ex[:, None, :] ** 2 + ey[:, :, None] ** 2)
-    share = np.clip((radius - apart) / max(dx, dy) + 0.5, 0.0, 1.0)
-    on_pad = ((rows >= 0) & (rows < ny))[:, :, None] & ((columns >= 0) & (columns < nx))[:, None, :]
-    node = (env[:, None, None] * ny + rows[:, :, None]) * nx + columns[:, None, :]
-    kept = on_pad & (share > 0)
-    np.maximum.at(ink.reshape(-1), node[kept], share[kept].astype(np.float32))
+    # Distances within a dot are single precision's business.
+    ex = (grid.x[0] + columns * dx - x[:, None]).astype(np.float32)
+    ey = (grid.y[0] + rows * dy - y[:, None]).astype(np.float32)
+    share = np.sqrt((ex * ex)[:, None, :] + (ey * ey)[:, :, None])
+    share *= np.float32(-1.0 / max(dx, dy))
+    share += np.float32(radius / max(dx, dy) + 0.5)
+    np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+    node = ((env * ny)[:, None] + rows)[:, :, None] * nx + columns[:, None, :]
+    if len(env) and (rows.min() < 0 or rows.max() >= ny or columns.min() < 0 or columns.max() >= nx):
+        on_pad = ((rows >= 0) & (rows < ny))[:, :, None] & ((columns >= 0) & (columns < nx))[:, None, :]
+        node, share = node[on_pad], share[on_pad]
+    node, share, flat = node.reshape(-1), share.reshape(-1), ink.reshape(-1)
+    # The greatest share of each node. Dots seldom lie over one another, so one round does, in a tenth of the time of ``np.maximum.at``.
+    while len(node):
+        flat[node] = share
+        more = share > flat[node]
+        node, share = node[more], share[more]
     return ink

@@ -275,7 +275,9 @@ class ImageMode(ABC):
     def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any, ink: Any) -> tuple[Any, Any]:
         mi = self.mi
         channels, flags = self._inked_levels(self._see(heights, contact, rest, ink), inputs)
-        return mi.UInt8(dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))), flags
+        levels = dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))
+        dr.eval(levels, flags)  # in one kernel: flags that are left over would find all bins again
+        return mi.UInt8(levels), flags
 
     def _inked_levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
         """``_levels`` with the dots of the markers, if there are some."""

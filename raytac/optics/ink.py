@@ -58,12 +58,16 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     """
     coat, response = sensor.coat, sensor.response
     s = coat.specular
-    found = []
-    for c, dotted in enumerate(inked_albedo(sensor, ink)):
-        level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
-        share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
-        power: Any = dr.power  # typed as an object in Dr.Jit's stubs
-        linear = power(dr.maximum(level, 0) / 255, response.gamma) - black
-        dark = power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255
-        found.append(dr.select(ink > 0, dark, level))
-    return found
+
+    def inked(*levels: Any) -> tuple[Any, ...]:
+        found = []
+        for c, dotted in enumerate(inked_albedo(sensor, ink)):
+            level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
+            share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
+            power: Any = dr.power  # typed as an object in Dr.Jit's stubs
+            linear = power(dr.maximum(level, 0) / 255, response.gamma) - black
+            found.append(power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255)
+        return tuple(found)
+
+    # A branch, since powers are dear and dots are few.
+    return list(dr.if_stmt(tuple(levels), ink > 0, inked, lambda *levels: levels, label="ink"))

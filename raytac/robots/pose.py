@@ -49,21 +49,22 @@ def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
     return pose(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
 
 
-def site_poses(datas: Sequence[mujoco.MjData], site: int) -> np.ndarray:
-    """Poses (B, 4, 4) of a site in many states, as the last ``mj_kinematics`` (or step) left them."""
+def site_poses(datas: Sequence[mujoco.MjData], site: int | np.ndarray) -> np.ndarray:
+    """Poses (B, 4, 4) of a site in many states, as the last ``mj_kinematics`` (or step) left them; (B, n, 4, 4) of n sites."""
     return _poses([data.site_xmat[site] for data in datas], [data.site_xpos[site] for data in datas])
 
 
-def body_poses(datas: Sequence[mujoco.MjData], body: int) -> np.ndarray:
-    """The same of a body."""
+def body_poses(datas: Sequence[mujoco.MjData], body: int | np.ndarray) -> np.ndarray:
+    """The same of a body, or of several."""
     return _poses([data.xmat[body] for data in datas], [data.xpos[body] for data in datas])
 
 
 def _poses(rotations: Sequence[np.ndarray], positions: Sequence[np.ndarray]) -> np.ndarray:
-    found = np.zeros((len(rotations), 4, 4))
-    found[:, :3, :3] = np.reshape(rotations, (-1, 3, 3))
-    found[:, :3, 3] = np.reshape(positions, (-1, 3))
-    found[:, 3, 3] = 1.0
+    place = np.array(positions)
+    found = np.zeros((*place.shape[:-1], 4, 4))
+    found[..., :3, :3] = np.reshape(rotations, (*place.shape, 3))
+    found[..., :3, 3] = place
+    found[..., 3, 3] = 1.0
     return found
 
 

@@ -94,7 +94,8 @@ def reading_forces(reading: PadReading, outputs: tuple[str, ...]) -> dict[str, n
 def _contact_size(surface: GelSurface, failed: np.ndarray) -> dict[str, np.ndarray]:
     """``contact_area`` and, of a simulated pad, ``contact_cells``."""
     cell = surface.grid.pitch[0] * surface.grid.pitch[1]
-    found = {"contact_area": np.where(failed, np.nan, surface.contact.sum(axis=(1, 2)) * cell)}
+    nodes = np.array([np.count_nonzero(one) for one in surface.contact])
+    found = {"contact_area": np.where(failed, np.nan, nodes * cell)}
     if surface.coat is not None:
         found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
     return found

@@ -20,7 +20,12 @@ _PITCHES = 0.8e-3, 0.4e-3, 0.2e-3
 _ENOUGH = 150
 """Nodes: 96 mm² of the first grid, 24 mm² of the second."""
 _NEAR = 0.75
-"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
+"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further. So
+high above the gel bodies are looked at on each grid."""
+
+_WINDOWS = np.array([8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256])
+"""Nodes along a side of the windows that are looked at, beyond which it is the whole line: few sizes, so that environments share them, and
+each by what is in it, so that no environment's sums depend on the others'."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +42,15 @@ class Touches:
     """Unit normal of the resting gel there, (n, 3)."""
     gap: tuple[np.ndarray, ...]
     """Of each, the distance along z from the resting gel to the body [m], (Ny, Nx); negative where they overlap, inf where there is no
-    body."""
+    body, or none within ``clear`` of the gel."""
     cell: np.ndarray
     """Area of one node of each [m²], (n,)."""
+    clear: np.ndarray
+    """Up to where each ``gap`` is known [m], (n,)."""
+
+    def known_depth(self, k: int) -> float:
+        """Depth [m] up to which a load law of the k-th can be told from its gap: that law counts what is nearer than half the depth."""
+        return 2.0 * float(self.depth[k] + self.clear[k])
 
 
 class PadOverlap:
@@ -58,29 +69,57 @@ class PadOverlap:
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
         """How a body at poses (B, 4, 4) overlaps the pad. ``radius`` [m] of a ball about the body's origin that holds it."""
         found: list[Touches] = []
-        left = [np.arange(len(pad_from_body)), *(np.zeros(0, int) for _ in self._grids[1:])]
+        ball, last = _Ball(pad_from_body, radius), len(self._grids) - 1
+        following = self._first_grid(ball)
         for k, nodes in enumerate(self._grids):
-            rows, last = left[k], k == len(self._grids) - 1
+            rows = np.flatnonzero(following == k)
             if not len(rows):
                 continue
-            if not last and radius < nodes.pitch:
-                left[k + 1] = np.union1d(left[k + 1], rows)  # such a body may lie between the nodes
-                continue
-            gaps = nodes.gaps(parts, pad_from_body[rows], radius, below=0.0 if last else _NEAR * nodes.pitch)
-            least, count = gaps.least, np.count_nonzero(gaps.values < 0.0, axis=(1, 2))
-            done = least < 0.0 if last else count >= _ENOUGH
-            if done.any():
-                found.append(nodes.measure(gaps, rows, done))
-            if not last:
-                on = (least < _NEAR * nodes.pitch) & ~done
-                few = count < _ENOUGH // 8  # with half the spacing there are four times as many, at most half of enough
-                left[k + 1] = np.union1d(left[k + 1], rows[on & ~few])
-                left[-1] = np.union1d(left[-1], rows[on & few])
+            for some, size in nodes.windows(ball.of(rows)):
+                rows_of = rows[some]
+                gaps = nodes.gaps(parts, ball.of(rows_of), size)
+                if k == last:
+                    done = gaps.least < 0.0
+                else:
+                    count = np.count_nonzero(gaps.values < 0.0, axis=(1, 2))
+                    done = count >= _ENOUGH
+                    # With half the spacing there are four times as many nodes: of few, at most half of enough.
+                    on = np.where(count < _ENOUGH // 8, last, k + 1)
+                    following[rows_of] = np.where(done | (gaps.least >= nodes.near), -1, on)
+                if done.any():
+                    found.append(nodes.measure(gaps, rows_of, done))
         return _joined(found)
+
+    def _first_grid(self, ball: _Ball) -> np.ndarray:
+        """The first grid that may hold enough nodes of each ball below the highest gel, (B,), the last if none may."""
+        reach = ball.reach(self.highest)
+        # No disc holds more nodes than the area of one that is wider by half a cell's diagonal. A body narrower than a cell is in none.
+        first = np.zeros(len(reach), int)
+        for nodes in self._grids[:-1]:
+            first += np.pi * (reach / nodes.pitch + 0.71) ** 2 < _ENOUGH
+        return first
 
     def law(self, touches: Touches, k: int) -> LoadLaw:
         """Load law of the body in the k-th environment that touches, at this place and angle."""
         return LoadLaw(np.maximum(touches.gap[k] + touches.depth[k], 0.0), float(touches.cell[k]), self._gelpad)
+
+
+@dataclass(frozen=True)
+class _Ball:
+    """Balls of one radius about a body's origin, each of which holds the body."""
+
+    pad_from_body: np.ndarray
+    """Poses of the body (n, 4, 4)."""
+    radius: float
+    """[m], inf for a half-space."""
+
+    def reach(self, below: float) -> np.ndarray:
+        """How far from their centres along x and y what is lower than ``below`` [m] can be [m], (n,)."""
+        above = np.maximum(self.pad_from_body[:, 2, 3] - below, 0.0)
+        return np.sqrt(np.maximum(self.radius**2 - above * above, 0.0))
+
+    def of(self, rows: np.ndarray) -> _Ball:
+        return self if len(rows) == len(self.pad_from_body) else _Ball(self.pad_from_body[rows], self.radius)
 
 
 @dataclass(frozen=True)
@@ -101,70 +140,82 @@ class _Nodes:
         grid = make_grid(gelpad, pitch)
         self.x, self.y = grid.x, grid.y
         self.pitch, self.cell = pitch, grid.pitch[0] * grid.pitch[1]
+        self.near = _NEAR * pitch
         self.highest = float(grid.rest.max())
         # The rest surface is a sum of a function of x and one of y (``GelpadSpec.sag``), and so are its slopes.
-        self.rest_x, self.rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)
-        self._rest = grid.rest
-        self.slope_x, self.slope_y = np.gradient(self.rest_x, grid.x), np.gradient(self.rest_y, grid.y)
+        rest_x, rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)
+        self._rest, self._rest_x, self._rest_y = grid.rest, rest_x, rest_y
+        # Along each axis: place, height and slope of every node.
+        self._along = [
+            np.stack([line, rest, np.gradient(rest, line)], axis=1) for line, rest in ((grid.x, rest_x), (grid.y, rest_y))
+        ]
 
-    def gaps(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float, below: float) -> _Gaps:
-        """Gaps at poses (n, 4, 4); a body that stays ``below`` [m] above the highest gel may read inf."""
-        columns, rows = (_window(line, pad_from_body[:, k, 3], radius) for k, line in enumerate((self.x, self.y)))
+    def windows(self, ball: _Ball) -> list[tuple[np.ndarray, int]]:
+        """Which of the balls need a window of which of ``_WINDOWS``, by its place there, for what ``gaps`` shows."""
+        need = 2.0 / self.pitch * ball.reach(self.highest + self.near) + 2.0
+        size = _WINDOWS.searchsorted(need)
+        return [(np.flatnonzero(size == one), one) for one in sorted(set(size.tolist()))]
+
+    def gaps(self, parts: Sequence[Part], ball: _Ball, size: int) -> _Gaps:
+        """Gaps of the body that each ball holds, on windows about them; what is ``near`` above the highest gel may read inf."""
+        below, pad_from_body = self.highest + self.near, ball.pad_from_body
+        nodes = int(_WINDOWS[size]) if size < len(_WINDOWS) else max(len(self.x), len(self.y))
+        columns, rows = (_window(line, pad_from_body[:, k, 3], nodes) for k, line in enumerate((self.x, self.y)))
         if columns.shape[1] == len(self.x) and rows.shape[1] == len(self.y):
-            x, y = self.x, self.y
+            values = object_height(parts, pad_from_body, self.x, self.y, below=below)
+            values -= self._rest
         else:
-            x, y = (np.broadcast_to(v, (len(pad_from_body), v.shape[1])) for v in (self.x[columns], self.y[rows]))
-        values = object_height(parts, pad_from_body, x, y, below=self.highest + below)
-        values -= self._rest if x.ndim == 1 else self.rest_x[columns][:, None, :] + self.rest_y[rows][:, :, None]
+            x, y = self.x[columns], self.y[rows]
+            if len(pad_from_body) > 1:
+                x, y = (np.broadcast_to(v, (len(pad_from_body), v.shape[1])) for v in (x, y))
+            values = object_height(parts, pad_from_body, x, y, below=below)
+            values -= self._rest_x[columns][:, None, :]
+            values -= self._rest_y[rows][:, :, None]
         return _Gaps(values, columns, rows, values.min(axis=(1, 2)))
 
     def measure(self, gaps: _Gaps, env: np.ndarray, chosen: np.ndarray) -> Touches:
         """Depth, centroid and normal of the overlaps that a mask chooses; ``env`` is what the environments are called."""
-        values = gaps.values[chosen]
-        columns, rows = (v[chosen] if len(v) > 1 else v for v in (gaps.columns, gaps.rows))
+        values, columns, rows = gaps.values, gaps.columns, gaps.rows
+        if not chosen.all():
+            values, env = values[chosen], env[chosen]
+            columns, rows = (v[chosen] if len(v) > 1 else v for v in (columns, rows))
         # Moments of the overlap by its sums along the axes: the vectors are short then, and the gel is a sum of two functions.
         overlap = np.minimum(values, 0.0)
-        along_x, along_y = overlap.sum(axis=1), overlap.sum(axis=2)
-        total = along_x.sum(axis=1)
-        along_x, along_y = along_x / total[:, None], along_y / total[:, None]
-
-        def mean(on_x: np.ndarray, on_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return (along_x * on_x[columns]).sum(axis=1), (along_y * on_y[rows]).sum(axis=1)
-
-        height = np.add(*mean(self.rest_x, self.rest_y)) + np.square(overlap).sum(axis=(1, 2)) / total
-        centre = np.stack([*mean(self.x, self.y), height], axis=1)
-        slope = mean(self.slope_x, self.slope_y)
-        normal = np.stack([-slope[0], -slope[1], np.ones(len(total))], axis=1)
-        normal /= np.sqrt(np.square(normal).sum(axis=1))[:, None]
-        return Touches(env[chosen], -_refined(values), centre, normal, tuple(values), np.full(len(total), self.cell))
+        total = overlap.sum(axis=(1, 2))[:, None]
+        (x, height_x, slope_x), (y, height_y, slope_y) = (
+            ((overlap.sum(axis=axis)[:, None, :] @ along[nodes])[:, 0] / total).T
+            for axis, along, nodes in ((1, self._along[0], columns), (2, self._along[1], rows))
+        )
+        height = height_x + height_y + np.vecdot(flat := overlap.reshape(len(values), -1), flat) / total[:, 0]
+        normal = np.stack([-slope_x, -slope_y, np.ones(len(values))], axis=1)
+        normal /= np.sqrt(np.vecdot(normal, normal))[:, None]
+        cell, clear = np.full(len(values), self.cell), np.full(len(values), self.near)
+        return Touches(env, -_refined(values), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
 
 
-def _window(line: np.ndarray, at: np.ndarray, radius: float) -> np.ndarray:
-    """Indices (n, k) of a line's nodes within ``radius`` of places (n,), as many for all; (1, k) if these are all nodes."""
-    count = len(line) if np.isinf(radius) else min(int(2.0 * radius / (line[1] - line[0])) + 2, len(line))
-    if count == len(line):
-        return np.arange(count)[None]
-    first = np.clip(np.searchsorted(line, at - radius), 0, len(line) - count)
-    return first[:, None] + np.arange(count)
+def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
+    """Indices (n, k) of a line's nodes about places (n,), ``nodes`` or (1, k) of all there are."""
+    if nodes >= len(line):
+        return np.arange(len(line))[None]
+    pitch = line[1] - line[0]
+    first = np.ceil((at - line[0]) / pitch - 0.5 * nodes).astype(int)
+    return np.minimum(np.maximum(first, 0), len(line) - nodes)[:, None] + np.arange(nodes)
 
 
 def _refined(gap: np.ndarray) -> np.ndarray:
     """The least gaps (n,) of (n, Ny, Nx) between the nodes: parabolas through the least node and its neighbours along both axes, exact
     for a ball on a dome."""
     n, ny, nx = gap.shape
-    env = np.arange(n)
-    j, i = np.divmod(gap.reshape(n, -1).argmin(axis=1), nx)
-    middle = gap[env, j, i]
-    least = middle.copy()
-    for inside, before, after in (
-        ((i > 0) & (i < nx - 1), gap[env, j, np.maximum(i - 1, 0)], gap[env, j, np.minimum(i + 1, nx - 1)]),
-        ((j > 0) & (j < ny - 1), gap[env, np.maximum(j - 1, 0), i], gap[env, np.minimum(j + 1, ny - 1), i]),
-    ):
-        curve = before + after - 2.0 * middle
-        bent = inside & np.isfinite(curve) & (curve > 0.0)
-        before, after = (np.where(bent, v, 0.0) for v in (before, after))
-        least -= 0.125 * (after - before) ** 2 / np.where(bent, curve, 1.0)
-    return least
+    lowest = gap.reshape(n, -1).argmin(axis=1)
+    j, i = np.divmod(lowest, nx)
+    lowest += (ny * nx) * np.arange(n)
+    inside = np.stack([(i > 0) & (i < nx - 1), (j > 0) & (j < ny - 1)])
+    step = np.where(inside, [[1], [nx]], 0)
+    middle, before, after = (gap.take(lowest + way * step) for way in (0, -1, 1))
+    curve = before + after - 2.0 * middle
+    bent = inside & np.isfinite(curve) & (curve > 0.0)
+    rise = np.where(bent, after, 0.0) - np.where(bent, before, 0.0)
+    return middle[0] - 0.125 * (rise * rise / np.where(bent, curve, 1.0)).sum(axis=0)
 
 
 def _joined(found: Sequence[Touches]) -> Touches:
@@ -173,10 +224,12 @@ def _joined(found: Sequence[Touches]) -> Touches:
         return found[0]
     if not found:
         nothing = np.zeros(0)
-        return Touches(np.zeros(0, int), nothing, np.zeros((0, 3)), np.zeros((0, 3)), (), nothing)
-    env, depth, centre, normal, cell = (
-        np.concatenate([getattr(some, name) for some in found]) for name in ("env", "depth", "centre", "normal", "cell")
+        return Touches(np.zeros(0, int), nothing, np.zeros((0, 3)), np.zeros((0, 3)), (), nothing, nothing)
+    env, depth, centre, normal, cell, clear = (
+        np.concatenate([getattr(some, name) for some in found]) for name in ("env", "depth", "centre", "normal", "cell", "clear")
     )
     gap = [one for some in found for one in some.gap]
     order = np.argsort(env)
-    return Touches(env[order], depth[order], centre[order], normal[order], tuple(gap[k] for k in order), cell[order])
+    return Touches(
+        env[order], depth[order], centre[order], normal[order], tuple(gap[k] for k in order), cell[order], clear[order]
+    )

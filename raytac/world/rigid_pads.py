@@ -23,14 +23,14 @@ the other, since its own share of the time is small (docs/rl.md, Speed).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from raytac.gel.elastic import ElasticSurround
-from raytac.gel.object_height import object_bounds, object_height
+from raytac.gel.object_height import object_height, object_radius
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.load_law import LoadLaw
@@ -38,7 +38,7 @@ from raytac.physics.pad_reading import PadReading
 from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import body_poses, site_poses
 from raytac.specs.sensor import SensorSpec
-from raytac.world.compose import ComposedBody, ComposedScene
+from raytac.world.compose import ComposedScene
 from raytac.world.pad_overlap import PadOverlap, Touches
 from raytac.world.state import Drive, lost
 from raytac.world.variation import EnvironmentModels
@@ -52,6 +52,9 @@ _RATE = 0.2
 impedance d, which keeps the force at rest: K = s / ((1 − d) A)."""
 _SLIP_RATE = 0.5
 """Rate at which friction takes away sliding, per step of MuJoCo."""
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+"""Axes of a cross product; NumPy's own takes ten times as long for one pair."""
 
 
 class _Pad:
@@ -85,14 +88,18 @@ class RigidPads:
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         }
         self.bodies = tuple(composed.bodies.values())
-        self._radius = [_radius(body) for body in self.bodies]
+        self._body_index = np.array([body.index for body in self.bodies], int)
+        self._site_index = np.array([pad.site for pad in self.pads.values()], int)
+        self._planes = np.flatnonzero([body.spec.kind == "plane" for body in self.bodies])
+        self._radius = np.array([object_radius(body.parts) for body in self.bodies])
         self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
-        self._laws: list[dict[tuple[str, int], LoadLaw]] = [{} for _ in range(num_envs)]
+        self._laws: list[dict[tuple[str, int], tuple[LoadLaw, float]]] = [{} for _ in range(num_envs)]
+        """By sensor and body, and the depth [m] up to which each is known."""
         self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
         """Body that each pad showed deepest last; −1: none."""
         self._forms = {(name, i): self._form(name, i) for name in self.pads for i in range(len(self.bodies))}
-        self._shown: dict[str, tuple[PadGrid, ElasticSurround]] = {}
+        self._shown: dict[str, tuple[PadGrid, ElasticSurround, float]] = {}
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -109,6 +116,8 @@ class RigidPads:
         for b in sound.tolist():
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
         for _ in range(round(scene.control_timestep / scene.timestep)):
+            if not len(sound):
+                break
             for b in sound.tolist():
                 mujoco.mj_step1(models[b], datas[b])
             touching = self._add_contacts(datas, sound, failed)
@@ -137,11 +146,11 @@ class RigidPads:
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at the present poses."""
         found = []
-        for name, pad in self.pads.items():
-            world_from_pad = site_poses([data], pad.site)
-            for i, body in enumerate(self.bodies):
-                touches = self._touches(pad, i, world_from_pad, body_poses([data], body.index))
-                found += [(name, body.spec.name, float(depth)) for depth in touches.depth]
+        for name, pad, _, pad_from_body in self._poses([data]):
+            near = self._near(pad, pad_from_body)
+            for i in np.flatnonzero(near[0]).tolist():
+                touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
+                found += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
         return found
 
     def reading(
@@ -151,23 +160,24 @@ class RigidPads:
         pad, rows = self.pads[name], np.arange(len(datas)) if envs is None else np.asarray(envs)
         datas, failed = [datas[b] for b in rows.tolist()], failed[rows]
         if name not in self._shown or self._shown[name][0] is not grid:
-            self._shown[name] = grid, ElasticSurround(grid)
+            self._shown[name] = grid, ElasticSurround(grid), float(grid.rest.max())
         height = np.full((len(datas), *grid.shape), np.inf)
         poses = np.full((len(datas), 4, 4), np.nan)
         deepest, pressed = np.zeros(len(datas)), np.full(len(datas), -1)
-        highest = float(grid.rest.max())
-        world_from_pad = site_poses(datas, pad.site)
-        for i, body in enumerate(self.bodies):
-            pad_from_body = _relative(world_from_pad, body_poses(datas, body.index))
-            near = np.flatnonzero(self._is_near(pad, pad_from_body, i) & ~failed)
-            if not len(near):
-                continue
-            under = object_height(body.parts, pad_from_body[near], grid.x, grid.y, below=highest)
+        highest = self._shown[name][2]
+        pad_from_body = _relative(site_poses(datas, pad.site)[:, None], body_poses(datas, self._body_index))
+        near = self._near(pad, pad_from_body) & ~failed[:, None]
+        for i in np.flatnonzero(near.any(axis=0)).tolist():
+            rows_near = np.flatnonzero(near[:, i])
+            under = object_height(self.bodies[i].parts, pad_from_body[rows_near, i], grid.x, grid.y, below=highest)
             depth = (grid.rest - under).max(axis=(1, 2))
-            deeper = depth > deepest[near]
-            at = near[deeper]
-            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at]
-            height[near] = np.minimum(height[near], under)
+            deeper = depth > deepest[rows_near]
+            at = rows_near[deeper]
+            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at, i]
+            if len(rows_near) == len(datas):
+                height = np.minimum(height, under, out=under)
+            else:
+                height[rows_near] = np.minimum(height[rows_near], under)
         height[failed] = np.nan
         # From one body to another is no motion of either.
         before = self._pressed[name][rows]
@@ -177,57 +187,61 @@ class RigidPads:
         wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
         return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
 
-    def _is_near(self, pad: _Pad, pad_from_body: np.ndarray, i: int) -> np.ndarray:
-        """Whether a body at poses (B, 4, 4) may reach the pad's box, (B,)."""
-        radius, at = self._radius[i], pad_from_body[:, :3, 3]
-        if self.bodies[i].spec.kind == "plane":
-            # The plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
-            normal = pad_from_body[:, :3, 2]
-            return normal[:, 2] * pad.highest - np.abs(normal[:, :2]) @ pad.reach < (normal * at).sum(axis=1)
-        return (at[:, 2] - radius < pad.highest) & (np.abs(at[:, :2]) - radius < pad.reach).all(axis=1)
+    def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[tuple[str, _Pad, np.ndarray, np.ndarray]]:
+        """Every pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
+        world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
+        for k, (name, pad) in enumerate(self.pads.items()):
+            yield name, pad, world_from_pad[:, k], _relative(world_from_pad[:, k, None], world_from_body)
 
-    def _touches(self, pad: _Pad, i: int, world_from_pad: np.ndarray, world_from_body: np.ndarray) -> Touches:
-        """Where a body touches a pad; ``env`` counts the poses (n, 4, 4) given."""
-        pad_from_body = _relative(world_from_pad, world_from_body)
-        near = np.flatnonzero(self._is_near(pad, pad_from_body, i))
-        if not len(near):
-            return pad.overlap.none
-        touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[near], self._radius[i])
-        return replace(touches, env=near[touches.env])
+    def _near(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
+        """Which bodies at poses (n, bodies, 4, 4) may reach the pad's box, (n, bodies)."""
+        at, radius = pad_from_body[..., :3, 3], self._radius
+        near = (at[..., 2] - radius < pad.highest) & (np.abs(at[..., :2]) - radius[:, None] < pad.reach).all(axis=-1)
+        if len(self._planes):
+            # A plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
+            normal, at = pad_from_body[:, self._planes][..., :3, 2], at[:, self._planes]
+            lowest = normal[..., 2] * pad.highest - np.abs(normal[..., :2]) @ pad.reach
+            near[:, self._planes] = lowest < np.vecdot(normal, at)
+        return near
 
     def _add_contacts(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> list[_Contact]:
         """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
-        found, models, weight = [], self._models, self._models.inverse_weight
+        found, models = [], self._models
         some = [datas[b] for b in envs.tolist()]
-        world_from_body = [body_poses(some, body.index) for body in self.bodies]
-        for sensor, (name, pad) in enumerate(self.pads.items()):
-            world_from_pad = site_poses(some, pad.site)
-            for i, body in enumerate(self.bodies):
-                compliance = weight[:, pad.body] + weight[:, body.index]
-                if not compliance.any():
-                    continue  # neither moves
-                touches = self._touches(pad, i, world_from_pad, world_from_body[i])
+        weight = models.inverse_weight[envs]
+        for sensor, (name, pad, world_from_pad, pad_from_body) in enumerate(self._poses(some)):
+            compliance = weight[:, pad.body, None] + weight[:, self._body_index]
+            near = self._near(pad, pad_from_body) & (compliance > 0.0)  # where that is 0 neither moves
+            for i in np.flatnonzero(near.any(axis=0)).tolist():
+                rows = np.flatnonzero(near[:, i])
+                touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[rows, i], float(self._radius[i]))
                 if not len(touches.env):
                     continue
-                rotation, origin = world_from_pad[touches.env, :3, :3], world_from_pad[touches.env, :3, 3]
+                rows = rows[touches.env]
+                rotation, origin = world_from_pad[rows, :3, :3], world_from_pad[rows, :3, 3]
                 frames = _frames((rotation @ touches.normal[..., None])[..., 0], rotation[..., 0])
                 places = (rotation @ touches.centre[..., None])[..., 0] + origin
-                for k, b in enumerate(envs[touches.env].tolist()):
-                    law = self._laws[b].get((name, i))
-                    if law is None:
-                        law = self._laws[b][name, i] = pad.overlap.law(touches, k)
-                    contact = self._forms[name, i]
+                contact = self._forms[name, i]
+                for k, (row, b) in enumerate(zip(rows.tolist(), envs[rows].tolist(), strict=True)):
                     contact.frame[:], contact.pos[:] = frames[k], places[k]
                     friction = float(models.friction_on_gel[b, i])
                     if np.isnan(friction):
                         friction = float(models.gel_friction[b, sensor])
                     depth, softer = float(touches.depth[k]), float(models.gel_stiffness[b, sensor])
-                    self._load(contact, depth, law, softer, float(compliance[b]), friction)
+                    law = self._law(b, name, i, touches, k)
+                    self._load(contact, depth, law, softer, float(compliance[row, i]), friction)
                     if mujoco.mj_addContact(models[b], datas[b], contact) != 0:
                         failed[b] = True
                     else:
                         found.append(_Contact(b, name, int(datas[b].ncon) - 1))
         return found
+
+    def _law(self, env: int, name: str, i: int, touches: Touches, k: int) -> LoadLaw:
+        """Load law of a pad and a body: the k-th that touch, unless it was told before in this control step and reaches as deep."""
+        known = self._laws[env].get((name, i))
+        if known is None or touches.depth[k] > known[1]:
+            known = self._laws[env][name, i] = self.pads[name].overlap.law(touches, k), touches.known_depth(k)
+        return known[0]
 
     def _form(self, name: str, i: int) -> mujoco.MjContact:
         """What all contacts between a pad and a body have in common."""
@@ -273,37 +287,26 @@ class RigidPads:
             site = self.pads[one.sensor].site
             # Place and force are of the start of this step, the site's too until the next step's kinematics.
             rotation, origin = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
-            torque = torque + _cross(contact.pos - origin, force)
+            arm = contact.pos - origin
+            torque = torque + arm[_NEXT] * force[_AFTER] - arm[_AFTER] * force[_NEXT]
             self._wrench[one.sensor][one.env] += np.concatenate([force @ rotation, torque @ rotation])
 
 
-def _radius(body: ComposedBody) -> float:
-    """Of a ball about the body's origin that holds it [m]; inf for a half-space."""
-    low, high = object_bounds(body.parts, np.eye(4))
-    return float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
-
-
 def _relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
-    """``pad_from_body`` (n, 4, 4)."""
-    back = np.swapaxes(world_from_pad[:, :3, :3], 1, 2)
-    found = np.zeros_like(world_from_pad)
-    found[:, :3, :3] = back @ world_from_body[:, :3, :3]
-    found[:, :3, 3] = (back @ (world_from_body[:, :3, 3] - world_from_pad[:, :3, 3])[..., None])[..., 0]
-    found[:, 3, 3] = 1.0
-    return found
+    """``pad_from_body`` (…, 4, 4) of poses that broadcast to the latter's shape."""
+    away = world_from_body.copy()
+    away[..., :3, 3] -= world_from_pad[..., :3, 3]
+    back = np.swapaxes(world_from_pad[..., :3, :3], -1, -2)
+    away[..., :3, :] = back @ away[..., :3, :]
+    return away
 
 
 def _frames(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Rows of right-handed frames whose first is ``normal`` (n, 3) and whose second is near ``along``, (n, 9)."""
-    second = along - (along * normal).sum(axis=1, keepdims=True) * normal
-    second /= np.sqrt(np.square(second).sum(axis=1, keepdims=True))
-    return np.concatenate([normal, second, np.cross(normal, second)], axis=1)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a × b of two vectors; NumPy's own takes twenty times as long for one pair."""
-    (ax, ay, az), (bx, by, bz) = a, b
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    second = along - np.vecdot(along, normal)[:, None] * normal
+    second /= np.sqrt(np.vecdot(second, second))[:, None]
+    third = normal[:, _NEXT] * second[:, _AFTER] - normal[:, _AFTER] * second[:, _NEXT]
+    return np.concatenate([normal, second, third], axis=1)
 
 
 def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:

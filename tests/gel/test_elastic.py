@@ -14,6 +14,7 @@ from raytac.gel.gaussian import GaussianBlur, gaussian_matrix
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid, rest_height
 from raytac.gel.part import primitive
+from raytac.gel.smoothed import ComposedGaussians, LocalField, WholeField
 from raytac.gel.surface import GelSurface
 from raytac.specs.sensor import GelpadSpec
 
@@ -78,6 +79,41 @@ def test_wide_gaussian_agrees_with_scipy() -> None:
     field = np.random.default_rng(1).normal(size=(120, 150)).astype(np.float32)
     expected = gaussian_filter(field.astype(float), 12.0, mode="mirror", truncate=6.0)
     np.testing.assert_allclose(GaussianBlur((120, 150), (1.0, 1.0), 12.0)(field), expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("final", [True, False])
+@pytest.mark.parametrize("corner", [(0, 0), (31, 40), (45, 70)])
+def test_a_field_followed_locally_is_that_of_the_whole_grid(corner: tuple[int, int], final: bool) -> None:
+    """Also where Gaussians are mirrored at the borders, and for any rule by which the field is set anew."""
+    shape, pitch, sigmas = (60, 84), (1e-4, 0.9e-4), (8e-4, 3e-4, 1e-4, 0.4e-4)
+    touched = slice(corner[0], corner[0] + 13), slice(corner[1], corner[1] + 9)
+    window = slice(0, 60), slice(0, 84)
+    rng = np.random.default_rng(3)
+    values = rng.uniform(0.0, 1.0, (13, 9)).astype(np.float32)
+    blurs = [GaussianBlur(shape, pitch, s) for s in sigmas]
+    whole = WholeField(values, touched, window, blurs[:3], blurs[3] if final else None)
+    local = LocalField(values, touched, ComposedGaussians(shape, pitch, sigmas), 3, final, 4.8)
+    for _ in range(3):
+        one, other = whole.smooth(), local.smooth()
+        np.testing.assert_allclose(other, one, atol=5e-6)
+        laid = np.where(rng.uniform(size=one.shape) < 0.5, values, one)
+        whole.impose(laid.copy())
+        local.impose(laid)
+    np.testing.assert_allclose(local.over(window), whole.over(window), atol=1e-5)
+    assert whole.over(window).max() > 0.5
+
+
+def test_small_and_large_contacts_are_smoothed_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    for rule in ("unilateral", "threshold"):
+        for at in ((0.0, 0.0), (6e-3, -4.5e-3)):
+            local = press_sphere(0.1e-3, at=at, rule=rule)
+            with monkeypatch.context() as patch:
+                patch.setattr(ComposedGaussians, "fits", False)
+                whole = press_sphere(0.1e-3, at=at, rule=rule)
+            assert not np.array_equal(local.height, whole.height)  # they went two ways
+            np.testing.assert_allclose(local.height, whole.height, rtol=0.0, atol=1e-5 * 0.6e-3)
+            np.testing.assert_array_equal(local.contact, whole.contact)
+            np.testing.assert_allclose(local.contact_centre, whole.contact_centre, rtol=0.0, atol=1e-9)
 
 
 def test_no_contact_is_exactly_rest() -> None:

@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from raytac.errors import InputError
-from raytac.gel.object_height import object_bounds, object_height
+from raytac.gel.object_height import object_bounds, object_height, object_radius
 from raytac.gel.part import Part, hfield_part, mesh_part, primitive
 from raytac.gel.relief import looks_down, relief_part
 
@@ -260,17 +260,45 @@ def test_environments_with_nodes_of_their_own_are_as_alone(kind: str) -> None:
     assert np.isnan(together[2]).all() and np.isfinite(together[[0, 1, 3]]).any()
 
 
-def test_below_only_leaves_out_what_is_above_it() -> None:
+BODIES = {**GEOMS, "cone": (3e-3, 4e-3, 0.5e-3), "torus": (3e-3, 1e-3)}
+
+
+def body(kind: str) -> Part:
+    if kind != "mesh":
+        return primitive(kind, BODIES[kind])
     import trimesh
 
     ball = trimesh.creation.icosphere(3, 3e-3)
-    for part in (mesh_part(ball.vertices, ball.faces), primitive("sphere", (3e-3,))):
-        pose = np.eye(4)[None].copy()
-        pose[0, 2, 3] = 2.5e-3
-        full, cut = object_height([part], pose, X, Y), object_height([part], pose, X, Y, below=0.0)
-        assert (full < 0.0).any()
-        np.testing.assert_array_equal(full[full < 0.0], cut[full < 0.0])
-        assert (cut[full >= 0.0] >= 0.0).all()
+    return mesh_part(ball.vertices, ball.faces)
+
+
+@pytest.mark.parametrize("kind", [*BODIES, "mesh"])
+def test_below_only_leaves_out_what_is_above_it(kind: str) -> None:
+    part = body(kind)
+    for seed in range(6):
+        pose = random_pose(seed)[None]
+        full = object_height([part], pose, X, Y)
+        below = float(np.quantile(full[np.isfinite(full)], 0.2))
+        cut = object_height([part], pose, X, Y, below=below)
+        assert (full < below).any() and (full > below).any()
+        np.testing.assert_array_equal(full[full < below], cut[full < below])
+        assert (cut[full >= below] >= below).all()
+        alone = object_height([part], pose, X[None], Y[None], below=below)  # as an environment with nodes of its own
+        np.testing.assert_array_equal(full[full < below], alone[full < below])
+
+
+@pytest.mark.parametrize("kind", [*BODIES, "mesh"])
+def test_the_radius_holds_the_object(kind: str) -> None:
+    from dataclasses import replace
+
+    from raytac.physics.part_surface import object_surface
+
+    part = replace(body(kind), object_from_part=random_pose(4))
+    away = float(np.linalg.norm(object_surface([part]).vertices, axis=1).max())
+    assert away <= object_radius([part]) * (1 + 1e-12) and object_radius([part]) < away + np.linalg.norm(random_pose(4)[:3, 3])
+    centred = replace(part, object_from_part=np.eye(4))
+    assert object_radius([centred]) == pytest.approx(np.linalg.norm(object_surface([centred]).vertices, axis=1).max(), rel=0.01)
+    assert object_radius([primitive("plane")]) == np.inf
 
 
 def test_pose_that_is_not_finite_spoils_only_its_environment() -> None:

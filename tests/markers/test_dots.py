@@ -37,6 +37,14 @@ def test_ink_moves_with_its_dot(grid: PadGrid) -> None:
     assert not ink[2].any()
 
 
+def test_dots_over_one_another_leave_the_darkest(grid: PadGrid) -> None:
+    at = 1e-3 * np.array([[0.0, 0.0], [0.35, 0.0], [0.1, 0.3], [0.05, 0.02], [5.0, 0.0]])
+    alone = np.stack([dot_ink(grid, one[None, None], 0.4e-3)[0] for one in at])
+    for order in (slice(None), slice(None, None, -1)):
+        np.testing.assert_array_equal(dot_ink(grid, at[None, order], 0.4e-3)[0], alone.max(axis=0))
+    assert (np.count_nonzero(alone, axis=0) > 2).any()
+
+
 def test_a_dot_over_the_edge_is_cut_off(grid: PadGrid) -> None:
     half = dot_ink(grid, np.array([[[float(grid.x[-1]), 0.0]]]), 0.5e-3)
     whole = dot_ink(grid, np.array([[[0.0, 0.0]]]), 0.5e-3)
