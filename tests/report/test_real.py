@@ -127,6 +127,10 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
         9,
     ]
     assert own == SENSOR.lights
+    doubled = read_data(data, "gelsight_mini", None, OWN_LEDS, 2)[0].lights
+    assert len(doubled.leds) == 2 * len(own.leds)
+    with pytest.raises(InputError, match="split = 2: is for --sides own"):
+        read_data(data, "gelsight_mini", None, FROM_SCRATCH, 2)
 
 
 def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
