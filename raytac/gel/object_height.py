@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -111,15 +112,12 @@ def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray
 def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest x, y (2,) [m] of what is lower than ``below`` of a primitive at poses (n, 4, 4) in boxes ``low`` to ``high``."""
     near, far = low[:, :2].min(axis=0), high[:, :2].max(axis=0)
-    radius = radius_about_origin(part.kind, part.size)
-    if np.isfinite(below) and np.isfinite(radius):
+    above = float(poses[:, 2, 3].min()) - below
+    if above > 0.0:
         # In a ball about the origin, what is lower than a plane beneath its centre lies in a disc.
-        above = np.maximum(poses[:, 2, 3] - below, 0.0)
-        reach = np.sqrt(np.maximum(radius**2 - above * above, 0.0))[:, None]
-        near, far = (
-            np.maximum(near, (poses[:, :2, 3] - reach).min(axis=0)),
-            np.minimum(far, (poses[:, :2, 3] + reach).max(axis=0)),
-        )
+        reach = math.sqrt(max(radius_about_origin(part.kind, part.size) ** 2 - above * above, 0.0))
+        centre = poses[:, :2, 3]
+        near, far = np.maximum(near, centre.min(axis=0) - reach), np.minimum(far, centre.max(axis=0) + reach)
     return near, far
 
 

@@ -65,7 +65,11 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
             level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
             share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
             power: Any = dr.power  # typed as an object in Dr.Jit's stubs
-            linear = power(dr.maximum(level, 0) / 255, response.gamma) - black
+            level = dr.maximum(level, 0)
+            if black == 0:  # the two powers of the level are one another's inverse
+                found.append(power(share, 1 / response.gamma) * level)
+                continue
+            linear = power(level / 255, response.gamma) - black
             found.append(power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255)
         return tuple(found)
 

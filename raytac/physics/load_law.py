@@ -10,6 +10,8 @@ from raytac.specs.sensor import GelpadSpec
 __all__ = ["LoadLaw", "layer_stiffening", "reduced_modulus"]
 
 _TABLE = 512
+_DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
+"""Depths of the table over the pad's thickness."""
 
 
 def reduced_modulus(gelpad: GelpadSpec) -> float:
@@ -57,7 +59,7 @@ class LoadLaw:
         """``gap`` [m]: distance along z from the resting gel to the object at first touch, any shape, >= 0, ``inf`` where there
         is none; ``cell_area`` [m²] of one node."""
         self._gelpad = gelpad
-        self.depth = gelpad.thickness * np.linspace(0.0, 1.0, _TABLE) ** 2
+        self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
         near = np.sort(gap[gap < 0.5 * gelpad.thickness], axis=None)
         # Count half a node where the gap reaches the limit, so that the area grows continuously from 0 instead of in steps.

@@ -20,8 +20,7 @@ _PITCHES = 0.8e-3, 0.4e-3, 0.2e-3
 _ENOUGH = 150
 """Nodes: 96 mm² of the first grid, 24 mm² of the second."""
 _NEAR = 0.75
-"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further. So
-high above the gel bodies are looked at on each grid."""
+"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
 
 _WINDOWS = np.array([8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256])
 """Nodes along a side of the windows that are looked at, beyond which it is the whole line: few sizes, so that environments share them, and
@@ -58,7 +57,8 @@ class PadOverlap:
 
     def __init__(self, gelpad: GelpadSpec) -> None:
         self._gelpad = gelpad
-        self._grids = [_Nodes(gelpad, pitch) for pitch in _PITCHES]
+        # Who does not reach the gel on the last grid does not touch it.
+        self._grids = [_Nodes(gelpad, pitch, _NEAR * pitch if pitch > _PITCHES[-1] else 0.0) for pitch in _PITCHES]
         self.highest = self._grids[-1].highest
 
     @property
@@ -136,11 +136,12 @@ class _Gaps:
 
 
 class _Nodes:
-    def __init__(self, gelpad: GelpadSpec, pitch: float) -> None:
+    def __init__(self, gelpad: GelpadSpec, pitch: float, near: float) -> None:
+        """``near`` [m]: how far above the gel a body may stay and be looked at."""
         grid = make_grid(gelpad, pitch)
         self.x, self.y = grid.x, grid.y
         self.pitch, self.cell = pitch, grid.pitch[0] * grid.pitch[1]
-        self.near = _NEAR * pitch
+        self.near = near
         self.highest = float(grid.rest.max())
         # The rest surface is a sum of a function of x and one of y (``GelpadSpec.sag``), and so are its slopes.
         rest_x, rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)

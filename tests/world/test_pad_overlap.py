@@ -96,7 +96,7 @@ def test_the_law_holds_to_the_depth_that_is_known(depth: float) -> None:
     law, known = OVERLAP.law(found, 0), found.known_depth(0)
     gap = gap_of(part, at)
     whole = LoadLaw(np.maximum(gap + found.depth[0], 0.0), FINE.pitch[0] * FINE.pitch[1], PAD)
-    assert known > 2.0 * depth
+    assert known >= 1.9 * depth
     for share in (0.1, 0.5, 1.0):
         assert law.force(share * known) == pytest.approx(whole.force(share * known), rel=1e-12)
-    assert law.force(4.0 * known) < 0.99 * whole.force(4.0 * known)  # beyond, it is too soft: RigidPads takes it anew
+    assert law.greatest < 0.9 * whole.greatest  # far beyond, it is too soft: RigidPads takes it anew
