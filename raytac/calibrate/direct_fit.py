@@ -11,19 +11,20 @@ of LEDs) can be given as ``extra`` light of every LED, with its slopes by the LE
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from raytac.calibrate.direct_light import LedLight, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
+from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import CEILING, DARKEST, REFERENCE_DISTANCE, LightParameters, darkest
 from raytac.calibrate.photographs import Photographs, decode, encode
 from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
-__all__ = ["HEIGHT", "DirectFit", "ExtraLight", "FitSettings", "FitState", "Light"]
+__all__ = ["HEIGHT", "DirectFit", "FitSettings", "FitState"]
 
 SIGMA = {
     "place": 4.0,
@@ -85,41 +86,6 @@ class FitState:
     p: LightParameters
     slopes: np.ndarray
     circles: np.ndarray
-
-
-@dataclass(frozen=True)
-class Light:
-    """Light of every LED at power 1 by channel, each (L, M, 3): in the pixels of presses, in the same at rest, over the image at rest."""
-
-    pressed: np.ndarray
-    flat: np.ndarray
-    rest: np.ndarray
-
-    @property
-    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All three, in that order."""
-        return self.pressed, self.flat, self.rest
-
-    def plus(self, other: Light, factor: np.ndarray | float = 1.0) -> Light:
-        """The sum with ``factor`` times another; one factor for all, or one an LED (L, 1, 1)."""
-        return Light(*(a + factor * b for a, b in zip(self.parts, other.parts, strict=True)))
-
-
-@dataclass(frozen=True)
-class ExtraLight:
-    """What direct light lacks, to first order about LEDs ``at`` (L, 7), a row as those of ``LightParameters.leds``."""
-
-    light: Light
-    at: np.ndarray
-    by_led: Mapping[int, Light]
-    """Slope of every LED's light by a column of its row; columns that are not named change nothing."""
-
-    def of(self, leds: np.ndarray) -> Light:
-        """The light of LEDs (L, 7)."""
-        found = self.light
-        for k, slope in self.by_led.items():
-            found = found.plus(slope, (leds[:, k] - self.at[:, k])[:, None, None])
-        return found
 
 
 class DirectFit:

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from raytac.calibrate.direct_fit import HEIGHT, REST_FACTOR, SIGMA, DirectFit, ExtraLight, FitSettings, FitState, Light
+from raytac.calibrate.direct_fit import HEIGHT, REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError

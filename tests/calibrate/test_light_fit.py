@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from raytac.calibrate.direct_fit import HEIGHT, DirectFit, ExtraLight, FitSettings, FitState, Light
+from raytac.calibrate.direct_fit import HEIGHT, DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import LightParameters, leds_at_walls, leds_split, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
