@@ -19,12 +19,12 @@ import numpy as np
 from raytac.calibrate.direct_light import LedLight, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import CEILING, DARKEST, REFERENCE_DISTANCE, LightParameters, darkest
+from raytac.calibrate.light_parameters import CEILING, DARKEST, HEIGHT, HEIGHTS, REFERENCE_DISTANCE, LightParameters, darkest
 from raytac.calibrate.photographs import Photographs, decode, encode
 from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
-__all__ = ["HEIGHT", "DirectFit", "FitSettings", "FitState"]
+__all__ = ["DirectFit", "FitSettings", "FitState"]
 
 SIGMA = {
     "place": 4.0,
@@ -47,10 +47,6 @@ ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
-HEIGHT = 6
-"""Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
-HEIGHTS = 0.1, 6.0
-"""Least and greatest [mm]: an LED, and a light guide as high as a Mini's wall (a guess)."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
 
@@ -178,9 +174,13 @@ class DirectFit:
     def sigma(self, p: LightParameters) -> np.ndarray:
         return np.concatenate([np.full(n, SIGMA[name]) for name, n in self.blocks(p)])
 
+    @property
+    def _sees_heights(self) -> bool:
+        """Whether images change with the heights of LEDs: shadows are all that tells them."""
+        return self.extra is not None and HEIGHT in self.extra.by_led
+
     def free(self, p: LightParameters) -> np.ndarray:
-        blind = () if self.extra is not None and HEIGHT in self.extra.by_led else ("height",)
-        held = (*self.settings.fixed, *blind)
+        held = (*self.settings.fixed, *(() if self._sees_heights else ("height",)))
         return np.concatenate([np.full(n, name not in held) for name, n in self.blocks(p)])
 
     def flat(self, state: FitState) -> np.ndarray:
@@ -197,11 +197,13 @@ class DirectFit:
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], heights in ``HEIGHTS``, nothing negative."""
+        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], fitted heights in ``HEIGHTS``, none
+        negative."""
         p, half = state.p, 5e2 * np.array(self.sensor.case.size)
         leds, response = p.leds.copy(), p.response.copy()
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
-        leds[:, HEIGHT] = np.clip(leds[:, HEIGHT], *HEIGHTS)
+        if self._sees_heights:
+            leds[:, HEIGHT] = np.clip(leds[:, HEIGHT], *HEIGHTS)
         reach = 0.02 + _reach(p.template, leds)
         floor = 1e3 * self.sensor.case.floor_z
         leds[:, :3] = np.clip(leds[:, :3], reach + np.array([-half[0], -half[1], floor]), np.array([*half, CEILING]) - reach)

@@ -11,7 +11,17 @@ from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 
-__all__ = ["CEILING", "CHANNELS", "LightParameters", "darkest", "leds_at_walls", "leds_split", "with_parameters"]
+__all__ = [
+    "CEILING",
+    "CHANNELS",
+    "HEIGHT",
+    "HEIGHTS",
+    "LightParameters",
+    "darkest",
+    "leds_at_walls",
+    "leds_split",
+    "with_parameters",
+]
 
 CHANNELS = ("red", "green", "blue")
 SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
@@ -20,6 +30,10 @@ DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
 """Highest z [mm] of an LED: below gel and a support plate of 1 mm, so that ``refraction.model = "slab"`` stays possible."""
+HEIGHT = 6
+"""Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
+HEIGHTS = 0.1, 6.0
+"""Least and greatest that a fit makes it [mm]: an LED, and a light guide as high as a Mini's wall (a guess)."""
 SPREAD = 1.5
 """Width over which an LED is split, over its own: what lies in front of it, and its neighbours, make a row of them (a guess)."""
 REFERENCE_DISTANCE = 10e-3
@@ -80,7 +94,7 @@ class LightParameters:
                     position=(float(row[0] / 1e3), float(row[1] / 1e3), float(row[2] / 1e3)),
                     axis=(float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4]))),
                     lobe=float(row[5]),
-                    size=(led.size[0], float(row[6] / 1e3)),
+                    size=(led.size[0], float(row[HEIGHT] / 1e3)),
                     power=tuple(map(float, power / scale)),
                     glow=float(self.glow[layer] / _GLOW),
                 )
@@ -114,6 +128,8 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
     """A start for a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
+
+    Whether they lie in the case is not checked: a fit moves them there.
 
     Raises:
         InputError: no whole number >= 1.

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from raytac.calibrate.direct_fit import HEIGHT, REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import LightParameters, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
@@ -108,13 +108,15 @@ def extra_light(
     if slopes and options.get("shadows", True):
         direct = {**options, "bounce": False}
         for k, step in STEPS.items():
-            ends = []
-            for way in (step, -step):
-                leds = state.p.leds.copy()
+            ends = [state.p.leds.copy(), state.p.leds.copy()]
+            for leds, way in zip(ends, (-step, step), strict=True):
                 leds[:, k] += way
-                moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds))
-                ends.append(defect(problem, moved, grid, device, direct))
-            found[k] = Light(*((b - a) / (2 * step) for b, a in zip(ends[0].parts, ends[1].parts, strict=True)))
+                if k == HEIGHT:
+                    leds[:, k] = np.maximum(leds[:, k], HEIGHTS[0])  # a height below 0 is that above
+            apart = (ends[1][:, k] - ends[0][:, k])[:, None, None]
+            states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
+            below, above = (defect(problem, moved, grid, device, direct) for moved in states)
+            found[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
     return ExtraLight(defect(problem, state, grid, device, options), state.p.leds.copy(), found)
 
 

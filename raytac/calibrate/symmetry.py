@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.light_parameters import CHANNELS, LightParameters
+from raytac.calibrate.light_parameters import CHANNELS, HEIGHT, LightParameters
 
 __all__ = ["Ties", "side_ties"]
 
-PLACE, AIM, LOBE, HEIGHT, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
+PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
 """How far LEDs are believed to be from mirrored places [mm] and aims [rad], and from the lobe, height [mm] and power [full scales] next to
 them."""
 
@@ -79,7 +79,7 @@ def side_ties(p: LightParameters, size: int) -> Ties:
                     tie(AIM, 0.0, (wide * a + 4, 1), (wide * b + 4, -1))
         for a, b in itertools.pairwise(own):
             tie(LOBE, 0.0, (wide * a + 5, 1), (wide * b + 5, -1))
-            tie(HEIGHT, 0.0, (wide * a + 6, 1), (wide * b + 6, -1))
+            tie(TALL, 0.0, (wide * a + HEIGHT, 1), (wide * b + HEIGHT, -1))
             for c in range(3):
                 first = p.leds.size + c
                 tie(POWER, 0.0, (first + 3 * a, 1), (first + 3 * b, -1))

@@ -47,7 +47,8 @@ class CalibrateArgs(SolverOptions):
     """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
     these were fitted to photographs that are tested on, errors are not of held-out presses."""
     split: int = 1
-    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side, as LEDs behind a diffuser light like a row."""
+    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
+    a diffuser light like a row."""
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False

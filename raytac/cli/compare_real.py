@@ -37,7 +37,8 @@ class CompareRealArgs(CommonOptions):
     """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
     these were fitted to photographs that are tested on, errors are not of held-out presses."""
     split: int = 1
-    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side, as LEDs behind a diffuser light like a row."""
+    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
+    a diffuser light like a row."""
     regions: bool = True
     """Also fit to one half of the pad and to shallow presses, and test on the others."""
     ablations: bool = True

@@ -15,8 +15,8 @@ from raytac.specs import SensorSpec, load_sensor, with_lights
 __all__ = ["FROM_SCRATCH", "INNER", "OWN_LEDS", "prior_of", "read_data"]
 
 FROM_SCRATCH = "12,8,9"
-"""Numbers of LEDs that the figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own lights were
-fitted to photographs: begun from these, presses that are held out would not be new to it."""
+"""Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
+lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
 INNER = "inner"
 """Strength of priors: chosen by cross-validation within the presses that are fitted to."""

@@ -72,7 +72,7 @@ ABLATIONS: dict[str, Ablation] = {
     # The case's glow is rendered with the bounce, so it goes too: to be held against no_glow.
     "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), options={"bounce": False}),
     "other_shadows": Ablation(other_shadows=True),
-    "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4))),
+    "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4)), fixed=("height",)),
     "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
     "no_glow": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",)),
     "flat_pad": Ablation(sensor=_flat),

@@ -107,6 +107,7 @@ def run_calibrate_optics(
             "starts": starts,
             "rounds": rounds,
             "prior": models.prior,
+            "prior_asked": "inner" if prior is None else prior,
             "leds": len(sensor.lights.leds),
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             "presses.fitted": int((~held).sum()),
