@@ -116,19 +116,21 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, or a sensor that cannot
             work (see ``validate_sensor``).
     """
-    return _read_sensor(find_file("sensor", name_or_path), may_have_base=True)
+    return _read_sensor(find_file("sensor", name_or_path))
 
 
-def _read_sensor(path: Path, *, may_have_base: bool) -> SensorSpec:
-    """A sensor file; with ``base``, that sensor with every table and file that this one gives in place of its own."""
+def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
+    """A sensor file; with ``base``, that sensor with every table and file that this one gives in place of its own. ``above``: files that
+    are built on this one."""
     top = read_toml(path)
     parts = {name: schema for name, schema in SENSOR_SCHEMA.items() if name}
     base = None
     if "base" in top.data:
-        if not may_have_base:
-            raise top.error("must be a sensor that has no base itself", "base", top.data["base"])
         named = top.read_one("base", SENSOR_SCHEMA[""]["base"])
-        base = _read_sensor(find_file("sensor", named, base=path.parent), may_have_base=False)
+        found, above = find_file("sensor", named, base=path.parent), (*above, path.resolve())
+        if found.resolve() in above:
+            raise top.error("must be a sensor that is not built on this one", "base", top.data["base"])
+        base = _read_sensor(found, above)
     schema = dict(SENSOR_SCHEMA[""])
     if base is not None:
         schema["lights"] = Text(default="")

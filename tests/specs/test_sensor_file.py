@@ -331,3 +331,31 @@ def test_led_corners_are_the_rectangle_of_the_led(axis: tuple[float, float, floa
         first[0] * second[1] - first[1] * second[0],
     ]
     assert [n / (a * b) for n in normal] == pytest.approx(unit, abs=1e-8)
+
+
+def _on(folder: Path, name: str, base: str, rest: str = "") -> Path:
+    path = folder / f"{name}.toml"
+    path.write_text(f'base = "{base}"\n{rest}', "utf-8")
+    return path
+
+
+def test_a_sensor_is_its_base_but_for_what_it_gives(tmp_path: Path) -> None:
+    """The last file that gives a table wins, over two bases: what ``raytac calibrate`` writes for a sensor that has one."""
+    coat = "[coat]\nreflectance = [0.3, 0.3, 0.3]\nspecular = 0.0\nroughness = 0.4\n"
+    _on(tmp_path, "first", "gelsight_mini", coat)
+    second = load_sensor(_on(tmp_path, "second", "first.toml", 'lights = "gelsight_mini_calibrated"\n'))
+    mini, calibrated = load_sensor("gelsight_mini"), load_sensor("gelsight_mini_calibrated")
+    assert second.coat.reflectance == (0.3, 0.3, 0.3) != mini.coat.reflectance
+    assert second.lights == calibrated.lights != mini.lights
+    assert (second.gelpad, second.camera, second.response) == (mini.gelpad, mini.camera, mini.response)
+    assert (second.name, second.source) == ("second", tmp_path / "second.toml")
+
+
+@pytest.mark.parametrize("ring", [("own",), ("one", "two"), ("one", "two", "three")])
+def test_bases_that_go_round_are_refused(tmp_path: Path, ring: tuple[str, ...]) -> None:
+    for k, name in enumerate(ring):
+        _on(tmp_path, name, f"{ring[(k + 1) % len(ring)]}.toml")
+    with pytest.raises(SpecError, match="must be a sensor that is not built on this one"):
+        load_sensor(tmp_path / f"{ring[0]}.toml")
+    with pytest.raises(SpecError, match="not built on this one"):
+        load_sensor(_on(tmp_path, "outside", f"{ring[-1]}.toml"))
