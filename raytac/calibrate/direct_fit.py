@@ -148,8 +148,7 @@ class DirectFit:
 
     def total(self, p: LightParameters, light: Light) -> list[np.ndarray]:
         """Linear light (M, 3) in the pixels of presses, in the same at rest, over the image at rest."""
-        parts = self._with_extra(p, light).parts
-        return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in parts]
+        return _summed(p, self._with_extra(p, light))
 
     def _with_extra(self, p: LightParameters, light: Light) -> Light:
         return light if self.extra is None else light.plus(self.extra.of(p.leds))
@@ -242,7 +241,8 @@ class DirectFit:
         geometries = (seen, self.flat_geometry, self.rest_geometry)
         leds = [[led_light(g, led, REFERENCE_DISTANCE) for led in p.leds] for g in geometries]
         light = Light(*(self._led_layers(p, g, [one.light for one in part]) for g, part in zip(geometries, leds, strict=True)))
-        total = self.total(p, light)
+        whole = self._with_extra(p, light)
+        total = _summed(p, whole)
         image, rest = self.images(p, total)
         gains = self._gains(p, image, rest, total)
         (count, wide), slopes = p.leds.shape, len(state.slopes)
@@ -260,10 +260,9 @@ class DirectFit:
                 of_extra = [part[led] for part in by_led[k].parts] if k in by_led else none
                 own = [part[led].by_led[k][:, None] if k < len(part[led].by_led) else 0.0 for part in leds]
                 column(wide * led + k, *((a + b) * p.power[led] for a, b in zip(own, of_extra, strict=True)))
-        parts = self._with_extra(p, light).parts
         for led in range(count):
             for c in range(3):
-                column(p.leds.size + 3 * led + c, *(part[led] * np.eye(3)[c] for part in parts))
+                column(p.leds.size + 3 * led + c, *(part[led] * np.eye(3)[c] for part in whole.parts))
         for k in range(3):
             power = p.power[p.layer == k].sum(0) * self.even_gain
             column(first + k, *(case_light(g)[:, None] * power for g in geometries))
@@ -394,6 +393,11 @@ def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray
             found.append(np.stack([np.full(len(chosen), k), row[chosen], column[chosen]]))
     press, row, column = np.concatenate(found, axis=1)
     return press, row, column
+
+
+def _summed(p: LightParameters, light: Light) -> list[np.ndarray]:
+    """All LEDs at their powers, (M, 3) of each part of ``light``."""
+    return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in light.parts]
 
 
 def _reach(lights: LightsSpec, leds: np.ndarray) -> np.ndarray:

@@ -20,7 +20,10 @@ from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state
 from raytac.errors import InputError
 from raytac.specs import SensorSpec
 
-__all__ = ["STRENGTHS", "choose_strength"]
+__all__ = ["INNER", "STRENGTHS", "choose_strength"]
+
+INNER = "inner"
+"""What a choice within the presses that are fitted to is called, beside the names of ``STRENGTHS``."""
 
 STRENGTHS: dict[str, dict[str, float]] = {
     "free": {"prior": 30.0, "ties": 0.0, "rest_weight": 0.3},

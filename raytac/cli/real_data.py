@@ -8,7 +8,7 @@ from raytac.calibrate.circles import with_found_circles
 from raytac.calibrate.light_parameters import leds_at_walls, leds_split
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
-from raytac.calibrate.prior_choice import STRENGTHS
+from raytac.calibrate.prior_choice import INNER, STRENGTHS
 from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
 
@@ -18,8 +18,6 @@ FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
 lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
-INNER = "inner"
-"""Strength of priors: chosen by cross-validation within the presses that are fitted to."""
 
 
 def prior_of(name: str) -> str | None:

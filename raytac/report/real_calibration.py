@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.prior_choice import INNER
 from raytac.calibrate.ray_fit import Fitted
 from raytac.device import resolve_device
 from raytac.errors import InputError
@@ -107,7 +108,7 @@ def run_calibrate_optics(
             "starts": starts,
             "rounds": rounds,
             "prior": models.prior,
-            "prior_asked": "inner" if prior is None else prior,
+            "prior_asked": INNER if prior is None else prior,
             "leds": len(sensor.lights.leds),
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             "presses.fitted": int((~held).sum()),

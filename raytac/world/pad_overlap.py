@@ -61,11 +61,6 @@ class PadOverlap:
         self._grids = [_Nodes(gelpad, pitch, _NEAR * pitch if pitch > _PITCHES[-1] else 0.0) for pitch in _PITCHES]
         self.highest = self._grids[-1].highest
 
-    @property
-    def none(self) -> Touches:
-        """No overlap."""
-        return _joined([])
-
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
         """How a body at poses (B, 4, 4) overlaps the pad. ``radius`` [m] of a ball about the body's origin that holds it."""
         found: list[Touches] = []
