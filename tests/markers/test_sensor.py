@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
-from raytac.errors import InputError, SpecError
+from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene
@@ -146,13 +146,10 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
     assert f"held out: normal {float(metrics['held_out.fots.normal.mean_um']):.1f} um" in motion.provenance
 
 
-def test_a_base_must_not_have_a_base(tmp_path: Path) -> None:
+def test_a_gel_of_other_markers_is_its_base_otherwise(tmp_path: Path) -> None:
     from raytac.specs import load_sensor
 
     path = tmp_path / "mine.toml"
-    path.write_text('base = "gelsight_mini_7x9"\n')
-    with pytest.raises(SpecError, match="no base itself"):
-        load_sensor(path)
     path.write_text('base = "gelsight_mini"\n[markers]\nrows = 2\ncolumns = 3\npitch_mm = [3, 3]\nradius_mm = 0.5\n')
     sensor = load_sensor(path)
     assert (sensor.name, sensor.markers.rows, sensor.gelpad) == ("mine", 2, load_sensor("gelsight_mini").gelpad)
