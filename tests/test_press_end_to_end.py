@@ -65,6 +65,13 @@ def test_rgb_is_the_exr_through_the_cameras_response(folder: Path) -> None:
     cx, cy = (scale * c for c in sensor.camera.principal_point)
     r2 = ((u - cx) ** 2 + (v - cy) ** 2) / (0.25 * (SIZE[0] ** 2 + SIZE[1] ** 2))
     gain = response.exposure * (1 + a1 * r2 + a2 * r2**2 + a3 * r2**3)[..., None] * np.array(response.white_balance)
+    x, y = 2 * u / SIZE[0] - 1, 2 * v / SIZE[1] - 1
+    for c, found in enumerate(response.shading):
+        degree = next(n for n in range(20) if (n + 1) * (n + 2) // 2 == len(found))
+        table, rest = np.zeros((degree + 1, degree + 1)), list(found)
+        for i in range(degree + 1):
+            table[i, : degree + 1 - i], rest = rest[: degree + 1 - i], rest[degree + 1 - i :]
+        gain[..., c] *= np.exp(np.polynomial.chebyshev.chebval2d(x, y, table))
     value = np.clip(gain * linear + response.black_level, 0, 1)
     rgb = read_png(folder / "rgb.png")
     assert np.abs(rgb - 255 * value ** (1 / response.gamma)).max() <= 1.0

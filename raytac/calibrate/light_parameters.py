@@ -10,6 +10,7 @@ import numpy as np
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
+from raytac.specs.sensor_check import led_corners
 
 __all__ = [
     "CEILING",
@@ -114,10 +115,12 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
-    """The sensor with fitted lights and response; ``background`` [levels] as for ``LightParameters.of``. Not checked."""
+    """The sensor with fitted lights and response, without colour shading; ``background`` [levels] as for ``LightParameters.of``. Not
+    checked."""
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
-    response = dataclasses.replace(sensor.response, gamma=gamma, black_level=tuple(map(float, black)), vignetting=(a1, a2, 0.0))
+    fitted = {"gamma": gamma, "black_level": tuple(map(float, black)), "vignetting": (a1, a2, 0.0)}
+    response = dataclasses.replace(sensor.response, **fitted, shading_red=(), shading_green=(), shading_blue=())
     return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 
@@ -129,7 +132,7 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
     """A start for a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
 
-    Whether they lie in the case is not checked: a fit moves them there.
+    What would stick out of the case's walls is moved inside.
 
     Raises:
         InputError: no whole number >= 1.
@@ -138,20 +141,22 @@ def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
         raise InputError("split", value=count, rule="must be a whole number >= 1")
     if count == 1:
         return sensor.lights
-    leds = []
+    half, leds = 0.5 * np.array(sensor.case.size), []
     for led in sensor.lights.leds:
         width, along = SPREAD * led.size[0], np.array(led.edges[0])
         for k in range(count):
             place = np.array(led.position) + ((k + 0.5) / count - 0.5) * width * along
-            leds.append(
-                dataclasses.replace(
-                    led,
-                    name=f"{led.name}_{k + 1}",
-                    position=tuple(map(float, place)),
-                    size=(width / count, led.size[1]),
-                    power=tuple(p / count for p in led.power),
-                )
+            part = dataclasses.replace(
+                led,
+                name=f"{led.name}_{k + 1}",
+                position=tuple(map(float, place)),
+                size=(width / count, led.size[1]),
+                power=tuple(p / count for p in led.power),
             )
+            corners = np.array(led_corners(part))[:, :2]
+            inwards = np.maximum(-half - corners.min(0), 0) - np.maximum(corners.max(0) - half, 0)
+            x, y, z = part.position
+            leds.append(dataclasses.replace(part, position=(x + float(inwards[0]), y + float(inwards[1]), z)))
     return dataclasses.replace(sensor.lights, leds=tuple(leds))
 
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.optics.camera import Pinhole
+from raytac.optics.shading import shading_gain
 from raytac.specs.sensor import ResponseSpec
 
 __all__ = ["Response"]
 
 
 class Response:
-    """u8 = round(255 · clip(gain · white balance · exposure · vignette · L + black)^(1/γ)), one formula for device and host."""
+    """u8 = round(255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ)), one formula for device and host."""
 
     def __init__(self, spec: ResponseSpec, camera: Pinhole) -> None:
         self.spec = spec
@@ -24,7 +25,8 @@ class Response:
         r2 = (u**2 + v**2) / ((width**2 + height**2) / 4)
         a1, a2, a3 = spec.vignetting
         vignette = 1 + r2 * (a1 + r2 * (a2 + r2 * a3))
-        self.scale = (spec.exposure * vignette[..., None] * np.asarray(spec.white_balance)).astype(np.float32)
+        even = spec.exposure * vignette[..., None] * np.asarray(spec.white_balance)
+        self.scale = (even * shading_gain(spec.shading, camera.resolution)).astype(np.float32)
         """Linear gain per pixel and channel, (H, W, 3); a flat field multiplies it."""
         self.black = np.asarray(spec.black_level, dtype=np.float32)
 

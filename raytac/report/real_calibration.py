@@ -13,7 +13,7 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import INNER
-from raytac.calibrate.ray_fit import Fitted
+from raytac.calibrate.shading_fit import with_shading
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
@@ -21,12 +21,14 @@ from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.mlp import MlpMode
 from raytac.optics.mlp_weights import save_mlp
+from raytac.optics.raytrace import RayTracer
 from raytac.optics.taxim import TaximMode
 from raytac.report.real_models import SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.files import available, find_file
 from raytac.specs.lights_text import lights_text
+from raytac.specs.response_text import response_text
 
 __all__ = ["OUTLIER", "run_calibrate_optics", "sensor_text"]
 
@@ -123,6 +125,15 @@ def run_calibrate_optics(
             circles[held] = models.circles(test)
             tested = press_scores(sensor, images_of(mode, sensor, test, circles[held], fitted.state.slopes), test)
             metrics |= {f"held_out.{key}": value for key, value in summary(tested).items()}
+        shaded = fitted.sensor
+        if model == "raytrace":
+            shaded = with_shading(fitted.sensor, models.rest, device=device, options=models.options)
+            height, width = models.rest.shape[:2]
+            alone = RayTracer(shaded, resolution=(width, height), device=device, **models.options)
+            for part, chosen, some in (("fitted", ~held, train), ("held_out", held, test)):
+                if chosen.any():
+                    scored = press_scores(sensor, images_of(alone, sensor, some, circles[chosen], fitted.state.slopes), some)
+                    metrics |= {f"{part}.no_photograph.{key}": value for key, value in summary(scored).items()}
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
         errors = np.array([score["contact_mae"] for score in own])
         bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
@@ -136,7 +147,7 @@ def run_calibrate_optics(
                 f"Fitted to {int((~held).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
             )
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
-            (folder / "sensor.toml").write_text(sensor_text(sensor, fitted), "utf-8")
+            (folder / "sensor.toml").write_text(sensor_text(sensor, shaded), "utf-8")
         elif isinstance(mode, TaximMode):
             save_calibration(mode.table, folder)
         elif isinstance(mode, MlpMode):
@@ -153,16 +164,7 @@ def _is_shipped(file: Path) -> bool:
     return file.stem in available("sensor") and file.resolve() == find_file("sensor", file.stem).resolve()
 
 
-def sensor_text(sensor: SensorSpec, fitted: Fitted) -> str:
-    """A sensor file on the base of ``sensor`` with the fitted response and lights.toml beside it."""
-    response = fitted.sensor.response
+def sensor_text(sensor: SensorSpec, fitted: SensorSpec) -> str:
+    """A sensor file on the base of ``sensor`` with the response of ``fitted`` and lights.toml beside it."""
     base = sensor.name if sensor.source is None or _is_shipped(sensor.source) else str(sensor.source.resolve())
-
-    def row(values: tuple[float, ...]) -> str:
-        return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
-
-    return (
-        f'base = "{base}"\nlights = "lights.toml"\n\n[response]\nexposure = {response.exposure:.6g}\n'
-        f"white_balance = {row(response.white_balance)}\ngamma = {response.gamma:.6g}\nblack_level = {row(response.black_level)}\n"
-        f"vignetting = {row(response.vignetting)}\n"
-    )
+    return f'base = "{base}"\nlights = "lights.toml"\n\n{response_text(fitted.response)}'

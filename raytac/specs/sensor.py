@@ -111,7 +111,7 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class ResponseSpec:
-    """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · L + black)^(1/γ)."""
+    """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ)."""
 
     exposure: float
     """Common gain from radiance [W/(m² sr), relative] to full scale 1."""
@@ -124,6 +124,17 @@ class ResponseSpec:
     vignetting: Vec3
     """Coefficients (a1, a2, a3) of 1 + a1 r² + a2 r⁴ + a3 r⁶ with r = distance from the principal point over half the
     image diagonal; all 0 is none (cos⁴ fall-off of the pinhole is not added)."""
+    shading_red: tuple[float, ...] = ()
+    """Colour shading, a smooth gain of the red channel over the image: coefficients c_ij of exp Σ c_ij T_i(x) T_j(y), i + j ≤ n, with
+    Chebyshev's polynomials T and x, y from −1 to 1 over the image's width and height, in the order c_00, c_01 … c_0n, c_10 …:
+    (n + 1)(n + 2)/2 of them for the degree n, or none for a gain of 1."""
+    shading_green: tuple[float, ...] = ()
+    shading_blue: tuple[float, ...] = ()
+
+    @property
+    def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+        """Coefficients by channel."""
+        return self.shading_red, self.shading_green, self.shading_blue
 
 
 @dataclass(frozen=True)

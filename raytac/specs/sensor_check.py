@@ -7,8 +7,10 @@ import math
 from raytac.errors import SpecError
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3
 
-__all__ = ["check_slab", "validate_sensor"]
+__all__ = ["check_slab", "led_corners", "validate_sensor"]
 
+_LOG_GAIN = 20.0
+"""Most that the logarithm of a colour shading's gain may be."""
 _SLACK = 1e-9
 """Tolerance of geometric comparisons [m]: a part may touch the case or the gel."""
 
@@ -18,14 +20,16 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
     Raises:
         SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the
-            vignette leaves no light; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case; with
-            ``refraction.model = "slab"``, camera or LED do not lie below the slab's face to the air.
+            vignette leaves no light; colour shading has a wrong number of coefficients or might overflow; markers lie off the pad; an
+            LED lies in the gel, above the dome, or outside the case; with ``refraction.model = "slab"``, camera or LED do not lie
+            below the slab's face to the air.
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
     check_slab(sensor)
     _check_camera(sensor)
     _check_vignetting(sensor)
+    _check_shading(sensor)
     _check_markers(sensor)
     for index, led in enumerate(sensor.lights.leds):
         _check_led(sensor, index, led)
@@ -119,6 +123,17 @@ def _check_vignetting(sensor: SensorSpec) -> None:
     if min(1 + s * (a1 + s * (a2 + s * a3)) for s in (farthest**2, *lowest)) <= 0:
         rule = "1 + a1 r² + a2 r⁴ + a3 r⁶ must stay above 0 over the whole image"
         raise _error(sensor, "response.vignetting", list(sensor.response.vignetting), rule)
+
+
+def _check_shading(sensor: SensorSpec) -> None:
+    for channel, found in zip(("red", "green", "blue"), sensor.response.shading, strict=True):
+        degree = (math.isqrt(8 * len(found) + 1) - 3) // 2
+        if found and (degree + 1) * (degree + 2) // 2 != len(found):
+            rule = f"must have (n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not {len(found)}"
+            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
+        if sum(map(abs, found)) > _LOG_GAIN:
+            rule = f"absolute values must not sum to more than {_LOG_GAIN:g}: the gain is the exponential of the polynomial"
+            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
 
 
 def _real_roots(a: float, b: float, c: float) -> tuple[float, ...]:

@@ -23,7 +23,7 @@ from raytac.specs.sensor import (
     SensorSpec,
 )
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.toml import Integer, Number, Schema, Table, Text, read_toml
+from raytac.specs.toml import ANY, Integer, Number, Schema, Table, Text, read_toml
 
 __all__ = ["LED_SCHEMA", "SENSOR_SCHEMA", "load_lights", "load_sensor", "with_lights"]
 
@@ -63,6 +63,9 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "gamma": Number("[0.5, 5]"),
         "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
         "vignetting": Number("[-10, 10]", length=3, default=(0.0, 0.0, 0.0)),
+        "shading_red": Number("[-5, 5]", length=ANY, default=()),
+        "shading_green": Number("[-5, 5]", length=ANY, default=()),
+        "shading_blue": Number("[-5, 5]", length=ANY, default=()),
     },
     "markers": {
         "rows": Integer("[0, 200]"),

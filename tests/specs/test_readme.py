@@ -11,7 +11,7 @@ import pytest
 from raytac.assets import asset_root
 from raytac.specs.press_file import OBJECT_SCHEMA, POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
 from raytac.specs.sensor_file import LED_SCHEMA, SENSOR_SCHEMA
-from raytac.specs.toml import Integer, Number, Schema, Text
+from raytac.specs.toml import ANY, Integer, Number, Schema, Text
 
 README = asset_root("scenes") / "README.md"
 
@@ -25,7 +25,8 @@ def ranged(schema: Schema) -> Iterator[tuple[str, str]]:
     """Keys of a schema with their range as the tables write it."""
     for key, field in schema.items():
         if not isinstance(field, Text):
-            yield key, f"{field.length} × `{field.interval}`" if field.length else f"`{field.interval}`"
+            many = "× " if field.length == ANY else f"{field.length} × " if field.length else ""
+            yield key, f"{many}`{field.interval}`"
 
 
 def row(text: str, key: str) -> str:

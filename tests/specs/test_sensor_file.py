@@ -113,6 +113,10 @@ SENSOR_ERRORS: list[tuple[str, Any, str]] = [
     ("response.vignetting", [-4.0, 4.0, 0.0], "must stay above 0 over the whole image"),  # 0 at r² = 1/2 alone
     ("response.vignetting", [0.0, 0.0, -1.0], "must stay above 0 over the whole image"),
     ("response.vignetting", [-9.0, 10.0, 1e-300], "must stay above 0 over the whole image"),
+    ("response.shading_red", [0.1, 0.2], "(n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not 2"),
+    ("response.shading_green", [], "must be a list of numbers, each in [-5, 5]"),
+    ("response.shading_blue", [0.1, 5.1, 0.0], "must be a list of numbers, each in [-5, 5]"),
+    ("response.shading_blue", [5.0, -5.0, 5.0, -5.0, 5.0, -5.0], "absolute values must not sum to more than 20"),
     ("markers.rows", 7, "must both be 0 or both be positive"),
     ("refraction.model", "fresnel", "must be a known name"),
     ("refraction.ior", 0.9, "must be a number in [1, 3]"),
