@@ -13,7 +13,6 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import INNER
-from raytac.calibrate.shading_fit import with_shading
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
@@ -23,7 +22,7 @@ from raytac.optics.mlp import MlpMode
 from raytac.optics.mlp_weights import save_mlp
 from raytac.optics.raytrace import RayTracer
 from raytac.optics.taxim import TaximMode
-from raytac.report.real_models import SHADOW_TABLES, check_fit, fit_models, images_of
+from raytac.report.real_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.files import available, find_file
@@ -90,7 +89,7 @@ def run_calibrate_optics(
                 sensor,
                 train,
                 settings=settings,
-                modes=(model,),
+                modes=(model, ALONE) if model == "raytrace" else (model,),
                 device=device,
                 seed=seed,
                 starts=starts,
@@ -119,23 +118,17 @@ def run_calibrate_optics(
         }
         circles = shots.circles.copy()
         circles[~held] = fitted.state.circles
-        own = press_scores(sensor, images_of(mode, sensor, train, circles[~held], fitted.state.slopes), train)
-        metrics |= {f"fitted.{key}": value for key, value in summary(own).items()}
         if held.any():
             circles[held] = models.circles(test)
-            tested = press_scores(sensor, images_of(mode, sensor, test, circles[held], fitted.state.slopes), test)
-            metrics |= {f"held_out.{key}": value for key, value in summary(tested).items()}
-        shaded = fitted.sensor
-        if model == "raytrace":
-            shaded = with_shading(fitted.sensor, models.rest, device=device, options=models.options)
-            height, width = models.rest.shape[:2]
-            alone = RayTracer(shaded, resolution=(width, height), device=device, **models.options)
+        scores: dict[str, list[dict[str, float]]] = {}
+        for name, one in models.modes.items():
             for part, chosen, some in (("fitted", ~held, train), ("held_out", held, test)):
                 if chosen.any():
-                    scored = press_scores(sensor, images_of(alone, sensor, some, circles[chosen], fitted.state.slopes), some)
-                    metrics |= {f"{part}.no_photograph.{key}": value for key, value in summary(scored).items()}
+                    key = part if name == model else f"{part}.alone"
+                    scores[key] = press_scores(sensor, images_of(one, sensor, some, circles[chosen], fitted.state.slopes), some)
+                    metrics |= {f"{key}.{measure}": value for measure, value in summary(scores[key]).items()}
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
-        errors = np.array([score["contact_mae"] for score in own])
+        errors = np.array([score["contact_mae"] for score in scores["fitted"]])
         bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
         metrics["outliers"] = ", ".join(bad)
         for name in bad:
@@ -147,7 +140,9 @@ def run_calibrate_optics(
                 f"Fitted to {int((~held).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
             )
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
-            (folder / "sensor.toml").write_text(sensor_text(sensor, shaded), "utf-8")
+            alone = models.modes[ALONE]
+            assert isinstance(alone, RayTracer)
+            (folder / "sensor.toml").write_text(sensor_text(sensor, alone.sensor), "utf-8")
         elif isinstance(mode, TaximMode):
             save_calibration(mode.table, folder)
         elif isinstance(mode, MlpMode):

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from raytac.io.metrics import Metric
+from raytac.report.real_models import ALONE
 
 __all__ = ["draw", "table_text"]
 
 _ROWS = (
     ("raytrace", "ray tracer"),
+    (ALONE, "ray tracer, no photograph"),
     ("taxim", "table"),
     ("mlp", "network"),
     ("phong", "Phong"),
@@ -60,13 +62,14 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
 
 
 def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
-    """A row a press: the photograph, every mode, and every mode's signed error (grey is none), cut to the contact and what is about it."""
+    """A row a press: the photograph, every mode that has the one at rest, and its signed error (grey is none), cut to what is about the
+    contact."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    modes = [(key, name) for key, name in _ROWS if key in images[0] and key != "background"]
+    modes = [(key, name) for key, name in _ROWS if key in images[0] and key not in (ALONE, "background")]
     columns = ["photograph", *(name for _, name in modes), *(f"{name}, error × 4" for _, name in modes)]
     with plt.rc_context({"font.size": 6.5}):
         figure, axes = plt.subplots(

@@ -17,6 +17,7 @@ from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
+from raytac.calibrate.shading_fit import with_shading
 from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.device import DEVICES
 from raytac.errors import InputError
@@ -28,9 +29,11 @@ from raytac.optics.raytrace import RayTracer
 from raytac.optics.taxim import TaximMode
 from raytac.specs import SensorSpec
 
-__all__ = ["MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
+__all__ = ["ALONE", "MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
 
-MODES = ("raytrace", "taxim", "mlp", "phong")
+ALONE = "raytrace_alone"
+"""The fitted ray tracer without a photograph: colour shading (``with_shading``) in place of the flat field, as a sensor file has it."""
+MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
 SHADOW_TABLES = ("none", "raytrace")
 """Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
@@ -148,6 +151,9 @@ def fit_models(
     for name in modes:
         if name == "raytrace":
             built[name] = raytrace_mode(fitted.sensor, background, device, options)
+        elif name == ALONE:
+            shaded = with_shading(fitted.sensor, background, device=device, options=options)
+            built[name] = RayTracer(shaded, resolution=(background.shape[1], background.shape[0]), device=device, **options)
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":

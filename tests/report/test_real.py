@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.splits import by_press
 from raytac.cli import main
@@ -16,7 +18,10 @@ from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
 from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
 from raytac.errors import InputError
+from raytac.gel.pad import make_grid
+from raytac.gel.surface import GelSurface
 from raytac.io.png import write_png
+from raytac.optics.raytrace import RayTracer
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings
 from raytac.report.real_calibration import run_calibrate_optics
@@ -111,6 +116,37 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
     assert not out.exists()
 
 
+def test_calibrate_writes_a_sensor_that_needs_no_photograph(tmp_path: Path) -> None:
+    """Images of the shipped Mini itself as data: what is written renders held-out presses, and the pad at rest, to about a level."""
+    data, out, grid = tmp_path / "data", tmp_path / "out", make_grid(SENSOR.gelpad, 0.12e-3)
+    data.mkdir()
+    places = [(x, y) for y in (70, 120, 170) for x in (80, 160, 240)]
+    circles = np.array([(x, y, 26.0 + k % 3 * 3) for k, (x, y) in enumerate(places)])
+    tracer = RayTracer(SENSOR, device="cpu", shadows=False)
+    photographs = {"background": tracer.render(GelSurface.at_rest(grid)).rgb}
+    for k in range(len(circles)):
+        surface = press_surface(SENSOR, grid, circles[k : k + 1], np.array([3.155e-3]), RIGID_PAD)
+        photographs[f"6.310mm_{k:02d}"] = tracer.render(surface).rgb
+    for name, rgb in photographs.items():
+        assert rgb is not None
+        write_png(data / f"{name}.png", rgb[0])
+    rows = [f"6.310mm,{k},{x},{y},{r}" for k, (x, y, r) in enumerate(circles)]
+    (data / "labels.csv").write_text("\n".join(["diameter,index,cx_px,cy_px,r_px", *rows]) + "\n", "utf-8")
+
+    args = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tied", "--holdout", "3", "--device", "cpu"]
+    assert main(["calibrate", str(data), *args, "--out", str(out)]) == 0
+    metrics = json.loads((out / "metrics.json").read_text("utf-8"))
+    assert (metrics["presses.fitted"], metrics["presses.held_out"]) == (6, 3)
+    for key in ("fitted", "fitted.alone", "held_out", "held_out.alone"):
+        assert metrics[f"{key}.contact_mae"] < 1.5 and metrics[f"{key}.ring_mae"] < 1.0, (key, metrics)
+    written = load_sensor(out / "sensor.toml")
+    assert all(len(found) == 28 for found in written.response.shading)
+    rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(grid)).rgb
+    assert rest is not None and photographs["background"] is not None
+    off = np.abs(rest[0].astype(int) - photographs["background"][0])
+    assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())
+
+
 def test_folds_test_every_press_once() -> None:
     splits = by_press(30, 5)
     assert sorted(np.concatenate([test for _, test in splits])) == list(range(30))
@@ -159,7 +195,7 @@ def test_a_comparison_of_unknown_settings_cannot_be_set_up(name: str) -> None:
 @pytest.mark.parametrize("name", [*WRONG, "modes", "fixed", "shadow_table"])
 def test_a_fit_of_unknown_names_is_refused_at_once(name: str) -> None:
     own: dict[str, Any] = {
-        "modes": (("raytrace", "ray"), "raytrace, taxim, mlp, phong"),
+        "modes": (("raytrace", "ray"), "raytrace, raytrace_alone, taxim, mlp, phong"),
         "fixed": (("gama",), "gamma, stray"),
         "shadow_table": ("pins", "none, raytrace"),
     }
