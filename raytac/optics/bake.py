@@ -2,7 +2,8 @@
 
 A real calibration presses a ball some fifty times and finds its outline by hand. Here the surface is known, so every pixel that a press
 moved is a sample: its slope, from the front step that the table mode itself uses, names the bin; its place and its difference from the
-image at rest are what the bin's polynomial is fitted to (docs/taxim-table.md, *Baked from the ray tracer*).
+image at rest are what the bin's polynomial is fitted to, for touched pixels and for those around them apart (docs/taxim-table.md, *Baked
+from the ray tracer*).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_t
 
 @dataclass(frozen=True)
 class Baked:
-    """A table and how well its bins were sampled."""
+    """A table and how well the bins of its sheet for touched pixels were sampled."""
 
     table: PolyTable
     fit: BinFit
@@ -127,16 +128,19 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
     images = settings.images + 6 * settings.pins
     with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
-        sums = BinSums(settings.n_bins, camera.resolution)
+        sheets = [BinSums(settings.n_bins, camera.resolution) for _ in range(3)]
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
-            add_samples(sums, views, at.rest_image)
+            for sums, own in zip(sheets, (views.contact, ~views.contact, None), strict=True):
+                add_samples(sums, views, at.rest_image, own)
             bar.update(len(views.rgb))
-        fit = sums.solve(neighbours=settings.neighbours, ridge=settings.ridge)
+        fit, surround, together = (sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in sheets)
         shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if settings.pins else None
     width, height = camera.resolution
     table = PolyTable(
         gradients=fit.gradients,
         covered=fit.covered,
+        surround=surround.gradients,
+        one_sheet=together.gradients,
         background=at.rest_image.astype(np.float32),
         pixel_pitch=at.pitch,
         shadow=shadow,
@@ -180,10 +184,10 @@ def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Itera
     return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
 
 
-def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray) -> None:
-    """Every pixel that moved, of all environments of ``views``."""
+def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray | None = None) -> None:
+    """Every pixel that moved, of all environments of ``views``; of those of ``own`` (B, H, W) alone where it is given."""
     for b in range(len(views.rgb)):
-        row, column = np.nonzero(views.moved[b] > MOVED)
+        row, column = np.nonzero(views.moved[b] > MOVED if own is None else (views.moved[b] > MOVED) & own[b])
         at = b, row, column
         i, j = slope_bins(views.slope_x[at].astype(np.float64), views.slope_y[at].astype(np.float64), sums.n_bins)
         sums.add(i, j, column, row, views.rgb[at].astype(np.float32) - rest_image[row, column])

@@ -65,6 +65,17 @@ def test_a_ball_looks_as_the_ray_tracer_shows_it(baked: Baked, calibration: Cali
     assert error.uncovered == 0
 
 
+def test_touched_gel_and_that_around_have_sheets_of_their_own() -> None:
+    """Near lights see slopes of the deep contact and of the skirt beside it unlike: one sheet takes the mean of both."""
+    at = Calibration(load_sensor("gelsight_mini"), device="cpu", resolution=SIZE)
+    both = calibrate(at, settings=replace(QUICK, pins=0))
+    one = replace(both.table, gradients=both.table.one_sheet, surround=None, one_sheet=None)
+    surfaces = {f"{k}": ball(at, *size) for k, size in enumerate(((2e-3, 0.6e-3), (4e-3, 0.9e-3)))}
+    two, together = (errors(replace(both, table=table), surfaces)["taxim"] for table in (both.table, one))
+    for name in surfaces:
+        assert two[name].contact_mae < 0.8 * together[name].contact_mae, (two[name].contact_mae, together[name].contact_mae)
+
+
 def test_the_same_seed_gives_the_same_table(baked: Baked, calibration: Calibration) -> None:
     few = replace(QUICK, images=4, pins=0)
     a, b, c = (calibrate(calibration, settings=few, seed=seed).table for seed in (0, 0, 1))
