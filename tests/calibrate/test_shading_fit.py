@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from raytac.specs import SensorSpec, load_sensor, validate_sensor
 from raytac.specs.response_text import response_text
 
 SIZE = (80, 60)
-OPTIONS = {"bounce": False}
+OPTIONS: dict[str, Any] = {"bounce": False}
 MINI = load_sensor("gelsight_mini")
 BARE = dataclasses.replace(MINI, response=dataclasses.replace(MINI.response, shading_red=(), shading_green=(), shading_blue=()))
 
