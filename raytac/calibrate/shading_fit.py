@@ -25,6 +25,8 @@ __all__ = ["DEGREE", "with_shading"]
 
 DEGREE = 6
 """Of the polynomial: 28 numbers a channel."""
+RIDGE = 1e-5
+"""Pull of the coefficients to 0: far below what a level of the image is worth, but where a photograph is dark."""
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m]; the pad is smooth."""
 
@@ -53,7 +55,7 @@ def with_shading(
     tracer = RayTracer(plain, resolution=(width, height), outputs=("layers",), device=device, **(options or {}))
     rest = total(tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, GRID_PITCH))))[0] * tracer.response.scale
     if not (rest > 0).all():
-        rule = "leave so many values of the image at rest dark that no gain lifts"
+        rule = "leave this many values of the image at rest dark, and no gain makes these bright"
         raise InputError("lights", value=int((rest <= 0).sum()), rule=rule)
     gamma, black = bare.gamma, np.asarray(bare.black_level)
     light = decode(background, gamma)
@@ -65,7 +67,7 @@ def with_shading(
     # d level / d log gain = 255/γ · light^(1/γ − 1) · target
     slope = np.where(lit, 255 / gamma * np.maximum(light, 1e-6) ** (1 / gamma - 1) * target, 0.0)
     gain = np.where(lit, target, rest) / rest
-    red, green, blue = (fit_log_gain(gain[..., c], slope[..., c] ** 2, degree) for c in range(3))
+    red, green, blue = (fit_log_gain(gain[..., c], slope[..., c] ** 2, degree, ridge=RIDGE) for c in range(3))
     return dataclasses.replace(
         sensor, response=dataclasses.replace(bare, shading_red=red, shading_green=green, shading_blue=blue)
     )

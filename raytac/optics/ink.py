@@ -14,7 +14,8 @@ from raytac.specs.sensor import SensorSpec
 
 SPECULAR = 0.57
 """q of ``darkened``. From the reference integrator on the untouched Mini with 7 x 9 dots, 64 samples a pixel: a dot of albedo 0.05 on a
-coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21)."""
+coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21, the Mini
+of that day). Where s = 0, as in the shipped sensors, q does not matter."""
 
 __all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
 

@@ -21,12 +21,17 @@ def shading_gain(shading: Sequence[Sequence[float]], resolution: tuple[int, int]
     return np.stack(gains, -1)
 
 
-def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int) -> tuple[float, ...]:
-    """Coefficients of the polynomial of this degree that is nearest to log ``gain`` (H, W) > 0 with weights (H, W) on squared residuals."""
+def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int, *, ridge: float = 0.0) -> tuple[float, ...]:
+    """Coefficients of the polynomial of this degree that is nearest to log ``gain`` (H, W) > 0 with weights (H, W) on squared residuals.
+
+    ``ridge`` pulls every coefficient to 0, relative to all weights together: it holds a fit where pixels without weight leave it free.
+    """
     height, width = gain.shape
     root = np.sqrt(weight).ravel()
     basis = _basis((width, height), degree).reshape(gain.size, -1)
-    found, *_ = np.linalg.lstsq(basis * root[:, None], np.log(gain).ravel() * root, rcond=None)
+    pull = np.sqrt(ridge * weight.sum()) * np.eye(basis.shape[1])
+    target = np.concatenate([np.log(gain).ravel() * root, np.zeros(len(pull))])
+    found, *_ = np.linalg.lstsq(np.concatenate([basis * root[:, None], pull]), target, rcond=None)
     return tuple(map(float, found))
 
 

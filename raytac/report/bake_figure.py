@@ -56,7 +56,7 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
         image = left.imshow(
             shown, origin="lower", extent=extent, aspect="auto", cmap="viridis", norm=norm, interpolation="nearest"
         )
-        left.set_title(f"a  samples a bin, {sensor}")
+        left.set_title(f"a  touched samples a bin, {sensor}")
         figure.colorbar(image, ax=left, pad=0.02)
         shown = np.ma.masked_less(degree, 0)
         colours = ListedColormap(_DEGREES)

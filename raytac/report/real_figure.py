@@ -62,7 +62,7 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
 
 
 def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
-    """A row a press: the photograph, every mode that has the one at rest, and its signed error (grey is none), cut to what is about the
+    """A row a press: the photograph, every mode that uses the one at rest, and its signed error (grey is none), cut to what is about the
     contact."""
     import matplotlib
 

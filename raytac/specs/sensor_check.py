@@ -9,6 +9,8 @@ from raytac.specs.sensor import LedSpec, SensorSpec, Vec3
 
 __all__ = ["check_slab", "led_corners", "validate_sensor"]
 
+_COEFFICIENT = 5.0
+"""Most that a coefficient of a colour shading may be, as in the file."""
 _LOG_GAIN = 20.0
 """Most that the logarithm of a colour shading's gain may be."""
 _SLACK = 1e-9
@@ -130,6 +132,9 @@ def _check_shading(sensor: SensorSpec) -> None:
         degree = (math.isqrt(8 * len(found) + 1) - 3) // 2
         if found and (degree + 1) * (degree + 2) // 2 != len(found):
             rule = f"must have (n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not {len(found)}"
+            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
+        if max(map(abs, found), default=0.0) > _COEFFICIENT:
+            rule = f"must be numbers in [-{_COEFFICIENT:g}, {_COEFFICIENT:g}]"
             raise _error(sensor, f"response.shading_{channel}", list(found), rule)
         if sum(map(abs, found)) > _LOG_GAIN:
             rule = f"absolute values must not sum to more than {_LOG_GAIN:g}: the gain is the exponential of the polynomial"

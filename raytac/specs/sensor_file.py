@@ -164,6 +164,8 @@ def load_lights(name_or_path: str | Path) -> LightsSpec:
 def with_lights(sensor: SensorSpec, lights: LightsSpec | str | Path) -> SensorSpec:
     """``sensor`` under other lights, checked.
 
+    Its response stays, colour shading and black level too, though these belong to the lights that they were fitted with.
+
     Raises:
         SpecError: as ``load_lights`` and ``validate_sensor``.
     """

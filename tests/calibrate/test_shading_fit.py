@@ -83,5 +83,5 @@ def test_lights_that_leave_pixels_dark_are_refused() -> None:
             dark.lights, leds=tuple(dataclasses.replace(led, power=(0.0, 0.0, 1e-4), glow=0.0) for led in dark.lights.leds)
         ),
     )
-    with pytest.raises(InputError, match=r"lights = \d+: leave so many values"):
+    with pytest.raises(InputError, match=r"lights = \d+: leave this many values"):
         with_shading(dark, np.full((*SIZE[::-1], 3), 120.0), device="cpu", options=OPTIONS)

@@ -69,7 +69,7 @@ def lit_from_three_sides(*, scale: float = 3e-5) -> tuple[LedSpec, ...]:
 
 
 def like_a_mini() -> SensorSpec:
-    """Three colours, a dome, a slightly glossy coat and grey walls: everything that the shipped sensor has."""
+    """Three colours, a dome, a slightly glossy coat and grey walls: as the shipped sensor, but that its coat is matt."""
     spec = sensor(lit_from_three_sides(), albedo=(0.55, 0.5, 0.45), specular=0.05, walls=0.1, dome=(0.21, 0.135))
     return replace(spec, response=replace(spec.response, exposure=12.0))
 

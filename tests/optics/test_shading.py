@@ -54,6 +54,15 @@ def test_pixels_without_weight_do_not_count() -> None:
     assert np.abs(np.array(fit_log_gain(spoilt, np.ones_like(gain), 3)) - THIRD_DEGREE).max() > 0.01
 
 
+def test_a_ridge_holds_what_no_pixel_tells() -> None:
+    """A gain known in one corner alone: without it coefficients of a polynomial of degree six run away."""
+    gain = shading_gain((THIRD_DEGREE,), (48, 36))[..., 0] * np.random.default_rng(0).uniform(0.98, 1.02, (36, 48))
+    weight = np.zeros_like(gain)
+    weight[:8, :8] = 1.0
+    loose, held = (np.abs(fit_log_gain(gain, weight, 6, ridge=ridge)).max() for ridge in (0.0, 1e-5))
+    assert held < 1 < 5 < loose, (held, loose)
+
+
 @pytest.mark.parametrize("integrator", ["fast", "reference", "path"])
 def test_shading_scales_linear_light_in_every_integrator(tracer: Build, integrator: str) -> None:
     """u8 = 255 (gain · even · L + black)^(1/γ) of the layers that the same tracer gives, at rest and pressed."""

@@ -26,7 +26,7 @@ from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings
 from raytac.report.real_calibration import run_calibrate_optics
 from raytac.report.real_figure import table_text
-from raytac.report.real_models import fit_models
+from raytac.report.real_models import MODES, fit_models
 from raytac.report.real_score import noise_floor, press_scores, summary
 from raytac.specs import load_sensor
 
@@ -116,10 +116,10 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
     assert not out.exists()
 
 
-def test_calibrate_writes_a_sensor_that_needs_no_photograph(tmp_path: Path) -> None:
-    """Images of the shipped Mini itself as data: what is written renders held-out presses, and the pad at rest, to about a level."""
-    data, out, grid = tmp_path / "data", tmp_path / "out", make_grid(SENSOR.gelpad, 0.12e-3)
-    data.mkdir()
+@pytest.fixture(scope="module")
+def of_itself(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """Nine presses as a data set, images of the shipped Mini itself without cast shadows, and the one at rest."""
+    data, grid = tmp_path_factory.mktemp("data"), make_grid(SENSOR.gelpad, 0.12e-3)
     places = [(x, y) for y in (70, 120, 170) for x in (80, 160, 240)]
     circles = np.array([(x, y, 26.0 + k % 3 * 3) for k, (x, y) in enumerate(places)])
     tracer = RayTracer(SENSOR, device="cpu", shadows=False)
@@ -132,19 +132,43 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(tmp_path: Path) -> N
         write_png(data / f"{name}.png", rgb[0])
     rows = [f"6.310mm,{k},{x},{y},{r}" for k, (x, y, r) in enumerate(circles)]
     (data / "labels.csv").write_text("\n".join(["diameter,index,cx_px,cy_px,r_px", *rows]) + "\n", "utf-8")
+    background = photographs["background"]
+    assert background is not None
+    return data, background[0]
 
-    args = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tied", "--holdout", "3", "--device", "cpu"]
-    assert main(["calibrate", str(data), *args, "--out", str(out)]) == 0
+
+ONE_ROUND = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tied", "--device", "cpu"]
+
+
+def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    """What is written renders held-out presses, and the pad at rest, to about a level."""
+    (data, background), out = of_itself, tmp_path / "out"
+    assert main(["calibrate", str(data), *ONE_ROUND, "--holdout", "3", "--out", str(out)]) == 0
     metrics = json.loads((out / "metrics.json").read_text("utf-8"))
     assert (metrics["presses.fitted"], metrics["presses.held_out"]) == (6, 3)
     for key in ("fitted", "fitted.alone", "held_out", "held_out.alone"):
         assert metrics[f"{key}.contact_mae"] < 1.5 and metrics[f"{key}.ring_mae"] < 1.0, (key, metrics)
     written = load_sensor(out / "sensor.toml")
     assert all(len(found) == 28 for found in written.response.shading)
-    rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(grid)).rgb
-    assert rest is not None and photographs["background"] is not None
-    off = np.abs(rest[0].astype(int) - photographs["background"][0])
+    rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
+    assert rest is not None
+    off = np.abs(rest[0].astype(int) - background)
     assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())
+
+
+@pytest.mark.slow
+def test_compare_real_scores_every_mode(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    (data, _), out = of_itself, tmp_path / "out"
+    args = ["--folds", "3", "--tested", "1", "--no-regions", "--no-ablations"]
+    assert main(["compare-real", str(data), *ONE_ROUND, *args, "--out", str(out)]) == 0
+    metrics = json.loads((out / "metrics.json").read_text("utf-8"))
+    for mode in MODES:
+        assert metrics[f"{mode}.ms"] > 0 and metrics[f"{mode}.contact_mae"] > 0, mode
+    for mode in ("raytrace", "raytrace_alone"):
+        assert metrics[f"{mode}.contact_mae"] < 1.5 < metrics["background.contact_mae"], (mode, metrics)
+    text = (out / "real.md").read_text("utf-8")
+    assert f"| ray tracer, no photograph | {metrics['raytrace_alone.contact_mae']:.2f} |" in text
+    assert (out / "real.png").stat().st_size > 10_000
 
 
 def test_folds_test_every_press_once() -> None:
