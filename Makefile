@@ -10,7 +10,7 @@ demo: $(VENV)/.installed
 	$(BIN)/python experiments/press_sheet.py --out $(OUT)
 
 test: $(VENV)/.installed-test lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile  # a file stays in one process, so that its fixtures are made once
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .

@@ -93,8 +93,10 @@ class MeshError(SpecError):
 
 
 def short_repr(value: object, limit: int = 80) -> str:
-    """``repr`` cut to ``limit`` characters, with paths shown as plain text."""
-    text = str(value) if isinstance(value, Path) else repr(value)
+    """``repr`` cut to ``limit`` characters; a path as plain text and whole, since its end names the file."""
+    if isinstance(value, Path):
+        return str(value)
+    text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 

@@ -71,6 +71,9 @@ def test_bad_input_writes_nothing(tmp_path: Path, channels: dict, header: dict, 
 
 
 def test_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+    """However long the folder's name is."""
+    tmp_path = tmp_path / ("long_" * 20)
+    tmp_path.mkdir()
     with pytest.raises(InputError, match=r"nothing\.exr.*must exist"):
         read_exr(tmp_path / "nothing.exr")
     (tmp_path / "text.exr").write_text("not an image")
