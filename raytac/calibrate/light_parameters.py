@@ -119,8 +119,8 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
     checked."""
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
-    fitted = {"gamma": gamma, "black_level": tuple(map(float, black)), "vignetting": (a1, a2, 0.0)}
-    response = dataclasses.replace(sensor.response, **fitted, shading_red=(), shading_green=(), shading_blue=())
+    black_level = tuple(map(float, black))
+    response = dataclasses.replace(sensor.response.unshaded, gamma=gamma, black_level=black_level, vignetting=(a1, a2, 0.0))
     return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 

@@ -50,7 +50,7 @@ def with_shading(
         BackendError: the ray tracer cannot run on ``device``.
     """
     height, width = background.shape[:2]
-    bare = dataclasses.replace(sensor.response, shading_red=(), shading_green=(), shading_blue=())
+    bare = sensor.response.unshaded
     plain = dataclasses.replace(sensor, response=bare)
     tracer = RayTracer(plain, resolution=(width, height), outputs=("layers",), device=device, **(options or {}))
     rest = total(tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, GRID_PITCH))))[0] * tracer.response.scale

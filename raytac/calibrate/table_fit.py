@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from raytac.calibrate.press_samples import PressSamples
-from raytac.optics.bake import bake_shadow
+from raytac.optics.bake import PLAIN, bake_shadow
 from raytac.optics.bake_fit import BinSums
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.bake_views import Calibration
-from raytac.optics.table import PolyTable, TaximConstants, slope_bins
+from raytac.optics.table import PolyTable, slope_bins
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["N_BINS", "fit_table", "with_cast_shadows"]
@@ -21,7 +21,6 @@ N_BINS = 60
 """Bins of the slope's magnitude, and of its direction. Upstream has 125; with 20 presses of a Mini half as many leave out fewer places."""
 NEIGHBOURS, RIDGE = 1.0, 1e-4
 """As in ``BakeSettings``, but the eight bins around count as much as the bin itself: photographs are few."""
-_PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
 
 
 def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples, *, n_bins: int = N_BINS) -> PolyTable:
@@ -30,12 +29,12 @@ def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples,
     little of them."""
     height, width = background.shape[:2]
     i, j = slope_bins(samples.slope_x, samples.slope_y, n_bins)
-    sheets = []
-    for own in (samples.touched, ~samples.touched, np.ones(len(i), bool)):
-        sums = BinSums(n_bins, (width, height))
+    touched, around = (BinSums(n_bins, (width, height)) for _ in range(2))
+    for sums, own in ((touched, samples.touched), (around, ~samples.touched)):
         sums.add(i[own], j[own], samples.column[own], samples.row[own], samples.difference[own].astype(np.float32))
-        sheets.append(sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE))
-    contact, surround, together = sheets
+    contact, surround, together = (
+        sums.solve(neighbours=NEIGHBOURS, ridge=RIDGE) for sums in (touched, around, touched.plus(around))
+    )
     return PolyTable(
         gradients=contact.gradients,
         covered=contact.covered,
@@ -45,7 +44,7 @@ def fit_table(sensor: SensorSpec, background: np.ndarray, samples: PressSamples,
         pixel_pitch=sensor.camera.pitch_at((width, height)),
         slopes_of="displacement",
         rest_image=np.clip(np.rint(background), 0, 255).astype(np.uint8),
-        constants=_PLAIN,
+        constants=PLAIN,
         provenance={"source": "real presses of balls", "sensor": sensor.name, "presses": str(len(np.unique(samples.press)))},
     )
 

@@ -26,12 +26,12 @@ from raytac.optics.table import PolyTable, ShadowTable, TaximConstants, slope_bi
 from raytac.optics.table_cache import cached, keep, table_folder
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Baked", "bake", "bake_shadow", "bake_table", "baked_table", "calibrate"]
+__all__ = ["PLAIN", "Baked", "bake", "bake_shadow", "bake_table", "baked_table", "calibrate"]
 
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
 
-_PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
 """The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
 
 
@@ -128,12 +128,14 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
     images = settings.images + 6 * settings.pins
     with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
-        sheets = [BinSums(settings.n_bins, camera.resolution) for _ in range(3)]
+        touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
-            for sums, own in zip(sheets, (views.contact, ~views.contact, None), strict=True):
-                add_samples(sums, views, at.rest_image, own)
+            add_samples(touched, views, at.rest_image, views.contact)
+            add_samples(around, views, at.rest_image, ~views.contact)
             bar.update(len(views.rgb))
-        fit, surround, together = (sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in sheets)
+        fit, surround, together = (
+            sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in (touched, around, touched.plus(around))
+        )
         shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if settings.pins else None
     width, height = camera.resolution
     table = PolyTable(
@@ -146,7 +148,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
         shadow=shadow,
         slopes_of="displacement",
         rest_image=at.rest_image,
-        constants=_PLAIN,
+        constants=PLAIN,
         provenance={
             "source": "baked from the ray tracer",
             "sensor": sensor.name,
@@ -170,7 +172,7 @@ def bake_shadow(
     """The shadow table alone, in the levels of ``at``'s images; ``tick`` is told how many images were rendered, six a pin in all."""
     settings = BakeSettings() if settings is None else settings
     _, deepest = settings.depth_range(at.sensor.gelpad.thickness)
-    shades = ShadowSums(2 * _PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)
+    shades = ShadowSums(2 * PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)
     for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
         shades.add(views, cast, at.rest_image)
         tick(3 * len(views.rgb))
@@ -184,10 +186,10 @@ def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Itera
     return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
 
 
-def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray | None = None) -> None:
-    """Every pixel that moved, of all environments of ``views``; of those of ``own`` (B, H, W) alone where it is given."""
+def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray) -> None:
+    """Every pixel of ``own`` (B, H, W) that moved, of all environments of ``views``."""
     for b in range(len(views.rgb)):
-        row, column = np.nonzero(views.moved[b] > MOVED if own is None else (views.moved[b] > MOVED) & own[b])
+        row, column = np.nonzero((views.moved[b] > MOVED) & own[b])
         at = b, row, column
         i, j = slope_bins(views.slope_x[at].astype(np.float64), views.slope_y[at].astype(np.float64), sums.n_bins)
         sums.add(i, j, column, row, views.rgb[at].astype(np.float32) - rest_image[row, column])

@@ -66,6 +66,12 @@ class BinSums:
         self._gram[key[first]] += gram
         self._moment[key[first]] += np.add.reduceat(products, first, axis=0)
 
+    def plus(self, other: BinSums) -> BinSums:
+        """Sums of the samples of both."""
+        both = BinSums(self.n_bins, self.resolution)
+        both._gram, both._moment = self._gram + other._gram, self._moment + other._moment
+        return both
+
     def solve(self, *, neighbours: float, ridge: float) -> BinFit:
         """The polynomials.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import chebyshev
+
+from raytac.specs.sensor import shading_degree
 
 __all__ = ["fit_log_gain", "shading_gain"]
 
@@ -14,11 +15,8 @@ __all__ = ["fit_log_gain", "shading_gain"]
 def shading_gain(shading: Sequence[Sequence[float]], resolution: tuple[int, int]) -> np.ndarray:
     """Gain (H, W, C) of every pixel for the coefficients of C channels (``ResponseSpec.shading_red``; none is a gain of 1) at
     ``resolution`` (width, height)."""
-    gains = [
-        np.exp(_basis(resolution, _degree(len(c))) @ np.asarray(c, float)) if len(c) else np.ones(resolution[::-1])
-        for c in shading
-    ]
-    return np.stack(gains, -1)
+    x, y = (_centres(n) for n in resolution)
+    return np.exp(np.stack([chebyshev.chebgrid2d(x, y, _table(c)).T for c in shading], -1))
 
 
 def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int, *, ridge: float = 0.0) -> tuple[float, ...]:
@@ -37,10 +35,19 @@ def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int, *, ridge: fl
 
 def _basis(resolution: tuple[int, int], degree: int) -> np.ndarray:
     """T_i(x) T_j(y) with i + j ≤ ``degree`` at the pixels' centres, (H, W, N)."""
-    x, y = (chebyshev.chebvander((np.arange(n) + 0.5) / n * 2 - 1, degree) for n in resolution)
+    x, y = (chebyshev.chebvander(_centres(n), degree) for n in resolution)
     return np.stack([np.multiply.outer(y[:, j], x[:, i]) for i in range(degree + 1) for j in range(degree + 1 - i)], -1)
 
 
-def _degree(count: int) -> int:
-    """n of (n + 1)(n + 2)/2 coefficients."""
-    return (math.isqrt(8 * count + 1) - 3) // 2
+def _centres(count: int) -> np.ndarray:
+    """Those of ``count`` pixels, −1 and 1 at the image's edges."""
+    return (np.arange(count) + 0.5) / count * 2 - 1
+
+
+def _table(coefficients: Sequence[float]) -> np.ndarray:
+    """c_ij as a square array, 0 where i + j > n."""
+    orders = np.arange(max(shading_degree(len(coefficients)), 0) + 1)
+    table = np.zeros((len(orders), len(orders)))
+    if len(coefficients):
+        table[np.add.outer(orders, orders) <= orders[-1]] = coefficients
+    return table

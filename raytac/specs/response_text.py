@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
+from itertools import islice
 
-from raytac.specs.sensor import ResponseSpec
+from raytac.specs.sensor import ResponseSpec, shading_degree
 
 __all__ = ["response_text"]
 
@@ -27,11 +27,8 @@ def response_text(response: ResponseSpec) -> str:
         if not found:
             continue
         lines.append(f"shading_{channel} = [")
-        rest = [f"{value:.4f}" for value in found]
-        while rest:
-            # (n + 1)(n + 2)/2 are left for the degree n: n + 1 of one order in x, then those of the degree n − 1.
-            count = (math.isqrt(8 * len(rest) + 1) - 1) // 2
-            lines.append("    " + ", ".join(rest[:count]) + ",")
-            rest = rest[count:]
+        rest = iter(found)
+        for order in range(shading_degree(len(found)), -1, -1):
+            lines.append("    " + ", ".join(f"{value:.4f}" for value in islice(rest, order + 1)) + ",")
         lines.append("]")
     return "\n".join(lines) + "\n"

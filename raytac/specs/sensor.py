@@ -7,7 +7,7 @@ sensor towards the object, +x image right, +y image down. The camera and the LED
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,16 @@ class ResponseSpec:
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
         """Coefficients by channel."""
         return self.shading_red, self.shading_green, self.shading_blue
+
+    @property
+    def unshaded(self) -> ResponseSpec:
+        """The same without colour shading."""
+        return replace(self, shading_red=(), shading_green=(), shading_blue=())
+
+
+def shading_degree(count: int) -> int:
+    """Highest degree n of a colour shading that ``count`` coefficients are enough for, (n + 1)(n + 2)/2 of them; −1 for none."""
+    return (math.isqrt(8 * count + 1) - 3) // 2
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from raytac.errors import SpecError
-from raytac.specs.sensor import LedSpec, SensorSpec, Vec3
+from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 
 __all__ = ["check_slab", "led_corners", "validate_sensor"]
 
@@ -129,8 +129,8 @@ def _check_vignetting(sensor: SensorSpec) -> None:
 
 def _check_shading(sensor: SensorSpec) -> None:
     for channel, found in zip(("red", "green", "blue"), sensor.response.shading, strict=True):
-        degree = (math.isqrt(8 * len(found) + 1) - 3) // 2
-        if found and (degree + 1) * (degree + 2) // 2 != len(found):
+        degree = shading_degree(len(found))
+        if (degree + 1) * (degree + 2) // 2 != len(found):
             rule = f"must have (n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not {len(found)}"
             raise _error(sensor, f"response.shading_{channel}", list(found), rule)
         if max(map(abs, found), default=0.0) > _COEFFICIENT:
