@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,30 @@ __all__ = [
     "OverlapError",
     "RaytacError",
     "SpecError",
+    "short_repr",
 ]
+
+_LONGEST_MESSAGE = 2000
+"""Characters of a message; the middle of a longer one is left out."""
+_LONGEST_PATH = 400
+"""Characters of a path in a message; the start of a longer one is left out, since its end names the file."""
+_DEEPEST = 8
+"""Nested containers that a message shows."""
+_MOST_CHOICES = 60
+"""Choices that a message lists."""
+_LONGEST_WORD = 100
+"""Characters of a word that is compared with the choices, and of a choice in a message."""
 
 
 class RaytacError(Exception):
-    """Base of every error that raytac raises on purpose."""
+    """Base of every error that raytac raises on purpose; a message is one bounded text, whatever value it is about."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        if len(text) <= _LONGEST_MESSAGE:
+            return text
+        half = _LONGEST_MESSAGE // 2
+        return f"{text[:half]} … {text[-half:]}"
 
 
 class AssetError(RaytacError, FileNotFoundError):
@@ -79,8 +98,9 @@ class SpecError(RaytacError, ValueError):
         self.value = value
         self.rule = rule
         self.choices = tuple(choices)
-        where = f"{self.file}: " if self.file is not None else ""
-        what = f"{key} = {short_repr(value)}: " if key and value is not None else f"{key}: " if key else ""
+        where = f"{short_repr(self.file)}: " if self.file is not None else ""
+        named = key if len(key) <= _LONGEST_PATH else key[: _LONGEST_PATH - 1] + "…"
+        what = f"{named} = {short_repr(value)}: " if named and value is not None else f"{named}: " if named else ""
         super().__init__(f"{where}{what}{rule}{_choices_text(hint_for or value, self.choices)}")
 
 
@@ -93,17 +113,54 @@ class MeshError(SpecError):
 
 
 def short_repr(value: object, limit: int = 80) -> str:
-    """``repr`` cut to ``limit`` characters; a path as plain text and whole, since its end names the file."""
+    """``repr`` cut to ``limit`` characters, for any value; a path as plain text and whole up to ``_LONGEST_PATH`` characters.
+
+    Integers too long to be printed, deep and long containers, and objects whose ``repr`` fails are abbreviated.
+    """
     if isinstance(value, Path):
-        return str(value)
-    text = repr(value)
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+        text = str(value)
+        return text if len(text) <= _LONGEST_PATH else "…" + text[-_LONGEST_PATH:]
+    text = ""
+    for piece in _pieces(value, limit, _DEEPEST):
+        text += piece
+        if len(text) > limit:
+            return text[: limit - 1] + "…"
+    return text
+
+
+def _pieces(value: object, limit: int, levels: int) -> Iterator[str]:
+    """``repr`` of ``value`` piece by piece, so that a reader can stop; no piece needs more than ``levels`` nested calls."""
+    if isinstance(value, (list, tuple, dict)) and type(value).__repr__ in (list.__repr__, tuple.__repr__, dict.__repr__):
+        first, last = {list: "[]", tuple: "()", dict: "{}"}[next(t for t in (list, tuple, dict) if isinstance(value, t))]
+        yield first
+        if value and not levels:
+            yield "…"
+        for i, item in enumerate(value if levels else ()):
+            yield ", " if i else ""
+            yield from _pieces(item, limit, levels - 1)
+            if isinstance(value, dict):
+                yield ": "
+                yield from _pieces(value[item], limit, levels - 1)
+        yield ",)" if isinstance(value, tuple) and len(value) == 1 else last
+    elif isinstance(value, (str, bytes, bytearray)):
+        yield repr(value[:limit] if len(value) > limit else value)
+    elif isinstance(value, int) and value.bit_length() > 10_000:  # beyond 4300 digits Python itself refuses
+        yield f"an integer of about {int(value.bit_length() * 0.30103) + 1} digits"
+    else:
+        try:
+            yield repr(value)
+        except Exception as error:  # whatever a foreign object's repr raises must not hide the message
+            yield f"<{type(value).__name__} whose repr raises {type(error).__name__}>"
 
 
 def _choices_text(value: object, choices: tuple[object, ...]) -> str:
     if not choices:
         return ""
-    names = [str(c) for c in choices]
-    close = difflib.get_close_matches(value, names, n=1) if isinstance(value, str) else []
+    names = [
+        name if len(name) <= _LONGEST_WORD else name[: _LONGEST_WORD - 1] + "…" for name in map(str, choices[:_MOST_CHOICES])
+    ]
+    comparable = isinstance(value, str) and len(value) <= _LONGEST_WORD
+    close = difflib.get_close_matches(value, names, n=1) if comparable else []
     hint = f"; did you mean {close[0]!r}?" if close else ";"
-    return f"{hint} choose from: {', '.join(names)}"
+    more = f" and {len(choices) - len(names)} more" if len(choices) > len(names) else ""
+    return f"{hint} choose from: {', '.join(names)}{more}"

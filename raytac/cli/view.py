@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from raytac.checks import check_whole
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.physics.solver import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
-from raytac.sensor.options import check_whole
 from raytac.specs import PressScene, TaskScene, load_scene
 from raytac.specs.press import chosen_physics
 from raytac.specs.task import COUPLINGS

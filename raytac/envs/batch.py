@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from raytac.checks import check_numbers, check_whole
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.envs.variation import VariationDraws
@@ -96,9 +97,7 @@ class TaskBatch:
         if action not in ACTIONS:
             raise InputError("action", value=action, rule="must be a known kind of action", choices=ACTIONS)
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
-        if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
-            raise InputError("max_episode_steps", value=steps, rule="must be a whole number >= 1")
-        self.task, self.num_envs, self.max_episode_steps = task, num_envs, int(steps)
+        self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
@@ -261,10 +260,7 @@ class TaskBatch:
         return found
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
-        values = np.asarray(actions, float)
-        if values.shape != (self.num_envs, self.steering.size):
-            rule = f"must have the shape {(self.num_envs, self.steering.size)}: one row an environment"
-            raise InputError("actions", value=values.shape, rule=rule)
+        values = check_numbers("actions", actions, (self.num_envs, self.steering.size))
         wrong = ~np.isfinite(values) | (np.abs(values) > 1.0 + 1e-6)
         if wrong.any():
             env, axis = (int(i) for i in np.argwhere(wrong)[0])

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from raytac.checks import check_number
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["COARSEST_PITCH", "grid_pitch", "make_grid", "rest_height"]
+__all__ = ["COARSEST_PITCH", "MOST_CELLS", "grid_pitch", "make_grid", "rest_height"]
 
 COARSEST_PITCH = 0.1e-3
 """Spacing of the pad's grid where the image does not ask for a finer one [m]."""
+
+
+MOST_CELLS = 8192
+"""Most cells of the pad's grid along an axis, as many as an image can have pixels."""
 
 
 def grid_pitch(pixel: tuple[float, float]) -> float:
@@ -34,16 +37,13 @@ def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
     """Grid of nodes over the whole pad.
 
     ``pitch`` [m] is the wanted spacing; along each axis it is adjusted to size / round(size / pitch), so that nodes fall on both
-    edges. Raises ``InputError`` if the pitch is not positive and finite or leaves fewer than two cells along an axis, or if a
-    dome radius is not greater than half the pad.
+    edges. Raises ``InputError`` if the pitch is not positive and finite, or leaves fewer than two cells along an axis or more than
+    ``MOST_CELLS``.
     """
-    if not (math.isfinite(pitch) and pitch > 0.0):
-        raise InputError("pitch", value=pitch, rule="must be finite and > 0 [m]")
-    for axis, size, radius in zip("xy", gelpad.size, gelpad.dome_radius, strict=True):
-        if not radius > 0.5 * size:
-            rule = f"must exceed half the pad's size along {axis}, {0.5 * size} m (inf is flat)"
-            raise InputError("gelpad.dome_radius", value=radius, rule=rule)
-        if round(size / pitch) < 2:
-            raise InputError("pitch", value=pitch, rule=f"must leave at least two cells over the pad's {size} m along {axis}")
+    check_number("pitch", pitch, "(0, inf)", "m")
+    for axis, size in zip("xy", gelpad.size, strict=True):
+        if not 1.5 <= size / pitch <= MOST_CELLS:
+            rule = f"must divide the pad's {size:g} m along {axis} into 2 to {MOST_CELLS} cells"
+            raise InputError("pitch", value=pitch, rule=rule)
     x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
     return PadGrid(x=x, y=y, rest=rest_height(gelpad, x[None, :], y[:, None]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -31,10 +32,10 @@ def parse_resolution(text: str) -> tuple[int, int]:
     Raises:
         InputError: not two positive whole numbers joined by ``x``.
     """
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.strip().isdecimal() and height.strip().isdecimal() and int(width) > 0 and int(height) > 0):
+    sides = re.fullmatch(r"\s*0*([1-9]\d{0,8})\s*x\s*0*([1-9]\d{0,8})\s*", text, re.ASCII | re.IGNORECASE)
+    if sides is None:
         raise InputError("resolution", value=text, rule="must be WIDTHxHEIGHT in pixels, as in 320x240")
-    return int(width), int(height)
+    return int(sides[1]), int(sides[2])
 
 
 def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:

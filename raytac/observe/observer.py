@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from raytac.checks import check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.batch import chosen_envs, rounded_envs
@@ -16,7 +17,7 @@ from raytac.observe.randomization import CameraDrift, Randomization, randomised_
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.observe.spaces import ArraySpec, array_specs
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import check_whole, sensor_spec
+from raytac.sensor.options import sensor_spec
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["TactileObserver"]

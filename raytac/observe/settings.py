@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from raytac.checks import check_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
@@ -78,11 +79,11 @@ class ObservationSettings:
             object.__setattr__(self, "resolution", parse_resolution(self.resolution))
         object.__setattr__(self, "resolution", checked_resolution(self.resolution))
         for name in ("downscale", "stack"):
-            _check_count(name, getattr(self, name))
+            check_whole(name, getattr(self, name))
         if not isinstance(self.map_shape, (tuple, list)) or len(self.map_shape) != 2:
             raise InputError("map_shape", value=self.map_shape, rule="must be (rows, columns)")
         for count in self.map_shape:
-            _check_count("map_shape", count)
+            check_whole("map_shape", count)
         if self.crop != "centre":
             sides = self.crop
             if (
@@ -156,7 +157,3 @@ def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
         raise InputError("resolution", value=observed, rule=rule)
     return Layout(observed, rendered, left, top, settings.downscale)
 
-
-def _check_count(name: str, value: object) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise InputError(name, value=value, rule="must be a whole number >= 1")

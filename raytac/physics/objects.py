@@ -11,7 +11,7 @@ from raytac.errors import InputError, SpecError
 from raytac.gel.part import Part, mesh_part, primitive
 from raytac.gel.relief import relief_part
 from raytac.physics.coin import coin_elevation
-from raytac.specs.press_file import OBJECT_SCHEMA
+from raytac.specs.shape_file import OBJECT_SCHEMA
 
 __all__ = ["Shape", "object_parts"]
 

@@ -7,12 +7,12 @@ from typing import TypeVar
 
 import numpy as np
 
+from raytac.checks import check_numbers
 from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.part import Part
 from raytac.physics.contact_state import ContactState
 from raytac.physics.objects import object_parts
-from raytac.specs.press import MOVES, PressScene
-from raytac.specs.press_file import STAGE_SCHEMA
+from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["CLEARANCE", "about_z", "check_trajectory", "peak_state", "per_environment", "scene_parts"]
@@ -39,8 +39,6 @@ def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part
         SpecError: names the scene's file and key.
         InputError: ``depths`` [m] deeper than the pad.
     """
-    if scene.moves not in MOVES:
-        raise SpecError("must be a known side", file=scene.source, key="moves", value=scene.moves, choices=MOVES)
     thickness = gelpad.thickness
     within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
     if scene.trajectory and not parts:
@@ -48,17 +46,8 @@ def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part
         raise SpecError(rule, file=scene.source, key="object.kind", value=scene.object.kind)
     for index, stage in enumerate(scene.trajectory):
         key = f"trajectory[{index}]"
-        if stage.kind not in STAGE_SCHEMA:
-            choices = tuple(STAGE_SCHEMA)
-            raise SpecError("unknown stage", file=scene.source, key=f"{key}.kind", value=stage.kind, choices=choices)
-        if stage.kind != "indent":
-            continue
-        if (stage.depth is None) == (stage.force is None):
-            raise SpecError("needs exactly one of depth and force", file=scene.source, key=key, value=(stage.depth, stage.force))
         if stage.depth is not None and not 0.0 < stage.depth < thickness:
             raise SpecError(within, file=scene.source, key=f"{key}.depth_mm", value=stage.depth * 1e3)
-        if stage.force is not None and not 0.0 < stage.force < np.inf:
-            raise SpecError("must be finite and > 0 [N]", file=scene.source, key=f"{key}.force_n", value=stage.force)
     if depths is not None:
         bad = depths[np.isfinite(depths) & ~((depths > 0.0) & (depths < thickness))]
         if len(bad):
@@ -74,11 +63,8 @@ def peak_state(scene: PressScene, states: Iterable[_State]) -> _State:
 
 
 def per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """``values`` as an array, zeros for None; raises ``InputError`` for another shape."""
-    array = np.zeros(shape) if values is None else np.asarray(values, float)
-    if array.shape != shape:
-        raise InputError(name, value=array.shape, rule=f"must have shape {shape}")
-    return array
+    """``values`` as an array, zeros for None; raises ``InputError`` for another shape, or what is no number."""
+    return np.zeros(shape) if values is None else check_numbers(name, values, shape)
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from raytac.checks import check_whole
 from raytac.errors import InputError, SpecError
 from raytac.physics.press_plan import per_environment
 from raytac.physics.rotation import rotation_of
@@ -49,10 +50,8 @@ class PressTargets:
 
         Raises:
             InputError: ``num_envs`` below 1, an argument of another shape, or a quaternion of zeros.
-            SpecError: the scene's own quaternion is not finite or of zeros.
         """
-        if num_envs < 1:
-            raise InputError("num_envs", value=num_envs, rule="must be a whole number >= 1")
+        check_whole("num_envs", num_envs)
         self.offsets = per_environment("offsets", offsets, (num_envs, 2))
         self.depths = None if depths is None else per_environment("depths", depths, (num_envs,))
         self._shears = None if shears is None else per_environment("shears", shears, (num_envs, 2))
@@ -68,9 +67,6 @@ class PressTargets:
             rule = f"must not be all 0, in environment {int(zero.argmax())}"
             raise InputError("rotations", value=turns[zero.argmax()].tolist(), rule=rule)
         at_rest = np.asarray(scene.object.quaternion, float)
-        if not np.isfinite(at_rest).all() or not at_rest.any():
-            rule = "must be four finite numbers, not all 0"
-            raise SpecError(rule, file=scene.source, key="object.quaternion_wxyz", value=scene.object.quaternion)
         self._scene, self._turns = scene, turns
         own = rotation_of(at_rest / np.linalg.norm(at_rest))
         self.rotations = own[None].repeat(num_envs, axis=0)
@@ -78,7 +74,9 @@ class PressTargets:
             self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ own
 
     def stage(self, stage: StageSpec, b: int) -> StageSpec:
-        """A stage as environment ``b`` runs it."""
+        """A stage as environment ``b`` runs it; the scene's own in an environment that is lost."""
+        if self.lost[b]:
+            return stage
         if stage.kind == "indent" and stage.depth is not None and self.depths is not None:
             return replace(stage, depth=float(self.depths[b]))
         if stage.kind == "shear" and self._shears is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from raytac.checks import check_whole
 from raytac.errors import InputError, SpecError
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height
@@ -118,8 +119,7 @@ class RigidPad:
                 twisted off it; names the scene's file and key.
             InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
         """
-        if steps_per_stage < 1:
-            raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
+        check_whole("steps_per_stage", steps_per_stage)
         self._environments = [self._start(b) for b in range(self.num_envs)] if self.parts else []
         yield self._state(-1, "start", 1.0)
         for index, stage in enumerate(self.scene.trajectory):
@@ -135,8 +135,7 @@ class RigidPad:
             InputError: ``steps`` below 1, or a stage that presses deeper than the pad or takes the object off it.
             SpecError: a scene without object, or a stage that no pad can follow.
         """
-        if steps < 1:
-            raise InputError("steps", value=steps, rule="must be a whole number >= 1")
+        check_whole("steps", steps)
         check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
         if not self._environments:
             self._environments = [self._start(b) for b in range(self.num_envs)]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
+from raytac.checks import check_whole
 from raytac.errors import InputError, SpecError
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.object_height import object_height
@@ -131,8 +132,7 @@ class SoftPad:
         Raises:
             InputError: ``steps_per_stage`` below 1.
         """
-        if steps_per_stage < 1:
-            raise InputError("steps_per_stage", value=steps_per_stage, rule="must be a whole number >= 1")
+        check_whole("steps_per_stage", steps_per_stage)
         self.reset()
         with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as bar:
             if self._drive is not None:
@@ -149,8 +149,7 @@ class SoftPad:
             InputError: ``steps`` below 1, or a stage deeper than any of the scene's: there the object's surface was left out.
             SpecError: a scene without object, or a stage that no pad can follow.
         """
-        if steps < 1:
-            raise InputError("steps", value=steps, rule="must be a whole number >= 1")
+        check_whole("steps", steps)
         if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
             rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"
             raise InputError("stage", value=stage, rule=rule)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from raytac.checks import check_numbers
 from raytac.errors import InputError
 from raytac.physics.rotation import rotation_vector
 
@@ -28,14 +29,7 @@ def pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 def check_pose(name: str, value: np.ndarray) -> np.ndarray:
     """``value`` as a float64 (4, 4) rigid transform. Raises ``InputError``, naming ``name``, if it is none."""
-    try:
-        matrix = np.asarray(value, float)
-    except (TypeError, ValueError) as error:
-        raise InputError(name, value=value, rule="must be a 4 x 4 matrix target_from_source") from error
-    if matrix.shape != (4, 4):
-        raise InputError(name, value=matrix.shape, rule="must have the shape (4, 4) of a matrix target_from_source")
-    if not np.isfinite(matrix).all():
-        raise InputError(name, value=matrix.tolist(), rule="must be finite")
+    matrix = check_numbers(name, value, (4, 4), finite=True)
     if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL:
         raise InputError(name, value=matrix[3].tolist(), rule="must have the last row 0, 0, 0, 1")
     rotation = matrix[:3, :3]

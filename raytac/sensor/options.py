@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from raytac.checks import check_known, check_methods, check_whole
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
 from raytac.markers import MARKER_MODELS, MarkerPerturbation
 from raytac.optics.base import INTEGRATORS
-from raytac.specs import PressScene, SensorSpec, load_press, load_sensor
+from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
 from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
@@ -27,10 +26,8 @@ __all__ = [
     "check_markers",
     "check_optics",
     "check_physics",
-    "check_whole",
     "checked_outputs",
     "checked_resolution",
-    "checked_seed",
     "press_scene",
     "sensor_outputs",
     "sensor_spec",
@@ -53,9 +50,11 @@ def sensor_outputs(optics: str) -> tuple[str, ...]:
 def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
     """Raises ``InputError`` for an unknown name, or a pad to be cut where none is simulated."""
     if physics is not None:
-        _check_name("physics", physics, PHYSICS)
+        check_known("physics", physics, PHYSICS)
     if isinstance(pad, str):
-        _check_name("pad", pad, PADS)
+        check_known("pad", pad, PADS)
+    elif pad is not None:
+        check_methods("pad", pad, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
     if pad is not None and physics == "rigid":
         raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
 
@@ -63,8 +62,12 @@ def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
 def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, options: dict[str, Any] | None) -> None:
     """Raises ``InputError`` for an unknown name, or settings that the optical mode does not have."""
     if isinstance(optics, str):
-        _check_name("optics", optics, OPTICS)
-    _check_name("integrator", integrator, INTEGRATORS)
+        check_known("optics", optics, OPTICS)
+    else:
+        check_methods("optics", optics, ("render",), ("label", "device"), f"one of {', '.join(OPTICS)}, or an OpticalMode")
+    if options is not None and not (isinstance(options, Mapping) and all(isinstance(name, str) for name in options)):
+        raise InputError("optics_options", value=options, rule="must be a mapping of names to values")
+    check_known("integrator", integrator, INTEGRATORS)
     if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
         raise InputError(
             "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
@@ -82,7 +85,7 @@ def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> 
         raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in outputs:
-        _check_name("outputs", name, OUTPUTS)
+        check_known("outputs", name, OUTPUTS)
         if isinstance(optics, str) and name not in sensor_outputs(optics):
             rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
             raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
@@ -92,18 +95,12 @@ def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> 
 def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: str | None) -> None:
     """Raises ``InputError`` for an unknown model, one that the physics cannot feed, or a perturbation of no markers."""
     if markers is not None:
-        _check_name("markers", markers, MARKER_MODELS)
+        check_known("markers", markers, MARKER_MODELS)
         if markers == "surface" and physics == "rigid":
             rule = "tracks the surface of a simulated gel; physics='rigid' has none"
             raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
     elif perturbation is not None:
         raise InputError("marker_perturbation", value=perturbation, rule="needs a marker model: markers=…")
-
-
-def check_whole(name: str, value: object) -> None:
-    """Raises ``InputError`` for what is not a whole number >= 1."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(name, value=value, rule="must be a whole number >= 1")
 
 
 def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, int] | None:
@@ -115,24 +112,18 @@ def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, i
     if not isinstance(resolution, (tuple, list)) or len(resolution) != 2:
         raise InputError("resolution", value=resolution, rule="must be (width, height) in pixels, as in (320, 240) or '320x240'")
     for side in resolution:
-        check_whole("resolution", side)
-        if side > LARGEST_SIDE:
-            raise InputError("resolution", value=side, rule=f"must be at most {LARGEST_SIDE} pixels a side")
+        check_whole("resolution", side, 1, LARGEST_SIDE)
     return int(resolution[0]), int(resolution[1])
-
-
-def checked_seed(seed: int) -> int:
-    """Raises ``InputError`` for what is not a whole number in [0, 2^32)."""
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
-        raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
-    return int(seed)
 
 
 def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
     """The specification itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
     if not isinstance(sensor, (str, Path, SensorSpec)):
         raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
-    return sensor if isinstance(sensor, SensorSpec) else load_sensor(sensor)
+    if not isinstance(sensor, SensorSpec):
+        return load_sensor(sensor)
+    validate_sensor(sensor)
+    return sensor
 
 
 def press_scene(scene: str | Path | PressScene) -> PressScene:
@@ -153,8 +144,3 @@ def warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) ->
             f"{width}x{max(round(width * h / w), 1)} keeps their shape",
             stacklevel=3,
         )
-
-
-def _check_name(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(name, value=value, rule="must be a known name", choices=choices)

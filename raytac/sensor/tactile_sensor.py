@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from raytac.checks import check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
@@ -25,10 +26,8 @@ from raytac.sensor.options import (
     check_markers,
     check_optics,
     check_physics,
-    check_whole,
     checked_outputs,
     checked_resolution,
-    checked_seed,
     press_scene,
     sensor_spec,
     warn_of_other_shape,
@@ -126,7 +125,7 @@ class TactileSensor:
         check_whole("num_envs", num_envs)
         check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
-        self.seed = checked_seed(seed)
+        self.seed = check_seed("seed", seed)
         self.spec = sensor_spec(sensor)
         self.integrator, self.spp = integrator, spp
         self._asked_physics, self._asked_pad = physics, pad
@@ -244,6 +243,7 @@ class TactileSensor:
             RaytacError: the object overlaps a simulated pad where it starts.
         """
         press = press_scene(scene)
+        own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
         self.physics = chosen_physics(self._asked_physics, self._asked_pad, press.physics)
         self._level = self._asked_pad or press.pad or PADS[0]
         self._pad = load_pad(
@@ -262,8 +262,8 @@ class TactileSensor:
             twists=twists,
         )
         self._is_narrow = False
-        if seeds is not None and self.markers is not None:
-            self.marker_tracker.reseed(range(self.num_envs), seeds)
+        if own_seeds is not None and self.markers is not None:
+            self.marker_tracker.reseed(range(self.num_envs), own_seeds)
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.specs.files import find_file
-from raytac.specs.toml import Number, Schema, Text, read_toml
+from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml
 
 __all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "PunchSpec", "load_marker_motion", "marker_motion_text"]
 
@@ -52,6 +52,14 @@ class MarkerMotionSpec:
     """In place of FOTS' Gaussians and caps of shear and twist; None: those, as published."""
     source: Path | None = None
     """File that it was read from."""
+
+    def check(self) -> None:
+        """Raise ``SpecError`` for a constant that no file could give."""
+        check_fields(vars(self), MARKER_MOTION_SCHEMA["fots"], "fots", self.source)
+        field = {name.removeprefix("field_"): value for name, value in vars(self).items() if name.startswith("field_")}
+        check_fields(field, MARKER_MOTION_SCHEMA["force_field"], "force_field", self.source)
+        if self.punch is not None:
+            check_fields(vars(self.punch), MARKER_MOTION_SCHEMA["punch"], "punch", self.source)
 
 
 MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {

@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
+from raytac.errors import SpecError
 from raytac.specs.sensor import Vec3
+from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
+from raytac.specs.toml import Number, Schema, Text, check_fields
 
-__all__ = ["DYNAMICS", "MOVES", "PADS", "PHYSICS", "ObjectSpec", "PressScene", "StageSpec", "chosen_physics"]
+__all__ = [
+    "DYNAMICS",
+    "MOVES",
+    "PADS",
+    "PHYSICS",
+    "POSE_SCHEMA",
+    "SCENE_SCHEMA",
+    "STAGE_SCHEMA",
+    "ObjectSpec",
+    "PressScene",
+    "StageSpec",
+    "chosen_physics",
+]
 
 MOVES = ("object", "case")
 """What a press can move; the other side stands still."""
@@ -17,6 +33,32 @@ PADS = ("coarse", "medium", "fine")
 """How finely a simulated pad can be cut."""
 DYNAMICS = ("kinematic", "affine", "soft")
 """What an object can be to a simulated pad: driven and rigid, free and near-rigid, or driven and soft."""
+
+SCENE_SCHEMA: Final[Schema] = {
+    "moves": Text(choices=MOVES, default="object"),
+    "physics": Text(choices=PHYSICS, default=None),
+    "pad": Text(choices=PADS, default=None),
+}
+"""Keys at the top of a scene."""
+
+POSE_SCHEMA: Final[Schema] = {
+    "position_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
+    "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
+    "mass_kg": Number("[0.0001, 100]", default=0.1),
+    "dynamics": Text(choices=DYNAMICS, default="kinematic"),
+    "youngs_modulus_kpa": Number("[1, 100000]", default=None),
+    "poisson_ratio": Number("[0, 0.49]", default=None),
+}
+"""Keys of ``[object]`` that every kind but ``none`` has."""
+
+_DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
+STAGE_SCHEMA: Final[dict[str, Schema]] = {
+    "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
+    "shear": {"shear_mm": Number("[-50, 50]", length=2), **_DURATION},
+    "twist": {"twist_deg": Number("[-180, 180]"), **_DURATION},
+    "release": {**_DURATION},
+}
+"""Kind of stage to its keys in ``[[trajectory]]``."""
 
 
 def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
@@ -51,6 +93,18 @@ class ObjectSpec:
     poisson_ratio: float = 0.4
     """Of a soft object."""
 
+    def __post_init__(self) -> None:
+        if self.kind not in OBJECT_SCHEMA:
+            raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_SCHEMA))
+        if self.kind == "none":
+            return
+        check_params(self.kind, self.params, OBJECT_SCHEMA[self.kind], "object")
+        # z is not used, and a file does not give it.
+        place = self.position[:2] if isinstance(self.position, (tuple, list)) and len(self.position) == 3 else self.position
+        own = {key: rule for key, rule in POSE_SCHEMA.items() if key != "quaternion_wxyz"}
+        check_fields(vars(self) | {"position": place}, own, "object")
+        check_quaternion(self.quaternion, "object.quaternion_wxyz")
+
 
 @dataclass(frozen=True)
 class StageSpec:
@@ -69,6 +123,14 @@ class StageSpec:
     duration: float = 0.5
     """Time that the leg takes [s]."""
 
+    def __post_init__(self) -> None:
+        if self.kind not in STAGE_SCHEMA:
+            raise SpecError("must be a known kind of stage", key="trajectory.kind", value=self.kind, choices=tuple(STAGE_SCHEMA))
+        check_fields(vars(self), STAGE_SCHEMA[self.kind], "trajectory")
+        if self.kind == "indent" and (self.depth is None) == (self.force is None):
+            rule = "an indent needs exactly one of depth_mm and force_n"
+            raise SpecError(rule, key="trajectory", value=(self.depth, self.force))
+
 
 @dataclass(frozen=True)
 class PressScene:
@@ -83,6 +145,13 @@ class PressScene:
     """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""
     pad: str | None = None
     """One of ``PADS``; None leaves it to whoever presses."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.object, ObjectSpec):
+            raise SpecError("must be an ObjectSpec", file=self.source, key="object", value=self.object)
+        if not isinstance(self.trajectory, tuple) or not all(isinstance(stage, StageSpec) for stage in self.trajectory):
+            raise SpecError("must be a tuple of StageSpec", file=self.source, key="trajectory", value=self.trajectory)
+        check_fields(vars(self), SCENE_SCHEMA, file=self.source)
 
     @property
     def peak_stage(self) -> int:

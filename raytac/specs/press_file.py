@@ -1,45 +1,19 @@
-"""Reads press scenes from TOML: the schemas of ``scenes/press/*.toml``, and the rules between scene and sensor."""
+"""Reads press scenes from TOML, ``scenes/press/*.toml``, and checks the rules between scene and sensor."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
 
 from raytac.errors import SpecError
 from raytac.specs.files import find_file
-from raytac.specs.press import DYNAMICS, MOVES, PADS, PHYSICS, ObjectSpec, PressScene, StageSpec
+from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion
-from raytac.specs.toml import Number, Schema, Table, Text, read_toml
+from raytac.specs.toml import Table, Text, read_toml
 
-__all__ = ["OBJECT_SCHEMA", "POSE_SCHEMA", "SCENE_SCHEMA", "STAGE_SCHEMA", "load_press", "validate_press"]
-
-SCENE_SCHEMA: Final[Schema] = {
-    "moves": Text(choices=MOVES, default="object"),
-    "physics": Text(choices=PHYSICS, default=None),
-    "pad": Text(choices=PADS, default=None),
-}
-"""Keys at the top of a scene."""
-
-POSE_SCHEMA: Final[Schema] = {
-    "position_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
-    "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
-    "mass_kg": Number("[0.0001, 100]", default=0.1),
-    "dynamics": Text(choices=DYNAMICS, default="kinematic"),
-    "youngs_modulus_kpa": Number("[1, 100000]", default=None),
-    "poisson_ratio": Number("[0, 0.49]", default=None),
-}
-"""Keys of ``[object]`` that every kind but ``none`` has."""
+__all__ = ["load_press", "validate_press"]
 
 _KIND = "kind"
-_DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
-STAGE_SCHEMA: Final[dict[str, Schema]] = {
-    "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
-    "shear": {"shear_mm": Number("[-50, 50]", length=2), **_DURATION},
-    "twist": {"twist_deg": Number("[-180, 180]"), **_DURATION},
-    "release": {**_DURATION},
-}
-"""Kind of stage to its keys in ``[[trajectory]]``."""
 
 
 def load_press(name_or_path: str | Path) -> PressScene:

@@ -9,15 +9,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from raytac.errors import SpecError
 from raytac.specs.marker_motion import MarkerMotionSpec
+from raytac.specs.toml import ANY, Integer, Number, Schema, Text, check_fields
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
 __all__ = [
     "BONDED",
+    "LED_SCHEMA",
+    "SENSOR_PARTS",
+    "SENSOR_SCHEMA",
     "CameraSpec",
     "CaseSpec",
     "CoatSpec",
@@ -32,6 +37,75 @@ __all__ = [
 
 BONDED = ("back", "back_and_sides")
 """Faces of a gelpad that the case can hold."""
+
+
+_NAME = Text(pattern=r"[a-z][a-z0-9_]*", described="a name of lower-case letters, digits and underscores")
+
+SENSOR_SCHEMA: Final[dict[str, Schema]] = {
+    "": {"lights": Text(), "base": Text(default=""), "marker_motion": Text(default="")},
+    "gelpad": {
+        "size_mm": Number("[2, 200]", length=2),
+        "thickness_mm": Number("[0.2, 50]"),
+        "dome_radius_mm": Number("[1, inf]", length=2),
+        "youngs_modulus_kpa": Number("[1, 100000]"),
+        "poisson_ratio": Number("[0, 0.5)"),
+        "density_kg_m3": Number("[100, 10000]"),
+        "friction": Number("[0, 10]"),
+        "bonded": Text(choices=BONDED, default="back"),
+    },
+    "coat": {
+        "reflectance": Number("[0, 1]", length=3),
+        "specular": Number("[0, 1)"),
+        "roughness": Number("[0.05, 1]"),
+    },
+    "case": {
+        "size_mm": Number("[2, 300]", length=2),
+        "floor_z_mm": Number("[-500, 0)"),
+        "reflectance": Number("[0, 1)"),
+    },
+    "camera": {
+        "resolution_px": Integer("[8, 8192]", length=2),
+        "pixel_pitch_mm": Number("[0.0005, 5]", length=2),
+        "position_mm": Number("[-500, 500]", length=3),
+        "principal_point_px": Number("[-8192, 16384]", length=2),
+    },
+    "response": {
+        "exposure": Number("(0, 1e9]"),
+        "white_balance": Number("(0, 100]", length=3),
+        "gamma": Number("[0.5, 5]"),
+        "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
+        "vignetting": Number("[-10, 10]", length=3, default=(0.0, 0.0, 0.0)),
+        "shading_red": Number("[-5, 5]", length=ANY, default=()),
+        "shading_green": Number("[-5, 5]", length=ANY, default=()),
+        "shading_blue": Number("[-5, 5]", length=ANY, default=()),
+    },
+    "markers": {
+        "rows": Integer("[0, 200]"),
+        "columns": Integer("[0, 200]"),
+        "pitch_mm": Number("[0, 50]", length=2, default=(0.0, 0.0)),
+        "offset_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
+        "radius_mm": Number("[0, 10]", default=0.0),
+        "reflectance": Number("[0, 1]", default=0.0),
+    },
+    "refraction": {
+        "model": Text(choices=("none", "slab")),
+        "ior": Number("[1, 3]"),
+        "plate_thickness_mm": Number("[0, 50]"),
+    },
+}
+"""Table (``""``: the top of the file) to its keys."""
+
+LED_SCHEMA: Final[Schema] = {
+    "name": _NAME,
+    "layer": _NAME,
+    "position_mm": Number("[-500, 500]", length=3),
+    "axis": Number("[-1000, 1000]", length=3),
+    "size_mm": Number("(0, 50]", length=2),
+    "lobe": Number("[1, 1000]"),
+    "power_w_per_sr": Number("[0, 1e6]", length=3),
+    "glow_per_m2": Number("[0, 1e6]", default=0.0),
+}
+"""Keys of one ``[[led]]`` table."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +129,9 @@ class GelpadSpec:
     bonded: str = "back"
     """What the case holds, one of ``BONDED``; only the soft pad knows it."""
 
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
+
     def sag(self, x: Any, y: Any) -> Any:
         """How far the surface at rest lies below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays that broadcast.
 
@@ -77,6 +154,9 @@ class CoatSpec:
     roughness: float
     """GGX roughness α of the specular lobe, in [0.05, 1]."""
 
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["coat"], "coat")
+
 
 @dataclass(frozen=True)
 class CaseSpec:
@@ -88,6 +168,9 @@ class CaseSpec:
     """Pad-frame z of the floor (the camera board) [m], below the camera."""
     reflectance: float
     """Diffuse albedo of walls and floor, in [0, 1)."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["case"], "case")
 
 
 @dataclass(frozen=True)
@@ -102,6 +185,9 @@ class CameraSpec:
     """Pinhole (effective centre of projection) in the pad frame [m]; z < 0. The image centre looks along +z."""
     principal_point: Vec2
     """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["camera"], "camera")
 
     def pitch_at(self, resolution: tuple[int, int]) -> Vec2:
         """Size along x and y [m] of a pixel on the plane z = 0 where the whole image has ``resolution`` (width, height) [px]."""
@@ -130,6 +216,9 @@ class ResponseSpec:
     (n + 1)(n + 2)/2 of them for the degree n, or none for a gain of 1."""
     shading_green: tuple[float, ...] = ()
     shading_blue: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["response"], "response")
 
     @property
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
@@ -164,6 +253,9 @@ class MarkerSpec:
     reflectance: float
     """Diffuse albedo of a dot, in [0, 1]."""
 
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["markers"], "markers")
+
 
 @dataclass(frozen=True)
 class RefractionSpec:
@@ -177,6 +269,9 @@ class RefractionSpec:
     """Refractive index of gel and plate (one medium)."""
     plate_thickness: float
     """Thickness of the support plate behind the gelpad [m]."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["refraction"], "refraction")
 
 
 @dataclass(frozen=True)
@@ -199,6 +294,12 @@ class LedSpec:
     glow: float = 0.0
     """Even radiance of the case's walls and floor over ``power`` [1/m²]: light of this LED that gel and housing scattered many times."""
 
+    def __post_init__(self) -> None:
+        check_fields(vars(self), LED_SCHEMA, "led")
+        length = math.hypot(*self.axis)
+        if abs(length - 1.0) > 1e-6:
+            raise SpecError(f"must be a unit vector; its length is {length:.6g}", key="led.axis", value=self.axis)
+
     @property
     def edges(self) -> tuple[Vec3, Vec3]:
         """Unit directions u, v of the rectangle's edges, pad frame: u along z × axis, v = axis × u; (u, v, axis) right-handed."""
@@ -214,14 +315,35 @@ class LightsSpec:
     source: Path | None = None
     """File that it was read from."""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.leds, tuple) or not all(isinstance(led, LedSpec) for led in self.leds):
+            raise SpecError("must be a tuple of LedSpec", file=self.source, key="led", value=self.leds)
+
     @property
     def layers(self) -> tuple[str, ...]:
         """Layer names in order of first appearance."""
         return tuple(dict.fromkeys(led.layer for led in self.leds))
 
 
+SENSOR_PARTS: Final = {
+    "gelpad": GelpadSpec,
+    "coat": CoatSpec,
+    "case": CaseSpec,
+    "camera": CameraSpec,
+    "response": ResponseSpec,
+    "markers": MarkerSpec,
+    "refraction": RefractionSpec,
+}
+"""Table of a sensor file to the dataclass that holds it."""
+
+
 @dataclass(frozen=True)
 class SensorSpec:
+    """A sensor; each part checks its own ranges when it is made, ``validate_sensor`` what the parts are to each other.
+
+    The latter is done for a file and for every sensor that is used, not here, so that a fit may move lights through each other.
+    """
+
     name: str
     gelpad: GelpadSpec
     coat: CoatSpec
@@ -235,3 +357,11 @@ class SensorSpec:
     """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
     source: Path | None = None
     """File that it was read from."""
+
+    def __post_init__(self) -> None:
+        for name, kind in SENSOR_PARTS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise SpecError(f"must be a {kind.__name__}", file=self.source, key=name, value=value)
+        if self.marker_motion is not None:  # while one is fitted, it may leave its ranges
+            self.marker_motion.check()

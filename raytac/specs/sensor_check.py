@@ -18,7 +18,7 @@ _SLACK = 1e-9
 
 
 def validate_sensor(sensor: SensorSpec) -> None:
-    """Check a sensor as a whole; for sensors changed in code (``dataclasses.replace``), files are checked on loading.
+    """Check a sensor as a whole; done for files and for every specification that a ``TactileSensor`` or world is made of.
 
     Raises:
         SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from raytac.checks import is_number
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import is_file
 from raytac.specs.mesh import load_mesh
-from raytac.specs.toml import Integer, Number, Schema, Table, Text
+from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, split_unit
 
-__all__ = ["OBJECT_SCHEMA", "check_shape", "resolved", "unit_quaternion"]
+__all__ = ["OBJECT_SCHEMA", "check_params", "check_quaternion", "check_shape", "resolved", "unit_quaternion"]
 
 _LENGTH = Number("(0, 100]")
 
@@ -45,13 +46,40 @@ def check_shape(table: Table, kind: str, values: dict[str, Any]) -> None:
         SpecError: lengths that contradict each other, or a file that does not exist.
         MeshError: the mesh cannot be used.
     """
-    _check_lengths(table, kind, values)
+    _check_lengths(kind, values, table.prefix, table.file)
     if kind in ("mesh", "mjcf"):
         values["path"] = str(resolved(table, values["path"]))
     if kind == "mesh":
         _check_mesh(table, values)
     elif kind == "mjcf" and not is_file(Path(values["path"])):
         raise table.error(f"the model file does not exist ({values['path']})", "path", table.data["path"])
+
+
+def check_params(kind: str, params: Mapping[str, Any], schema: Schema, prefix: str) -> None:
+    """The rules of ``check_shape`` for a shape that is made in code, in SI; a file that it names is looked at where it is read.
+
+    Raises:
+        SpecError: a length or count that is missing or out of its range, lengths that contradict each other, or an unknown name.
+    """
+    if not isinstance(params, Mapping):
+        raise SpecError("must be a mapping of names to values", key=f"{prefix}.params", value=params)
+    check_fields(params, schema, prefix)
+    known = [split_unit(key)[0] for key in schema]
+    for name in params:
+        if name not in known:
+            raise SpecError(
+                f"is no length or count of the kind {kind!r}", key=f"{prefix}.{name}", value=params[name], choices=known
+            )
+    _check_lengths(kind, params, prefix, None)
+
+
+def check_quaternion(quaternion: object, key: str) -> None:
+    """Raise ``SpecError`` for what is not four finite numbers w, x, y, z of unit length, to 1 %."""
+    if not isinstance(quaternion, (tuple, list)) or len(quaternion) != 4 or not all(map(is_number, quaternion)):
+        raise SpecError("must be four numbers w, x, y, z", key=key, value=quaternion)
+    length = math.hypot(*quaternion)
+    if not abs(length - 1) <= 0.01:
+        raise SpecError(f"must be a unit quaternion w, x, y, z, to 1 %; its length is {length:.4g}", key=key, value=quaternion)
 
 
 def unit_quaternion(table: Table, quaternion: tuple[float, ...]) -> tuple[float, float, float, float]:
@@ -72,16 +100,20 @@ def resolved(table: Table, path: str) -> Path:
         raise table.error(f"the path has no meaning here ({error})", "path", path) from error
 
 
-def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
+def _check_lengths(kind: str, p: Mapping[str, Any], prefix: str, file: Path | None) -> None:
     """Lengths [m] of one object that contradict each other."""
+    key = rule = ""
     if kind == "cone" and p["tip_radius"] >= p["radius"]:
-        raise _length_error(table, "tip_radius_mm", f"must be less than radius_mm = {_mm(p['radius'])}")
+        key, rule = "tip_radius_mm", f"must be less than radius_mm = {_mm(p['radius'])}"
     elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
-        raise _length_error(table, "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}")
+        key, rule = "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}"
     elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] < 2 * p["pin_radius"]:
-        raise _length_error(table, "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}")
+        key, rule = "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}"
     elif kind == "coin" and p["relief_height"] >= p["thickness"]:
-        raise _length_error(table, "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}")
+        key, rule = "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}"
+    if key:
+        dotted = f"{prefix}.{key}" if prefix else key
+        raise SpecError(rule, file=file, key=dotted, value=_mm(p[key.removesuffix("_mm")]))
 
 
 def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
@@ -92,10 +124,6 @@ def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
         rule = f"{error.rule} (mesh {values['path']})"
         dotted = f"{table.prefix}.{key}" if table.prefix else key
         raise MeshError(rule, file=table.file, key=dotted, value=table.data[key], choices=error.choices) from error
-
-
-def _length_error(table: Table, key: str, rule: str) -> SpecError:
-    return table.error(rule, key, table.data[key])
 
 
 def _mm(length: float) -> float:

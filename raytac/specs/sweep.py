@@ -5,14 +5,45 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
-from raytac.specs.press import PressScene
+from raytac.errors import SpecError
+from raytac.specs.press import PADS, PHYSICS, PressScene
 from raytac.specs.sensor import SensorSpec
+from raytac.specs.toml import ANY, Integer, Number, Schema, Text, check_fields, split_unit
 
-__all__ = ["PressRanges", "Range", "SweepSpec"]
+__all__ = ["RANGE_SCHEMA", "SWEEP_SCHEMA", "PressRanges", "Range", "SweepSpec"]
 
 Range = tuple[float, float]
 """Least and greatest value; draws are uniform between them."""
+
+SWEEP_SCHEMA: Final[Schema] = {
+    "sensors": Text(length=ANY, default=("gelsight_mini",)),
+    "objects": Text(length=ANY),
+    "count": Integer("[1, 1000000000]"),
+    "shard_size": Integer("[1, 100000]", default=256),
+    "seed": Integer("[0, 4294967295]", default=0),
+    "physics": Text(choices=PHYSICS, default="rigid"),
+    "pad": Text(choices=PADS, default=None),
+    "optics": Text(default="taxim"),
+    "outputs": Text(length=ANY, default=("rgb", "height", "wrench")),
+    "markers": Text(default=None),
+    "resolution": Integer("[1, 8192]", length=2, default=None),
+    "pitch_mm": Number("[0.01, 5]", default=None),
+    "variants": Integer("[1, 10000]", default=1),
+}
+"""Keys at the top of a sweep."""
+
+RANGE_SCHEMA: Final[Schema] = {
+    "depth_mm": Number("(0, 50]", length=2),
+    "x_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
+    "y_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
+    "yaw_deg": Number("[-360, 360]", length=2, default=(0.0, 0.0)),
+    "tilt_deg": Number("[0, 180]", length=2, default=(0.0, 0.0)),
+    "shear_mm": Number("[0, 50]", length=2, default=(0.0, 0.0)),
+    "twist_deg": Number("[-180, 180]", length=2, default=(0.0, 0.0)),
+}
+"""Keys of ``[press]``: least and greatest value."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +63,15 @@ class PressRanges:
     """Length of the way sideways after the indent [m]; its direction is uniform over the circle."""
     twist: Range = (0.0, 0.0)
     """Turn about +z after that, in contact [rad]."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), RANGE_SCHEMA, "press")
+        for key in RANGE_SCHEMA:
+            name, unit = split_unit(key)
+            low, high = getattr(self, name)
+            if low > high:
+                rule = "must be the least and the greatest value, in this order"
+                raise SpecError(rule, key=f"press.{key}", value=unit.shown((low, high)))
 
 
 @dataclass(frozen=True)
@@ -66,3 +106,7 @@ class SweepSpec:
     marker_perturbation: Mapping[str, float] = field(default_factory=dict)
     """Fields of ``raytac.markers.MarkerPerturbation`` by name."""
     source: Path | None = None
+
+    def __post_init__(self) -> None:
+        own = {key: rule for key, rule in SWEEP_SCHEMA.items() if key not in ("sensors", "objects")}
+        check_fields(vars(self), own, file=self.source)

@@ -1,46 +1,18 @@
-"""Reads sweeps from TOML: the schema of ``scenes/sweeps/*.toml``."""
+"""Reads sweeps from TOML: ``scenes/sweeps/*.toml``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Final
 
+from raytac.errors import SpecError
 from raytac.specs.files import find_file
-from raytac.specs.press import PADS, PHYSICS
 from raytac.specs.press_file import load_press
 from raytac.specs.sensor_file import load_sensor
-from raytac.specs.sweep import PressRanges, SweepSpec
-from raytac.specs.toml import ANY, Integer, Number, Schema, Table, Text, read_toml
+from raytac.specs.sweep import RANGE_SCHEMA, SWEEP_SCHEMA, PressRanges, SweepSpec
+from raytac.specs.toml import Number, Schema, Table, read_toml
 
-__all__ = ["MARKER_NOISE_SCHEMA", "RANDOMIZATION_SCHEMA", "RANGE_SCHEMA", "SWEEP_SCHEMA", "load_sweep"]
-
-SWEEP_SCHEMA: Final[Schema] = {
-    "sensors": Text(length=ANY, default=("gelsight_mini",)),
-    "objects": Text(length=ANY),
-    "count": Integer("[1, 1000000000]"),
-    "shard_size": Integer("[1, 100000]", default=256),
-    "seed": Integer("[0, 4294967295]", default=0),
-    "physics": Text(choices=PHYSICS, default="rigid"),
-    "pad": Text(choices=PADS, default=None),
-    "optics": Text(default="taxim"),
-    "outputs": Text(length=ANY, default=("rgb", "height", "wrench")),
-    "markers": Text(default=None),
-    "resolution": Integer("[1, 8192]", length=2, default=None),
-    "pitch_mm": Number("[0.01, 5]", default=None),
-    "variants": Integer("[1, 10000]", default=1),
-}
-"""Keys at the top of a sweep."""
-
-RANGE_SCHEMA: Final[Schema] = {
-    "depth_mm": Number("(0, 50]", length=2),
-    "x_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
-    "y_mm": Number("[-100, 100]", length=2, default=(0.0, 0.0)),
-    "yaw_deg": Number("[-360, 360]", length=2, default=(0.0, 0.0)),
-    "tilt_deg": Number("[0, 180]", length=2, default=(0.0, 0.0)),
-    "shear_mm": Number("[0, 50]", length=2, default=(0.0, 0.0)),
-    "twist_deg": Number("[-180, 180]", length=2, default=(0.0, 0.0)),
-}
-"""Keys of ``[press]``: least and greatest value."""
+__all__ = ["MARKER_NOISE_SCHEMA", "RANDOMIZATION_SCHEMA", "load_sweep"]
 
 _WIDTH = Number("[0, 1)", default=None)
 RANDOMIZATION_SCHEMA: Final[Schema] = {
@@ -107,10 +79,10 @@ def load_sweep(name_or_path: str | Path) -> SweepSpec:
 
 def _read_ranges(table: Table) -> PressRanges:
     values = table.read(RANGE_SCHEMA)
-    for key, (low, high) in zip(RANGE_SCHEMA, values.values(), strict=True):
-        if low > high:
-            raise table.error("must be the least and the greatest value, in this order", key, table.data[key])
-    return PressRanges(**values)
+    try:
+        return PressRanges(**values)
+    except SpecError as error:
+        raise SpecError(error.rule, file=table.file, key=error.key, value=error.value) from None
 
 
 def _read_randomization(top: Table) -> tuple[dict[str, float], dict[str, float]]:

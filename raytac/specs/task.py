@@ -5,17 +5,27 @@ World frame: base of the arm, z up, x ahead.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
+from raytac.errors import SpecError
+from raytac.specs.press import PADS, PHYSICS
 from raytac.specs.sensor import SensorSpec, Vec3
+from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
+from raytac.specs.toml import ANY, Number, Schema, Text, check_fields
 
 __all__ = [
+    "BODY_SCHEMA",
     "COUPLINGS",
     "MOTIONS",
+    "MOUNT_SCHEMA",
     "OWNERS",
     "PAIR_FRICTION",
     "ROBOTS",
+    "ROBOT_SCHEMA",
+    "SHAPE_SCHEMA",
+    "TASK_SCHEMA",
     "BodySpec",
     "MountSpec",
     "Quaternion",
@@ -36,6 +46,68 @@ PAIR_FRICTION = 0.5
 
 Quaternion = tuple[float, float, float, float]
 
+_NAME = Text(pattern=r"[a-z][a-z0-9_]*", described="lower-case letters, digits and _, a letter first")
+_STEP = "[0.0001, 0.1]"
+_POSE: Final[Schema] = {
+    "position_mm": Number("[-5000, 5000]", length=3, default=(0.0, 0.0, 0.0)),
+    "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
+}
+
+TASK_SCHEMA: Final[Schema] = {
+    "physics": Text(choices=PHYSICS, default=None),
+    "pad": Text(choices=PADS, default=None),
+    "coupling": Text(choices=COUPLINGS, default="two_way"),
+    "timestep_s": Number(_STEP, default=0.002),
+    "soft_timestep_s": Number(_STEP, default=0.01),
+    "control_timestep_s": Number("[0.0001, 1]", default=0.01),
+    "gravity_m_s2": Number("[-100, 100]", length=3, default=(0.0, 0.0, -9.81)),
+}
+"""Keys at the top of a task scene."""
+
+ROBOT_SCHEMA: Final[Schema] = {
+    "model": Text(),
+    "sensor": Text(default="gelsight_mini"),
+    "joints_deg": Number("[-360, 360]", length=ANY, default=None),
+    "opening_mm": Number("[0, 200]", default=None),
+    **_POSE,
+    "arm_joints": Text(default=None),
+    "keyframe": Text(default=None),
+}
+"""Keys of ``[robot]``; which robot takes which: ``scenes/README.md``."""
+
+MOUNT_SCHEMA: Final[Schema] = {
+    "name": _NAME,
+    "at": Text(),
+    "kind": Text(choices=("body", "site"), default=None),
+    "position_mm": Number("[-5000, 5000]", length=3, default=None),
+    "quaternion_wxyz": _POSE["quaternion_wxyz"],
+}
+"""Keys of ``[[robot.mount]]``."""
+
+SHAPE_SCHEMA: Final[dict[str, Schema]] = {
+    **{kind: keys for kind, keys in OBJECT_SCHEMA.items() if kind != "none"},
+    "box": {key: Number("(0, 5000]") for key in ("length_mm", "width_mm", "height_mm")},
+    "plane": {},
+}
+"""Kind of body to the keys of its own in ``[[body]]``: a press scene's objects, larger boxes, and half-spaces."""
+
+BODY_SCHEMA: Final[Schema] = {
+    "name": _NAME,
+    **_POSE,
+    "dynamics": Text(choices=MOTIONS, default="free"),
+    "owner": Text(choices=OWNERS, default=None),
+    "mass_kg": Number("[0.00001, 1000]", default=None),
+    "density_kg_m3": Number("[1, 30000]", default=None),
+    "friction": Number("[0, 10]", default=None),
+    "gel_friction": Number("[0, 10]", default=None),
+    "youngs_modulus_kpa": Number("[1, 100000]", default=None),
+    "poisson_ratio": Number("[0, 0.49]", default=None),
+    "cell_mm": Number("[0.1, 100]", default=None),
+    "held_by": replace(_NAME, default=None),
+    "colour": Number("[0, 1]", length=3, default=None),
+}
+"""Keys of ``[[body]]`` that every kind has."""
+
 
 @dataclass(frozen=True)
 class MountSpec:
@@ -51,6 +123,10 @@ class MountSpec:
     """Origin of the pad frame in the frame of ``at`` [m]; None: the sensor stands there with its back."""
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Rotation of the pad frame in the frame of ``at``, wxyz; matters only with ``position``."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), _unturned(MOUNT_SCHEMA), "robot.mount")
+        check_quaternion(self.quaternion, "robot.mount.quaternion_wxyz")
 
 
 @dataclass(frozen=True)
@@ -75,6 +151,11 @@ class RobotSpec:
     """Joints of an MJCF robot that steer its first sensor."""
     keyframe: str | None = None
     """Keyframe of an MJCF robot that it starts from."""
+
+    def __post_init__(self) -> None:
+        given = {key: rule for key, rule in _unturned(ROBOT_SCHEMA).items() if key not in ("sensor", "arm_joints")}
+        check_fields(vars(self), given, "robot")
+        check_quaternion(self.quaternion, "robot.quaternion_wxyz")
 
 
 @dataclass(frozen=True)
@@ -113,6 +194,13 @@ class BodySpec:
     colour: Vec3 | None = None
     """Linear red, green, blue in [0, 1] for pictures."""
 
+    def __post_init__(self) -> None:
+        if self.kind not in SHAPE_SCHEMA:
+            raise SpecError("must be a known kind of body", key="body.kind", value=self.kind, choices=tuple(SHAPE_SCHEMA))
+        check_params(self.kind, self.params, SHAPE_SCHEMA[self.kind], "body")
+        check_fields(vars(self), _unturned(BODY_SCHEMA), "body")
+        check_quaternion(self.quaternion, "body.quaternion_wxyz")
+
     @property
     def friction_on_gel(self) -> float | None:
         """Coefficient against gel; None: the gelpad's own."""
@@ -141,6 +229,19 @@ class TaskScene:
     source: Path | None = None
     """File that it was read from."""
 
+    def __post_init__(self) -> None:
+        check_fields(vars(self), TASK_SCHEMA, file=self.source)
+        for long, short in (("soft_timestep", "timestep"), ("control_timestep", "soft_timestep")):
+            ratio = getattr(self, long) / getattr(self, short)
+            if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
+                rule = f"must be a whole multiple of {short}_s = {getattr(self, short):g}"
+                raise SpecError(rule, file=self.source, key=f"{long}_s", value=getattr(self, long))
+
     def body(self, name: str) -> BodySpec:
         """The body of that name; raises ``KeyError`` if there is none."""
         return {body.name: body for body in self.bodies}[name]
+
+
+def _unturned(schema: Schema) -> Schema:
+    """The schema without the quaternion, which has a rule of its own."""
+    return {key: rule for key, rule in schema.items() if key != "quaternion_wxyz"}

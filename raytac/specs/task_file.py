@@ -1,47 +1,27 @@
-"""Reads task scenes from TOML: the schemas of ``scenes/tasks/*.toml``."""
+"""Reads task scenes from TOML: ``scenes/tasks/*.toml``."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from raytac.specs.files import find_file, is_file
-from raytac.specs.press import PADS, PHYSICS
-from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, resolved, unit_quaternion
-from raytac.specs.task import COUPLINGS, MOTIONS, OWNERS, ROBOTS, BodySpec, MountSpec, RobotSpec, TaskScene
-from raytac.specs.toml import ANY, Number, Schema, Table, Text, read_toml, split_unit
+from raytac.specs.shape_file import check_shape, resolved, unit_quaternion
+from raytac.specs.task import (
+    BODY_SCHEMA,
+    MOUNT_SCHEMA,
+    ROBOT_SCHEMA,
+    ROBOTS,
+    SHAPE_SCHEMA,
+    TASK_SCHEMA,
+    BodySpec,
+    MountSpec,
+    RobotSpec,
+    TaskScene,
+)
+from raytac.specs.toml import Schema, Table, Text, read_toml, split_unit
 
-__all__ = ["BODY_SCHEMA", "MOUNT_SCHEMA", "ROBOT_SCHEMA", "SHAPE_SCHEMA", "TASK_SCHEMA", "load_task"]
-
-_NAME = Text(pattern=r"[a-z][a-z0-9_]*", described="lower-case letters, digits and _, a letter first")
-_STEP = "[0.0001, 0.1]"
-_POSE: Final[Schema] = {
-    "position_mm": Number("[-5000, 5000]", length=3, default=(0.0, 0.0, 0.0)),
-    "quaternion_wxyz": Number("[-1, 1]", length=4, default=(1.0, 0.0, 0.0, 0.0)),
-}
-
-TASK_SCHEMA: Final[Schema] = {
-    "physics": Text(choices=PHYSICS, default=None),
-    "pad": Text(choices=PADS, default=None),
-    "coupling": Text(choices=COUPLINGS, default="two_way"),
-    "timestep_s": Number(_STEP, default=0.002),
-    "soft_timestep_s": Number(_STEP, default=0.01),
-    "control_timestep_s": Number("[0.0001, 1]", default=0.01),
-    "gravity_m_s2": Number("[-100, 100]", length=3, default=(0.0, 0.0, -9.81)),
-}
-"""Keys at the top of a task scene."""
-
-ROBOT_SCHEMA: Final[Schema] = {
-    "model": Text(),
-    "sensor": Text(default="gelsight_mini"),
-    "joints_deg": Number("[-360, 360]", length=ANY, default=None),
-    "opening_mm": Number("[0, 200]", default=None),
-    **_POSE,
-    "arm_joints": Text(default=None),
-    "keyframe": Text(default=None),
-}
-"""Keys of ``[robot]``; which robot takes which: ``scenes/README.md``."""
+__all__ = ["load_task"]
 
 _OWN: Final = {
     "panda_one_sensor": ("joints_deg",),
@@ -51,39 +31,6 @@ _OWN: Final = {
     "": ("arm_joints", "keyframe", "mount"),
 }
 """Keys that each robot takes besides ``model`` and ``sensor``; the last is an MJCF file."""
-
-MOUNT_SCHEMA: Final[Schema] = {
-    "name": _NAME,
-    "at": Text(),
-    "kind": Text(choices=("body", "site"), default=None),
-    "position_mm": Number("[-5000, 5000]", length=3, default=None),
-    "quaternion_wxyz": _POSE["quaternion_wxyz"],
-}
-"""Keys of ``[[robot.mount]]``."""
-
-SHAPE_SCHEMA: Final[dict[str, Schema]] = {
-    **{kind: keys for kind, keys in OBJECT_SCHEMA.items() if kind != "none"},
-    "box": {key: Number("(0, 5000]") for key in ("length_mm", "width_mm", "height_mm")},
-    "plane": {},
-}
-"""Kind of body to the keys of its own in ``[[body]]``: a press scene's objects, larger boxes, and half-spaces."""
-
-BODY_SCHEMA: Final[Schema] = {
-    "name": _NAME,
-    **_POSE,
-    "dynamics": Text(choices=MOTIONS, default="free"),
-    "owner": Text(choices=OWNERS, default=None),
-    "mass_kg": Number("[0.00001, 1000]", default=None),
-    "density_kg_m3": Number("[1, 30000]", default=None),
-    "friction": Number("[0, 10]", default=None),
-    "gel_friction": Number("[0, 10]", default=None),
-    "youngs_modulus_kpa": Number("[1, 100000]", default=None),
-    "poisson_ratio": Number("[0, 0.49]", default=None),
-    "cell_mm": Number("[0.1, 100]", default=None),
-    "held_by": replace(_NAME, default=None),
-    "colour": Number("[0, 1]", length=3, default=None),
-}
-"""Keys of ``[[body]]`` that every kind has."""
 
 _OF_MOTION: Final = {
     "owner": ("free",),
@@ -116,20 +63,11 @@ def load_task(name_or_path: str | Path) -> TaskScene:
     values = top.read(TASK_SCHEMA, sections=("robot", "body"))
     if values["pad"] is not None and values["physics"] != "ipc":
         raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", values["pad"])
-    _check_steps(top, values)
     robot = _read_robot(top.section("robot"))
     tables = top.sections("body")
     bodies = tuple(_read_body(table) for table in tables)
     _check_names(tables, bodies)
     return TaskScene(path.stem, robot, bodies, source=path, **values)
-
-
-def _check_steps(top: Table, values: dict[str, Any]) -> None:
-    for long, short in (("soft_timestep", "timestep"), ("control_timestep", "soft_timestep")):
-        ratio = values[long] / values[short]
-        if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
-            rule = f"must be a whole multiple of {short}_s = {values[short]:g}"
-            raise top.error(rule, f"{long}_s", values[long])
 
 
 def _read_robot(table: Table) -> RobotSpec:

@@ -15,14 +15,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from raytac.checks import Interval, is_number, is_whole
 from raytac.errors import SpecError
 
-__all__ = ["ANY", "REQUIRED", "Integer", "Interval", "Number", "Schema", "Table", "Text", "Unit", "read_toml", "split_unit"]
+__all__ = [
+    "ANY",
+    "REQUIRED",
+    "Integer",
+    "Number",
+    "Schema",
+    "Table",
+    "Text",
+    "Unit",
+    "check_fields",
+    "read_toml",
+    "split_unit",
+]
 
 REQUIRED: Final = object()
 """Default of a field that a file must give."""
 ANY: Final = -1
 """Length of a list of one value or more."""
+_LARGEST: Final = 2**22
+"""Longest file that is read [byte]; the parser takes minutes for a hundred megabytes."""
 
 _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "m_per_unit": (1.0, 1.0, "m per file unit"),
@@ -58,6 +73,14 @@ class Unit:
     def to_si(self, value: float) -> float:
         return value * self.numerator / self.denominator
 
+    def shown(self, value: Any) -> Any:
+        """A value in SI as a file would write it: a number or some, in this unit to six digits; anything else as it is."""
+        if isinstance(value, (tuple, list)):
+            return [self.shown(item) for item in value]
+        if not is_number(value) or self == Unit():
+            return value
+        return float(f"{float(value) * self.denominator / self.numerator:.6g}")
+
 
 def split_unit(key: str) -> tuple[str, Unit]:
     """``"thickness_mm"`` to ``("thickness", millimetres)``; a key without a unit suffix is its own name and keeps its value."""
@@ -65,28 +88,6 @@ def split_unit(key: str) -> tuple[str, Unit]:
         if key.endswith("_" + suffix):
             return key[: -len(suffix) - 1], Unit(*parts)
     return key, Unit()
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A range of numbers, written as in mathematics: ``[0, 1)``. A closed infinite end admits ``inf`` itself."""
-
-    low: float
-    high: float
-    low_open: bool
-    high_open: bool
-
-    @classmethod
-    def parse(cls, text: str) -> Interval:
-        match = re.fullmatch(r"([\[(])\s*(\S+)\s*,\s*(\S+?)\s*([\])])", text)
-        if match is None:
-            raise ValueError(f"interval {text!r} is not of the form [low, high)")
-        return cls(float(match[2]), float(match[3]), match[1] == "(", match[4] == ")")
-
-    def __contains__(self, value: float) -> bool:
-        above = value > self.low if self.low_open else value >= self.low
-        below = value < self.high if self.high_open else value <= self.high
-        return above and below  # False for NaN
 
 
 class _Refused(Exception):
@@ -129,9 +130,17 @@ class Number:
             number = float(value)
         except OverflowError:
             raise _Refused(self.rule(unit)) from None
-        if number not in self._range:
+        si = unit.to_si(number)
+        if number not in self._range or si not in _in_si(self._range, unit):  # a tiny length may become 0 m
             raise _Refused(self.rule(unit))
-        return unit.to_si(number)
+        return si
+
+    def check(self, value: object, unit: Unit) -> None:
+        """Refuse a value in SI that no file could give."""
+        interval = _in_si(self._range, unit)
+        for item in _items(value, self.length, self.rule(unit)):
+            if not is_number(item) or item not in interval:
+                raise _Refused(self.rule(unit))
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,13 @@ class Integer:
         if isinstance(value, bool) or not isinstance(value, int) or value not in Interval.parse(self.interval):
             raise _Refused(self.rule(unit))
         return value
+
+    def check(self, value: object, unit: Unit) -> None:
+        """Refuse a value that no file could give."""
+        interval = Interval.parse(self.interval)
+        for item in _items(value, self.length, self.rule(unit)):
+            if not is_whole(item) or item not in interval:
+                raise _Refused(self.rule(unit))
 
 
 @dataclass(frozen=True)
@@ -196,8 +212,47 @@ class Text:
             raise _Refused(self.rule(unit))
         return value
 
+    def check(self, value: object, unit: Unit) -> None:
+        """Refuse a value that no file could give."""
+        self.parse(list(value) if isinstance(value, tuple) else value, unit)
+
+
+def _in_si(interval: Interval, unit: Unit) -> Interval:
+    """The same range in SI. Conversion is monotone, so that what lies in the range of the file lies in this one."""
+    return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
+
+
+def _items(value: object, length: int, rule: str) -> Sequence[Any]:
+    """The numbers of a field: one, or as many as ``length`` says."""
+    if not length:
+        return (value,)
+    if not isinstance(value, (tuple, list)) or (len(value) != length and not (length == ANY and value)):
+        raise _Refused(rule)
+    return value
+
 
 Schema = Mapping[str, Number | Integer | Text]
+
+
+def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
+    """Check values in SI, by name, against the schema of the table that describes them in a file; ``vars`` gives those of a dataclass.
+
+    Thus a specification that was made or changed in code obeys the rules of one from a file. The default of a field needs no check.
+
+    Raises:
+        SpecError: a value of the wrong type or out of its range; the message gives the key and the value as a file would write them.
+    """
+    for key, spec in schema.items():
+        name, unit = split_unit(key)
+        value = values.get(name)
+        if (value is None or value == ()) and value == spec.default:
+            continue
+        try:
+            spec.check(value, unit)
+        except _Refused as refused:
+            dotted = f"{prefix}.{key}" if prefix else key
+            shown = "None" if value is None else unit.shown(value)
+            raise SpecError(refused.rule, file=file, key=dotted, value=shown, choices=refused.choices) from None
 
 
 @dataclass(frozen=True)
@@ -265,15 +320,20 @@ def read_toml(path: Path) -> Table:
     """The top table of a TOML file.
 
     Raises:
-        SpecError: the file is missing, cannot be read, or is not TOML.
+        SpecError: the file is missing, cannot be read, is longer than ``_LARGEST``, or is not TOML.
     """
     try:
         with path.open("rb") as stream:
-            data = tomllib.load(stream)
+            text = stream.read(_LARGEST + 1)
+        if len(text) > _LARGEST:
+            raise SpecError(f"the file must be at most {_LARGEST} bytes long", file=path)
+        data = tomllib.loads(text.decode())
     except FileNotFoundError:
         raise SpecError("the file does not exist", file=path) from None
     except OSError as error:
         raise SpecError(f"the file cannot be read ({error.strerror})", file=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise SpecError(f"the file is not valid TOML ({error})", file=path) from error
+    except RecursionError as error:
+        raise SpecError("the file is not valid TOML (its values are nested too deep)", file=path) from error
+    except ValueError as error:  # tomllib's, of the encoding, and Python's of an integer or a date that it does not make
+        raise SpecError(f"the file is not valid TOML ({str(error)[:200]})", file=path) from error
     return Table(data, path)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from raytac.checks import check_numbers, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
@@ -24,7 +25,7 @@ from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.pose import body_poses, site_poses
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import check_physics, check_whole
+from raytac.sensor.options import check_physics
 from raytac.specs.press import PADS, chosen_physics
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
@@ -236,9 +237,7 @@ class TactileWorld:
 
     @staticmethod
     def _checked_start(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        values = np.asarray(value, float)
-        if values.shape != shape:
-            raise InputError(name, value=values.shape, rule=f"must have the shape {shape}, one row an environment named")
+        values = check_numbers(name, value, shape)
         if not np.isfinite(values).all():
             bad = int(np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))[0])
             raise InputError(name, value=values[bad].tolist(), rule=f"must be finite; row {bad} is not")

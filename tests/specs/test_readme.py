@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from raytac.assets import asset_root
-from raytac.specs.press_file import OBJECT_SCHEMA, POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
-from raytac.specs.sensor_file import LED_SCHEMA, SENSOR_SCHEMA
+from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
+from raytac.specs.sensor import LED_SCHEMA, SENSOR_SCHEMA
+from raytac.specs.shape_file import OBJECT_SCHEMA
 from raytac.specs.toml import ANY, Integer, Number, Schema, Text
 
 README = asset_root("scenes") / "README.md"

@@ -84,7 +84,7 @@ def test_a_short_sweep_is_rigid_with_the_table(tmp_path: Path) -> None:
     [
         (LEAST, "press: missing table [press]"),
         (LEAST + "[press]\n", "press.depth_mm: missing key"),
-        (LEAST + "[press]\ndepth_mm = [1, 0.2]", "press.depth_mm = [1, 0.2]: must be the least and the greatest"),
+        (LEAST + "[press]\ndepth_mm = [1, 0.2]", "press.depth_mm = [1.0, 0.2]: must be the least and the greatest"),
         (LEAST + "[press]\ndepth_mm = [0.2]", "press.depth_mm = [0.2]: must be 2 numbers"),
         (LEAST + PRESS + "depth = 3", "press.depth: unknown key; did you mean 'depth_mm'"),
         ("count = 3\n" + PRESS, "objects: missing key: must be a list"),

@@ -10,8 +10,17 @@ import pytest
 from raytac.assets import asset_root
 from raytac.errors import SpecError
 from raytac.specs import available, load_task
-from raytac.specs.task import COUPLINGS, MOTIONS, OWNERS, ROBOTS
-from raytac.specs.task_file import BODY_SCHEMA, MOUNT_SCHEMA, ROBOT_SCHEMA, SHAPE_SCHEMA, TASK_SCHEMA
+from raytac.specs.task import (
+    BODY_SCHEMA,
+    COUPLINGS,
+    MOTIONS,
+    MOUNT_SCHEMA,
+    OWNERS,
+    ROBOT_SCHEMA,
+    ROBOTS,
+    SHAPE_SCHEMA,
+    TASK_SCHEMA,
+)
 from raytac.specs.toml import ANY, Number
 
 SCENE = """

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from raytac.checks import Interval
 from raytac.errors import SpecError
-from raytac.specs.toml import Integer, Interval, Number, Table, Text, read_toml, split_unit
+from raytac.specs.toml import Integer, Number, Table, Text, read_toml, split_unit
 
 SCHEMA = {"thickness_mm": Number("(0, 50]"), "radius_mm": Number("[1, inf]", length=2), "rows": Integer("[0, 9]"), "name": Text()}
 GOOD = {"thickness_mm": 4.0, "radius_mm": [210, math.inf], "rows": 3, "name": "mini"}

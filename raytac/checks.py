@@ -1,0 +1,123 @@
+"""Checks of arguments: each returns the value in its own type, or raises ``InputError`` with the argument's name, value and rule."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.errors import InputError
+
+__all__ = [
+    "Interval",
+    "check_known",
+    "check_methods",
+    "check_number",
+    "check_numbers",
+    "check_seed",
+    "check_seeds",
+    "check_whole",
+    "is_number",
+    "is_whole",
+]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A range of numbers, written as in mathematics: ``[0, 1)``. A closed infinite end admits ``inf`` itself."""
+
+    low: float
+    high: float
+    low_open: bool
+    high_open: bool
+
+    @classmethod
+    def parse(cls, text: str) -> Interval:
+        match = re.fullmatch(r"([\[(])\s*(\S+)\s*,\s*(\S+?)\s*([\])])", text)
+        if match is None:
+            raise ValueError(f"interval {text!r} is not of the form [low, high)")
+        return cls(float(match[2]), float(match[3]), match[1] == "(", match[4] == ")")
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self.low_open else value >= self.low
+        below = value < self.high if self.high_open else value <= self.high
+        return above and below  # False for NaN
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a real number of Python or NumPy; a truth value is none."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def is_whole(value: object) -> bool:
+    """Whether a value is a whole number of Python or NumPy; a truth value is none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def check_known(name: str, value: object, choices: Sequence[str]) -> str:
+    """``value``, one of ``choices``."""
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(name, value=value, rule="must be a known name", choices=choices)
+    return value
+
+
+def check_whole(name: str, value: object, low: int = 1, high: int | None = None) -> int:
+    """A whole number of at least ``low`` and at most ``high``."""
+    if not is_whole(value) or value < low or (high is not None and value > high):  # type: ignore[operator]
+        rule = f"must be a whole number >= {low}" if high is None else f"must be a whole number in [{low}, {high}]"
+        raise InputError(name, value=value, rule=rule)
+    return int(value)  # type: ignore[call-overload]
+
+
+def check_number(name: str, value: object, interval: str, unit: str = "") -> float:
+    """A real number in an interval such as ``(0, inf)``."""
+    if not is_number(value) or value not in Interval.parse(interval):
+        raise InputError(name, value=value, rule=f"must be a number in {interval}{' ' + unit if unit else ''}")
+    return float(value)  # type: ignore[arg-type]
+
+
+def check_seed(name: str, value: object) -> int:
+    """A whole number in [0, 2^32)."""
+    if not is_whole(value) or not 0 <= value < 2**32:  # type: ignore[operator]
+        raise InputError(name, value=value, rule="must be a whole number in [0, 2^32)")
+    return int(value)  # type: ignore[call-overload]
+
+
+def check_seeds(name: str, values: object, count: int) -> list[int]:
+    """Whole numbers >= 0, one for each of ``count`` environments."""
+    if not isinstance(values, (Sequence, np.ndarray)) or isinstance(values, (str, bytes)) or len(values) != count:
+        size = len(values) if isinstance(values, (Sequence, np.ndarray)) else values
+        raise InputError(name, value=size, rule=f"must be whole numbers >= 0, one for each of {count} environments")
+    return [check_whole(f"{name}[{i}]", value, 0) for i, value in enumerate(values)]
+
+
+def check_numbers(name: str, values: object, shape: tuple[int | None, ...], *, finite: bool = False) -> np.ndarray:
+    """Real numbers as a float64 array of ``shape``; None in it is any length.
+
+    Refused are complex numbers, dates, text, objects, truth values, lists that are no box of numbers, and masked entries.
+    """
+    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(name, value=values, rule=f"must be numbers of shape {wanted}") from error
+    if array.dtype.kind not in "iuf":
+        raise InputError(name, value=str(array.dtype), rule=f"must be real numbers of shape {wanted}")
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        raise InputError(name, value=array.shape, rule=f"must have shape {wanted}")
+    if np.ma.is_masked(values):
+        raise InputError(name, value=array.shape, rule="must have no masked entries")
+    array = array.astype(float)
+    if finite and not np.isfinite(array).all():
+        raise InputError(name, value=float(array[~np.isfinite(array)][0]), rule="must be finite everywhere")
+    return array
+
+
+def check_methods(name: str, value: object, methods: Sequence[str], attributes: Sequence[str], what: str) -> None:
+    """Refuse an object that is not ``what`` its methods and attributes make it."""
+    missing = [m for m in methods if not callable(getattr(value, m, None))] + [a for a in attributes if not hasattr(value, a)]
+    if missing or isinstance(value, type):
+        rule = f"must be {what}" + (f", which has {', '.join((*attributes, *methods))}" if missing else ", not its class")
+        raise InputError(name, value=value, rule=rule)
