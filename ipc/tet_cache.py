@@ -62,7 +62,7 @@ def kept_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMes
 def keep_tets(path: Path | None, mesh: TetMesh, surface: TriMesh, edge_length: float) -> None:
     """Write a mesh beside ``path``, synchronise it with the disk, and rename it; a warning where that cannot be."""
     stream = io.BytesIO()
-    np.savez(stream, vertices=mesh.vertices, tets=mesh.tets, **_request(surface, edge_length))
+    np.savez(stream, allow_pickle=False, vertices=mesh.vertices, tets=mesh.tets, **_request(surface, edge_length))
     data = stream.getvalue()
     try:
         if path is None:

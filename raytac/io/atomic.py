@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import secrets
 import stat
 from pathlib import Path
-from typing import BinaryIO
 
 __all__ = ["PARTIAL", "open_regular", "read_regular", "sync_folder", "write_atomic"]
 
@@ -49,7 +49,7 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> io.BufferedReader:
     """Open a regular file for reading; a pipe or a device of that name is an error and is not waited for.
 
     Raises:

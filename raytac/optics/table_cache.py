@@ -103,7 +103,8 @@ def _save(table: PolyTable, folder: Path) -> None:
 
 def _load(folder: Path) -> PolyTable:
     """The table of a folder of which every file agrees with its checksum; raises ``ValueError`` or ``OSError``."""
-    listed = dict(reversed(line.split("  ", 1)) for line in read_regular(folder / CHECKSUMS).decode().splitlines())
+    lines = (line.partition("  ") for line in read_regular(folder / CHECKSUMS).decode().splitlines())
+    listed = {name: digest for digest, _, name in lines}
     there = {path.name for path in folder.iterdir()} - {CHECKSUMS}
     if not listed or set(listed) != there:
         raise ValueError(f"{CHECKSUMS} does not list the files that are there")

@@ -31,9 +31,9 @@ def fills(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return made
 
 
-def _npz(**arrays: np.ndarray) -> bytes:
+def _npz(vertices: np.ndarray, tets: np.ndarray) -> bytes:
     stream = io.BytesIO()
-    np.savez(stream, **arrays)
+    np.savez(stream, vertices=vertices, tets=tets)
     return stream.getvalue()
 
 
