@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStac
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
 from raytac.errors import InputError
+from raytac.io.atomic import write_atomic
 from raytac.observe import ObservationSettings
 from raytac.report.proportion import wilson_interval
 
@@ -157,7 +158,6 @@ class Checkpoint:
 
     def save(self, path: Path, *, resumable: bool = True) -> None:
         """Write it; never half. Without the optimiser's state (``resumable=False``) it is a third as large and good for playing."""
-        part = path.with_name(path.name + ".partial")
         values = {
             "recipe": asdict(self.recipe),
             "steps": self.steps,
@@ -165,8 +165,9 @@ class Checkpoint:
             "optimizer": self.optimizer if resumable else {},
             "normaliser": self.normaliser,
         }
-        torch.save(values, part)
-        os.replace(part, path)
+        stream = io.BytesIO()
+        torch.save(values, stream)
+        write_atomic(path, stream.getvalue())
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:

@@ -23,6 +23,8 @@ import tyro
 from raytac.device import resolve_device
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.errors import InputError, RaytacError
+from raytac.io.atomic import write_atomic
+from raytac.io.lock import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.observe import MODALITIES, ObservationSettings
@@ -79,15 +81,15 @@ def main(args: Args) -> dict[str, Metric]:
             raise InputError(name, value=value, rule="must be 1 or more")
     device = resolve_device(args.device)
     out = args.out or Path("runs/soak")
-    kept = {name: resumed(out / f"{name}.json", settings_of(args)) for name in names}
-    out.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Metric] = {"experiment": "soak", "device": device, "seed": args.seed, **machine()}
-    for name in names:
-        blocks = run(name, args, modalities, kept[name], out / f"{name}.json")
-        found |= {f"{name}.{key}": value for key, value in summary(blocks).items()}
-        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in summary(blocks).items()), flush=True)
-    found |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "gymnasium"))}
-    write_metrics(out / "metrics.json", found)
+    with FolderLock(out):
+        kept = {name: resumed(out / f"{name}.json", settings_of(args)) for name in names}
+        found: dict[str, Metric] = {"experiment": "soak", "device": device, "seed": args.seed, **machine()}
+        for name in names:
+            blocks = run(name, args, modalities, kept[name], out / f"{name}.json")
+            found |= {f"{name}.{key}": value for key, value in summary(blocks).items()}
+            print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in summary(blocks).items()), flush=True)
+        found |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "gymnasium"))}
+        write_metrics(out / "metrics.json", found)
     print(f"-> {out}")
     return found
 
@@ -154,9 +156,7 @@ def settings_of(args: Args) -> dict[str, object]:
 
 def store(path: Path, settings: dict[str, object], blocks: list[Block]) -> None:
     """The record, replaced in one move."""
-    part = path.with_suffix(".partial")
-    part.write_text(json.dumps({"settings": settings, "blocks": [vars(block) for block in blocks]}), "utf-8")
-    part.replace(path)
+    write_atomic(path, json.dumps({"settings": settings, "blocks": [vars(block) for block in blocks]}).encode())
 
 
 def resumed(path: Path, settings: dict[str, object]) -> list[Block]:

@@ -181,7 +181,7 @@ def _train(job: _Job) -> None:
         write_metrics(job.folder / "metrics.json", found | versions(("stable_baselines3", "torch")))
         print(f"{args.task} {job.name}: success {result.successes}/{result.episodes} ({low:.2f} to {high:.2f})", flush=True)
     finally:
-        training.learner.close()
+        training.close()
 
 
 def _final_s(args: Args, last: float, recipe: Any) -> float:

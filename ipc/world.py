@@ -20,6 +20,7 @@ from ipc.potential import Potential
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.state import State, start_state, teleported
+from ipc.warp_start import start_warp
 
 __all__ = ["State", "World"]
 
@@ -57,7 +58,7 @@ class World:
         self.bodies = tuple(bodies)
         self.num_envs = num_envs
         self.layout = build_layout(self.bodies, self.settings.friction, friction or {}, ignored)
-        wp.init()
+        start_warp()
         if device == "auto":
             device = "cuda" if wp.is_cuda_available() else "cpu"
         try:

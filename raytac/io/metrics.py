@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from raytac.errors import InputError
+from raytac.io.atomic import write_atomic
 
 __all__ = ["REQUIRED", "VERSIONED", "Metric", "check_metrics", "read_metrics", "versions", "write_metrics"]
 
@@ -76,7 +77,7 @@ def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]
         InputError: see ``check_metrics``; nothing is written then.
     """
     checked = check_metrics(values)
-    path.write_text(json.dumps(checked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_atomic(path, (json.dumps(checked, indent=1, ensure_ascii=False) + "\n").encode())
     return checked
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import ipc
 from raytac.errors import InputError
 from raytac.gel.part import Part
+from raytac.io.cache import cache_folder
 from raytac.physics.part_surface import SAG, enclosed_volume, object_surface
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_skin import SoftSkin
@@ -131,7 +132,7 @@ def _soft(
         pose = parts[0].object_from_part
         tets = ipc.TetMesh(cut.vertices @ pose[:3, :3].T + pose[:3, 3], cut.tets)
     else:
-        tets = ipc.tetrahedralize(object_surface(parts, 0.05 * cell), cell)
+        tets = ipc.tetrahedralize(object_surface(parts, 0.05 * cell), cell, cache_folder("tets"))
     bonded = np.zeros(0, np.int64)
     if held is not None:
         bonded = np.flatnonzero(held(tets.vertices))
@@ -184,7 +185,7 @@ def object_body(
             volume = _volume(surface)
             return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
-            tets = ipc.tetrahedralize(surface, edge_length)
+            tets = ipc.tetrahedralize(surface, edge_length, cache_folder("tets"))
             if not np.allclose(rotations[:, 2], rotations[0, 2], atol=1e-9):
                 rule = "held at its top, so a soft object must be tilted the same in all environments"
                 raise InputError("rotations", value=rotations[:, 2].tolist(), rule=rule)

@@ -121,6 +121,7 @@ def test_a_training_that_was_interrupted_ends_with_the_same_weights(tmp_path: Pa
     first.run_segment()
     with (tmp_path / "cut" / "progress.csv").open("a", encoding="utf-8") as file:
         file.write("48,9.0,0,,,,0.3\n")  # what a training that was killed may leave beyond its checkpoint
+    first.close()
     second = Training(RECIPE, tmp_path / "cut", evaluation=2, say=lambda _: None)
     assert second.steps == 32 and not second.is_done
     second.run_segment()
@@ -136,8 +137,26 @@ def test_a_training_that_was_interrupted_ends_with_the_same_weights(tmp_path: Pa
         rows = [list(csv.DictReader((tmp_path / run / name).open(encoding="utf-8"))) for run in ("whole", "cut")]
         assert [row["steps"] for row in rows[0]] == [row["steps"] for row in rows[1]] == ["32", "64"]
     assert [row["return"] for row in rows[0]] == [row["return"] for row in rows[1]]
+    whole.close()
+    second.close()
     with pytest.raises(InputError, match="'gamma'"):
         Training(replace(RECIPE, gamma=0.5), tmp_path / "cut")
+
+
+def test_a_second_training_stays_out_of_the_folder_of_the_first(tmp_path: Path) -> None:
+    first = Training(RECIPE, tmp_path / "run", evaluation=2, say=lambda _: None)
+    first.run_segment()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    for recipe in (RECIPE, replace(RECIPE, seed=1)):
+        with pytest.raises(InputError, match="in use by another run"):
+            Training(recipe, tmp_path / "run", evaluation=2)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    first.close()
+    with pytest.raises(InputError, match="another recipe"):
+        Training(replace(RECIPE, seed=1), tmp_path / "run")
+    second = Training(RECIPE, tmp_path / "run", evaluation=2)  # the refusal gave the folder back
+    assert second.steps == 32
+    second.close()
 
 
 def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path) -> None:
@@ -186,7 +205,10 @@ def test_time_of_imitation_counts_after_a_resume(tmp_path: Path) -> None:
     first = Training(recipe, tmp_path, evaluation=2, say=lambda _: None)
     first.run_segment()
     assert not (tmp_path / "progress.csv").exists(), "no rollout of PPO yet"
-    assert Training(recipe, tmp_path, evaluation=2).wall_s == pytest.approx(first.wall_s, abs=0.01) and first.wall_s > 0.01
+    first.close()
+    second = Training(recipe, tmp_path, evaluation=2)
+    assert second.wall_s == pytest.approx(first.wall_s, abs=0.01) and first.wall_s > 0.01
+    second.close()
 
 
 def test_modalities_by_name() -> None:
