@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from raytac.errors import InputError
-from raytac.io.options import DeviceName, parse_resolution
+from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.physics.solver import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
@@ -55,6 +55,9 @@ class ViewArgs:
     """WIDTHxHEIGHT of the tactile image in pixels."""
     host: str = "127.0.0.1"
     """Address to serve at. Whoever can reach it can move the sliders: 127.0.0.1 is this machine only, 0.0.0.0 everyone."""
+    allow_host: str | None = None
+    """Names beside this machine's addresses that browsers may open the page by, joined by commas: gpu3.example.org, or NAME:PORT where
+    something forwards another port. All other names are refused."""
     port: int = 8080
     """Port to serve at; 0 takes any that is free."""
     device: DeviceName = "auto"
@@ -68,7 +71,8 @@ class ViewArgs:
         from raytac.view.viewer import Viewer, check_address, check_viewer
 
         check_viewer()
-        check_address(self.host, self.port)
+        allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
+        check_address(self.host, self.port, allowed)
         if self.optics not in OPTICS:
             raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
         scene = load_scene(self.scene)
@@ -78,7 +82,7 @@ class ViewArgs:
             if not self.verbose:
                 hush_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
-        with Viewer(session, host=self.host, port=self.port) as viewer:
+        with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")
             print(
                 f"raytac: open {viewer.url} (elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST); Ctrl-C ends",

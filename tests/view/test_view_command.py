@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import re
 import signal
@@ -24,7 +25,9 @@ def command(*args: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def test_it_serves_until_ctrl_c(tmp_path):
-    running = command("sphere", "--optics", "phong", "--resolution", "80x60", "--port", "0", cwd=tmp_path)
+    running = command(
+        "sphere", "--optics", "phong", "--resolution", "80x60", "--port", "0", "--allow-host", "gpu3.example.org:80", cwd=tmp_path
+    )
     try:
         assert running.stdout is not None
         for line in running.stdout:
@@ -33,6 +36,10 @@ def test_it_serves_until_ctrl_c(tmp_path):
                 break
         else:
             raise AssertionError(running.stderr.read() if running.stderr else "")
+        for name, status in (("gpu3.example.org", 200), ("evil.example", 403)):
+            link = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=10.0)
+            link.request("GET", "/", headers={"Host": name})
+            assert link.getresponse().status == status
         client = PageClient(int(found[1]))
         client.until(lambda: "sphere · gelsight_mini · rigid+phong" in client.texts(), "the title", 60.0)
         client.until(lambda: "paused" in client.texts(), "the first image", 60.0)
@@ -56,6 +63,7 @@ def test_it_serves_until_ctrl_c(tmp_path):
         (("sphere", "--physics", "soft"), "choose from: rigid, ipc"),
         (("sphere", "--resolution", "big"), "WIDTHxHEIGHT"),
         (("sphere", "--markers", "fots"), "markers"),
+        (("sphere", "--allow-host", "http://gpu3.example.org/"), "allow_host = .*must be a host name"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_nothing_is_served(tmp_path, args, said):
