@@ -195,6 +195,8 @@ class SoftScene:
         return SceneReport(
             report.failed,
             report.converged,
+            (~report.converged & ~report.failed).astype(int),
+            report.converged,
             report.min_gap,
             report.min_det,
             report.blocked,
