@@ -74,6 +74,12 @@ class SoftContact:
         self.converged[:] = True
         self._world_from_pad = np.tile(np.eye(4), (len(self._world_from_pad), 1, 1))
 
+    def fail(self, envs: np.ndarray) -> None:
+        """Step environments of a mask (B,) no more until the next ``reset``, so that they cost nothing and keep no other waiting."""
+        new = envs & ~self.scene.failed
+        if new.any():
+            self.scene.fail(new)
+
     def drive(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None = None) -> np.ndarray:
         """One step that takes the object to ``pad_from_object`` (B, 4, 4); the case moves if ``world_from_pad`` (B, 4, 4) is given.
 
@@ -112,6 +118,7 @@ class SoftContact:
         for _ in range(_SETTLINGS):
             if not forces[~lost].any():
                 break
+            self.fail(lost)
             lost |= self.drive(pad_from_object, world_from_pad)
             before, forces = forces, self.forces()
             changed, borne = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces - before, forces))

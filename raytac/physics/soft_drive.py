@@ -171,8 +171,10 @@ class SoftDrive:
                 self._kept = self._kept + np.clip(self._off(), -STEP, STEP)
 
     def _step(self) -> None:
-        self.failed |= self._solver.drive(self.poses(), self.case())
-        self.bar.update()
+        self._solver.fail(self.failed)
+        if not self.failed.all():
+            self.failed |= self._solver.drive(self.poses(), self.case())
+            self.bar.update()
 
     def _converge(self) -> None:
         """Stand still for some steps where the last one did not meet the solver's tolerance; what does not meet it then has failed."""
@@ -264,6 +266,7 @@ class SoftDrive:
         assert self._weight > 0.0
         self._solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
+            self._solver.fail(self.failed)
             self.failed |= self._solver.drive(self.poses())
             self.bar.update()
             if (self._solver.speed()[~self.failed] < _STILL).all() and (self._normal_force()[~self.failed] > 0.0).all():
