@@ -192,6 +192,8 @@ class SoftPads:
                 reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
                 since = 0
         failed |= ~reports[-1].last_converged
+        if (failed & ~self.soft.failed).any():
+            self.soft.fail(failed)
         self.report = _joined(reports) | {"inside_robot": self._depth_inside(datas, failed)}
         self._unconverged += self.report["unconverged"]
 
