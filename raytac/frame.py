@@ -62,6 +62,9 @@ class TactileFrame:
     ``force``, and for a simulated pad, which follows no such law."""
     failed: np.ndarray | None = None
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
+    unconverged: np.ndarray | None = None
+    """Steps of a simulated pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
+    shape (B,), int. An environment whose last step is one of them has ``failed``. None for the rigid pad, and as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
     """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 

@@ -56,9 +56,9 @@ class SceneBody:
 
 
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
-    """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names."""
+    """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names; its folds touch and never pass through each other."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded)
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
 
 
 def scene_body(
