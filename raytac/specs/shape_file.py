@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -10,6 +11,7 @@ from typing import Any, Final
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import is_file
 from raytac.specs.mesh import load_mesh
+from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.toml import Integer, Number, Schema, Table, Text
 
 __all__ = ["OBJECT_SCHEMA", "check_shape", "resolved", "unit_quaternion"]
@@ -86,12 +88,18 @@ def _check_lengths(table: Table, kind: str, p: Mapping[str, Any]) -> None:
 
 def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
     try:
-        load_mesh(values["path"], values["scale"])
+        vertices, faces = load_mesh(values["path"], values["scale"])
     except MeshError as error:
         key = "scale_m_per_unit" if error.key == "scale" else "path"
         rule = f"{error.rule} (mesh {values['path']})"
         dotted = f"{table.prefix}.{key}" if table.prefix else key
         raise MeshError(rule, file=table.file, key=dotted, value=table.data[key], choices=error.choices) from error
+    crossings = find_crossings(vertices, faces)
+    if crossings:
+        warnings.warn(
+            f"mesh {values['path']}: {crossings.text(1e-3, 'mm')}; the rigid pad takes its lowest faces, physics='ipc' refuses it",
+            stacklevel=2,
+        )
 
 
 def _length_error(table: Table, key: str, rule: str) -> SpecError:
