@@ -76,7 +76,8 @@ def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]
         InputError: see ``check_metrics``; nothing is written then.
     """
     checked = check_metrics(values)
-    path.write_text(json.dumps(checked, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(checked, indent=1, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")  # a path's undecodable bytes become JSON's own escapes
     return checked
 
 

@@ -14,7 +14,8 @@ from raytac.checks import check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.gel.pad import grid_pitch, make_grid
+from raytac.gel.batch import chosen_envs
+from raytac.gel.pad import check_grid, grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
@@ -135,6 +136,8 @@ class TactileSensor:
         self.device, self.num_envs = device, num_envs
         self.pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self.pitch)
+        self._known_grid = self.grid
+        """Grid of the last surface, which is of this pad."""
         self._level: str | PadMesh = pad or PADS[0]
         self.markers, self._marker_perturbation = markers, marker_perturbation
         if markers is not None:
@@ -276,9 +279,11 @@ class TactileSensor:
         ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
 
         Raises:
-            InputError: a state, and no scene was loaded, or another one than the state is of.
+            InputError: a state, and no scene was loaded, or another one than the state is of; a surface of another sensor's pad; ``envs``
+                that do not exist, or not one for each row.
         """
         start = time.perf_counter()
+        envs = None if envs is None else chosen_envs(envs, self.num_envs)
         if isinstance(state, GelSurface):
             surface, force, area, failed = state, None, None, None
             forces: dict[str, Any] = {}
@@ -292,6 +297,11 @@ class TactileSensor:
             forces = pad_forces(self._pad, state, surface, self.outputs)
             self._check_width(state, forces.get("contact_cells"))
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
+        if surface.grid is not self._known_grid:
+            check_grid(self.spec.gelpad, surface.grid)
+            self._known_grid = surface.grid
+        if envs is not None and len(envs) != surface.batch:
+            raise InputError("envs", value=len(envs), rule=f"must name one environment for each of {surface.batch} rows")
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None

@@ -9,7 +9,7 @@ from typing import Final
 from raytac.assets import AssetKind, asset_root
 from raytac.errors import SpecError
 
-__all__ = ["available", "find_file", "is_file"]
+__all__ = ["available", "find_file", "is_file", "name_of"]
 
 _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "sensor": ("scenes", "sensors"),
@@ -57,6 +57,11 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
             return candidate.resolve()
     shipped = ", and none of this path comes with raytac" if base is None and not path.is_absolute() else ""
     raise SpecError(f"the file does not exist{shipped}", file=candidates[0], key=what, value=text)
+
+
+def name_of(path: Path) -> str:
+    """Stem of a file as text that can be written anywhere: bytes that are no UTF-8 as ``\\udcXX``."""
+    return path.stem.encode("utf-8", "backslashreplace").decode()
 
 
 def is_file(path: Path) -> bool:
