@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,8 @@ class TactileSensor:
         frame = sensor.press("coin")
         frame.rgb  # (B, H, W, 3) uint8
 
-    The optical mode is built at the first image and reused for every later one.
+    The optical mode is built at the first image and reused for every later one. ``copy.copy``, ``copy.deepcopy`` and ``pickle`` give
+    another sensor of the same settings, before any scene: renderer and simulation stay with this one.
     """
 
     spec: SensorSpec
@@ -118,6 +120,9 @@ class TactileSensor:
             SpecError: the sensor, light or calibration file breaks a rule.
             BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
+        settings = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        self._settings: dict[str, Any] = settings
+        """Arguments that make this sensor again."""
         check_physics(physics, pad)
         check_optics(optics, integrator, spp, optics_options)
         resolve_device(device)
@@ -157,6 +162,20 @@ class TactileSensor:
         self._pad: RigidPad | SoftPad | None = None
         self._is_narrow = False
         """Whether this press was warned of already."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A sensor of the same settings.
+
+        Raises:
+            InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
+        """
+        if not isinstance(self._settings["optics"], str):
+            rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
+            raise InputError("optics", value=self._settings["optics"], rule=rule)
+        if self._tracker is not None:
+            rule = "cannot be copied or pickled once they have a history: make another sensor with the same arguments"
+            raise InputError("markers", value=self.markers, rule=rule)
+        return partial(type(self), **self._settings), ()
 
     @property
     def label(self) -> str:

@@ -37,6 +37,8 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
     Raises:
         SpecError: no such name (the message lists those there are), or no such file.
     """
+    if not isinstance(name_or_path, (str, Path)):
+        raise SpecError(f"must be a name or a path, not {type(name_or_path).__name__}", key=what, value=name_or_path)
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set(text) & {"/", "\\"}:
         names = available(what)
