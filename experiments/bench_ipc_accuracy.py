@@ -13,8 +13,8 @@ kept in DIR/references by content. docs/performance.md says what came out.
 from __future__ import annotations
 
 import hashlib
+import io
 import itertools
-import os
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
@@ -44,9 +44,11 @@ from numpy.typing import ArrayLike, NDArray
 
 import ipc
 from raytac.errors import InputError, RaytacError
+from raytac.io.arrays import npz_bytes
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
+from raytac.io.seal import SealError, read_sealed, write_sealed
 from raytac.report.machine import machine
 
 KINDS: tuple[ipc.Cut, ...] = ("alike", "mirrored")
@@ -169,16 +171,17 @@ def reference_press(size: int, tolerance: float, device: str, folder: Path) -> P
     for array in (mesh.vertices, mesh.tets, base, ball.vertices, ball.faces, drive):
         digest.update(np.ascontiguousarray(array).tobytes())
     path = folder / f"press_{size}_{digest.hexdigest()[:12]}.npz"
-    if path.is_file():
-        print(f"reference: {path}")
-        with np.load(path) as held:
+    try:
+        with np.load(io.BytesIO(read_sealed(path)), allow_pickle=False) as held:
+            print(f"reference: {path}")
             return Press(**{name: held[name] if held[name].ndim else held[name].item() for name in held.files})
+    except FileNotFoundError:
+        pass
+    except SealError as error:
+        print(f"reference: {path} cannot be used ({error})")
     print(f"reference: {len(mesh.vertices)} vertices at {tolerance:g} m/s, kept as {path}", flush=True)
     done = press(CELLS[size], "mirrored", settings, device)
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial.npz")
-    np.savez(partial, **asdict(done))
-    os.replace(partial, path)
+    write_sealed(path, npz_bytes(asdict(done)))
     return done
 
 

@@ -30,6 +30,9 @@ from experiments.grasp_control import GraspController, smooth
 from experiments.running import run
 from raytac.device import resolve_device
 from raytac.errors import RaytacError
+from raytac.io.arrays import npz_bytes
+from raytac.io.atomic import write_atomic
+from raytac.io.lock import FolderLock
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 from raytac.physics.soft_scene import SceneState
@@ -99,7 +102,12 @@ PLOTTED = {
 
 def main(args: Args) -> None:
     out = args.out if args.out is not None else Path("runs") / "endurance"
-    out.mkdir(parents=True, exist_ok=True)
+    with FolderLock(out):
+        endure(args, out)
+
+
+def endure(args: Args, out: Path) -> None:
+    """Go on from the state in ``out``, if there is one, until the steps are done."""
     began = time.perf_counter()
     world = make_world(args)
     cycle = args.close_steps + args.lift_steps + args.hold_steps + args.lower_steps + args.open_steps
@@ -209,10 +217,8 @@ def store(out: Path, world: TactileWorld, args: Args, rows: list[list[float]], d
     soft = world.soft.save()
     arrays = {f"solver.{f.name}": getattr(soft.world, f.name) for f in fields(soft.world)}
     arrays |= {f"body.{name}": pose for name, pose in soft.poses.bodies.items()}
-    part = out / "partial.npz"
-    record = {"rows": np.array(rows), "done": done, "spent": spent, "settings": settings_of(args)}
-    np.savez(part, allow_pickle=False, mujoco=values, pads=soft.poses.pads, **record, **arrays)
-    part.replace(out / "state.npz")
+    record = {"rows": np.array(rows), "done": np.array(done), "spent": np.array(spent), "settings": np.array(settings_of(args))}
+    write_atomic(out / "state.npz", npz_bytes({"mujoco": values, "pads": soft.poses.pads, **record, **arrays}))
 
 
 def resume(out: Path, world: TactileWorld, args: Args) -> tuple[list[list[float]], int, float]:

@@ -161,7 +161,7 @@ def _film(args: Args, recipe: Recipe | None) -> Film:
             _, _, terminated, truncated, _ = env.step(np.clip(policy(env.batch), -1.0, 1.0))
             ended = bool(terminated[0] or truncated[0])
         return Film(frames, env.batch.control_timestep, tuple(env.batch.observers))
-    settings = tactile_settings(recipe.tactile)
+    settings = tactile_settings(recipe.tactile, recipe.resolution)
     told = KINDS[recipe.task].task.tactile if settings == "task" else () if settings is None else settings.modalities  # type: ignore[union-attr]
     if "rgb" in told:
         learner = Learner(replace(recipe, num_envs=1), render_mode="rgb_array")

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,10 +23,11 @@ from raytac.checks import check_number, check_numbers, check_seed, check_whole
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
 from raytac.errors import InputError
+from raytac.io.atomic import write_atomic
 from raytac.observe import ObservationSettings
 from raytac.report.proportion import wilson_interval
 
-__all__ = ["HELD_OUT", "KINDS", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
+__all__ = ["HELD_OUT", "KINDS", "SMALLEST_SIDE", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
 
 KINDS: Mapping[str, type[TactileVectorEnv]] = {
     "PushCube": PushCubeVectorEnv,
@@ -36,6 +37,8 @@ KINDS: Mapping[str, type[TactileVectorEnv]] = {
 }
 HELD_OUT = 2**31
 """Seeds of evaluation start here; those of training are below."""
+SMALLEST_SIDE = 36
+"""Of an image [px]: DQN's convolutions (``NatureCNN``, which ``MultiInputPolicy`` uses too) leave nothing of fewer pixels."""
 _SMALL = 64
 """Observations of up to so many numbers go into the network as they are."""
 
@@ -50,6 +53,8 @@ class Recipe:
     seed: int
     steps: int
     """Environment steps of the whole training; the learning rate falls to a tenth over them."""
+    resolution: str = "48x36"
+    """WIDTHxHEIGHT of images [px], where ``rgb`` is felt; by default the smallest of 4:3, the shape of the sensors' view."""
     num_envs: int = 16
     processes: int = 1
     history: int = 1
@@ -103,13 +108,28 @@ class Evaluation:
         return wilson_interval(self.successes, self.episodes)
 
 
-def tactile_settings(name: str) -> ObservationSettings | str | None:
-    """What ``TaskBatch`` takes for a name such as ``none``, ``markers`` or ``markers+wrench``; images are 32 x 32."""
+def tactile_settings(name: str, resolution: str) -> ObservationSettings | str | None:
+    """What ``TaskBatch`` takes for a name such as ``none``, ``markers`` or ``rgb+wrench``, images of WIDTHxHEIGHT ``resolution``.
+
+    Raises:
+        InputError: an unknown modality, or images that are too small for the network.
+    """
     if name == "none":
         return None
     if name == "task":
         return "task"
-    return ObservationSettings(tuple(name.split("+")), resolution=(32, 32) if "rgb" in name.split("+") else None)
+    if "rgb" not in name.split("+"):
+        return ObservationSettings(tuple(name.split("+")))
+    settings = ObservationSettings(tuple(name.split("+")), resolution=resolution)
+    assert isinstance(settings.resolution, tuple)
+    _check_image(*settings.resolution)
+    return settings
+
+
+def _check_image(width: int, height: int) -> None:
+    if min(width, height) < SMALLEST_SIDE:
+        rule = f"is too small an image for the policy's network, which takes {SMALLEST_SIDE}x{SMALLEST_SIDE} pixels or more"
+        raise InputError("resolution", value=f"{width}x{height}", rule=rule)
 
 
 class KeyedExtractor(BaseFeaturesExtractor):
@@ -172,7 +192,6 @@ class Checkpoint:
 
     def save(self, path: Path, *, resumable: bool = True) -> None:
         """Write it; never half. Without the optimiser's state (``resumable=False``) it is a third as large and good for playing."""
-        part = path.with_name(path.name + ".partial")
         values = {
             "recipe": asdict(self.recipe),
             "steps": self.steps,
@@ -180,8 +199,9 @@ class Checkpoint:
             "optimizer": self.optimizer if resumable else {},
             "normaliser": self.normaliser,
         }
-        torch.save(values, part)
-        os.replace(part, path)
+        stream = io.BytesIO()
+        torch.save(values, stream)
+        write_atomic(path, stream.getvalue())
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
@@ -214,7 +234,7 @@ class Learner:
             overrides: options of ``TactileVectorEnv`` in place of those of the recipe.
 
         Raises:
-            InputError: an unknown task or modality, or several processes while a scripted policy teaches.
+            InputError: an unknown task or modality, images that are too small, or several processes while a scripted policy teaches.
         """
         if recipe.task not in KINDS:
             raise InputError("task", value=recipe.task, rule="must be a known task", choices=tuple(KINDS))
@@ -222,7 +242,8 @@ class Learner:
             rule = "must be 1 while a scripted policy teaches: it sees the state, which other processes keep"
             raise InputError("processes", value=recipe.processes, rule=rule)
         self.recipe = recipe
-        options: dict[str, Any] = {"tactile": tactile_settings(recipe.tactile), "device": recipe.device, **overrides}
+        tactile = tactile_settings(recipe.tactile, recipe.resolution)
+        options: dict[str, Any] = {"tactile": tactile, "device": recipe.device, **overrides}
         kind, count = KINDS[recipe.task], recipe.num_envs
         self.base: TactileVecEnv | ProcessVecEnv
         if recipe.processes > 1:
@@ -233,6 +254,10 @@ class Learner:
         stacked: VecEnv = VecFrameStack(seen, recipe.history) if recipe.history > 1 else seen
         space = stacked.observation_space
         assert isinstance(space, spaces.Dict)
+        for box in space.spaces.values():
+            if box.dtype == np.uint8:
+                assert box.shape is not None
+                _check_image(box.shape[1], box.shape[0])
         numbers = [name for name, box in space.spaces.items() if box.dtype == np.float32]
         watched = VecMonitor(stacked, info_keywords=("success",))
         self.normaliser = VecNormalize(watched, gamma=recipe.gamma, norm_obs_keys=numbers)

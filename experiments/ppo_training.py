@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import random
 import time
 from collections.abc import Callable, Mapping
@@ -27,6 +28,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from experiments.imitation import imitate
 from experiments.ppo_learner import HELD_OUT, Checkpoint, Learner, Recipe, evaluate
 from raytac.errors import InputError
+from raytac.io.atomic import write_atomic
+from raytac.io.lock import FolderLock
 
 __all__ = ["Training"]
 
@@ -60,19 +63,26 @@ class Training:
     """A recipe in a folder: ``checkpoint.pt``, ``progress.csv``, ``evaluation.csv``, and ``events.*`` where TensorBoard is installed."""
 
     def __init__(self, recipe: Recipe, folder: Path, *, evaluation: int = 32, say: Callable[[str], None] = print) -> None:
-        """Begin, or go on from the folder's checkpoint.
+        """Begin, or go on from the folder's checkpoint. The folder is locked until ``close``.
 
         Raises:
-            InputError: the folder's checkpoint is of another recipe.
+            InputError: the folder's checkpoint is of another recipe, or another training is running in the folder.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.recipe, self._evaluation, self._say = folder, recipe, evaluation, say
         self.path = folder / "checkpoint.pt"
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(FolderLock(folder))
+            self._begin(opened)
+            self._opened = opened.pop_all()
+
+    def _begin(self, opened: contextlib.ExitStack) -> None:
+        recipe, folder = self.recipe, self.folder
         saved = Checkpoint.load(self.path) if self.path.exists() else None
         if saved is not None and replace(saved.recipe, device=recipe.device) != recipe:
             other = {k: v for k, v in asdict(saved.recipe).items() if v != getattr(recipe, k)}
             raise InputError("out", value=folder, rule=f"holds a training of another recipe, with {other}: name another folder")
         self.learner = Learner(recipe)
+        opened.callback(self.learner.close)
         if saved is not None:
             self.learner.restore(saved)
         for name in ("progress.csv", "evaluation.csv"):
@@ -84,6 +94,10 @@ class Training:
         with contextlib.suppress(ImportError, AssertionError):  # not installed: the CSV files hold all that it would show
             formats.append(make_output_format("tensorboard", str(folder)))
         self.learner.model.set_logger(Logger(str(folder), formats))
+
+    def close(self) -> None:
+        """Close the environments and let another training into the folder."""
+        self._opened.close()
 
     @property
     def steps(self) -> int:
@@ -164,14 +178,14 @@ def _keep_rows(path: Path, steps: int) -> None:
         return
     with path.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
-    rest = path.with_suffix(".partial")
-    rest.unlink(missing_ok=True)
-    for row in rows:
-        _append(rest, row)
-    if rows:
-        rest.replace(path)
-    else:
+    if not rows:
         path.unlink()
+        return
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomic(path, text.getvalue().encode())
 
 
 def _last_wall(path: Path) -> float:

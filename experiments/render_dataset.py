@@ -80,6 +80,10 @@ def main(args: Args) -> RunReport | None:
         print(f"{check.shards} shards are whole")
         return None
     plan = DatasetPlan(_asked(args))
+    if args.sheet < 0:
+        raise InputError("sheet", value=args.sheet, rule="must be a whole number >= 0")
+    if args.sheet and not {"rgb", "height"} & set(plan.sweep.outputs):
+        raise InputError("sheet", value=args.sheet, rule="shows images and heights: outputs must have 'rgb' or 'height'")
     report = render_dataset(
         plan,
         out,
@@ -117,7 +121,7 @@ def main(args: Args) -> RunReport | None:
 
 def _asked(args: Args) -> SweepSpec:
     """The sweep with what the command line changes."""
-    found = {
+    asked = {
         "seed": args.seed,
         "count": args.count,
         "shard_size": args.shard_size,
@@ -126,11 +130,7 @@ def _asked(args: Args) -> SweepSpec:
         "resolution": None if args.resolution is None else parse_resolution(args.resolution),
         "outputs": None if args.outputs is None else parse_names(args.outputs, "outputs"),
     }
-    for name in ("count", "shard_size"):
-        value = found[name]
-        if isinstance(value, int) and value < 1:
-            raise InputError(name, value=value, rule="must be a whole number >= 1")
-    return replace(load_sweep(args.sweep), **{name: value for name, value in found.items() if value is not None})
+    return replace(load_sweep(args.sweep), **{name: value for name, value in asked.items() if value is not None})
 
 
 if __name__ == "__main__":

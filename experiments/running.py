@@ -1,23 +1,28 @@
-"""What every recorded experiment does around its work: a folder, metrics with seed, device, versions and time, and plain errors."""
+"""What every recorded experiment does around its work: a folder, metrics with seed, device, versions and time, and plain errors.
+
+``store`` and ``resumed`` keep the rows of a long run, so that an interrupted one goes on where it stopped.
+"""
 
 from __future__ import annotations
 
+import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
 from raytac.device import resolve_device
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
+from raytac.io.atomic import write_atomic
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 
-__all__ = ["recorded", "run"]
+__all__ = ["recorded", "resumed", "run", "store"]
 
 Args = TypeVar("Args", bound=CommonOptions)
 
@@ -38,9 +43,28 @@ def recorded(args: CommonOptions, name: str) -> Iterator[tuple[Path, dict[str, M
     print(f"written: {out}")
 
 
-def run(main: Callable[[Args], None], options: type[Args]) -> None:
+def run(main: Callable[[Args], object], options: type[Args]) -> None:
     """Read the command line and do it; a mistake of the user's ends with one line."""
     try:
         main(tyro.cli(options))
     except RaytacError as error:
         sys.exit(f"error: {error}")
+
+
+def store(path: Path, settings: Mapping[str, object], rows: Sequence[Mapping[str, object]]) -> None:
+    """Keep the rows of a run with its settings; the file is replaced in one move."""
+    write_atomic(path, json.dumps({"settings": settings, "rows": rows}, indent=1).encode())
+
+
+def resumed(path: Path, settings: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Rows that an earlier run stored; empty if there is none.
+
+    Raises:
+        InputError: it is of a run with other settings.
+    """
+    if not path.exists():
+        return []
+    record = json.loads(path.read_text("utf-8"))
+    if record["settings"] != settings:
+        raise InputError("out", value=path, rule=f"holds a run with other settings, {record['settings']}: choose another")
+    return record["rows"]

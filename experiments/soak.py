@@ -10,7 +10,6 @@ tenth of its blocks: by then what is made once is made, such as kernels for ever
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -20,9 +19,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from experiments.running import resumed, store
 from raytac.device import resolve_device
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.errors import InputError, RaytacError
+from raytac.io.lock import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.observe import MODALITIES, ObservationSettings
@@ -79,15 +80,15 @@ def main(args: Args) -> dict[str, Metric]:
             raise InputError(name, value=value, rule="must be 1 or more")
     device = resolve_device(args.device)
     out = args.out or Path("runs/soak")
-    kept = {name: resumed(out / f"{name}.json", settings_of(args)) for name in names}
-    out.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Metric] = {"experiment": "soak", "device": device, "seed": args.seed, **machine()}
-    for name in names:
-        blocks = run(name, args, modalities, kept[name], out / f"{name}.json")
-        found |= {f"{name}.{key}": value for key, value in summary(blocks).items()}
-        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in summary(blocks).items()), flush=True)
-    found |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "gymnasium"))}
-    write_metrics(out / "metrics.json", found)
+    with FolderLock(out):
+        kept = {name: [Block(**row) for row in resumed(out / f"{name}.json", settings_of(args))] for name in names}
+        found: dict[str, Metric] = {"experiment": "soak", "device": device, "seed": args.seed, **machine()}
+        for name in names:
+            blocks = run(name, args, modalities, kept[name], out / f"{name}.json")
+            found |= {f"{name}.{key}": value for key, value in summary(blocks).items()}
+            print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in summary(blocks).items()), flush=True)
+        found |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "gymnasium"))}
+        write_metrics(out / "metrics.json", found)
     print(f"-> {out}")
     return found
 
@@ -113,7 +114,7 @@ def run(name: str, args: Args, modalities: tuple[str, ...], blocks: list[Block],
             steps += args.envs
         blocks.append(Block(sitting, steps, episodes, failed, nonfinite, time.perf_counter() - begin, memory_mb()))
         done += steps
-        store(path, settings_of(args), blocks)
+        store(path, settings_of(args), [vars(block) for block in blocks])
         print(f"{name} {done}: {blocks[-1]}", flush=True)
     return blocks
 
@@ -150,27 +151,6 @@ def memory_mb() -> float:
 def settings_of(args: Args) -> dict[str, object]:
     """What runs that are joined must have in common."""
     return {"envs": args.envs, "modalities": args.modalities, "seed": args.seed, "block": args.block}
-
-
-def store(path: Path, settings: dict[str, object], blocks: list[Block]) -> None:
-    """The record, replaced in one move."""
-    part = path.with_suffix(".partial")
-    part.write_text(json.dumps({"settings": settings, "blocks": [vars(block) for block in blocks]}), "utf-8")
-    part.replace(path)
-
-
-def resumed(path: Path, settings: dict[str, object]) -> list[Block]:
-    """The record of an earlier run; empty if there is none.
-
-    Raises:
-        InputError: it is of a run with other settings.
-    """
-    if not path.exists():
-        return []
-    record = json.loads(path.read_text("utf-8"))
-    if record["settings"] != settings:
-        raise InputError("out", value=path, rule=f"holds a run with other settings, {record['settings']}: choose another")
-    return [Block(**block) for block in record["blocks"]]
 
 
 if __name__ == "__main__":

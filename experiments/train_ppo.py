@@ -39,7 +39,8 @@ RECIPES: dict[str, dict[str, Any]] = {
 }
 """What differs from ``Recipe``'s own, by task."""
 _TUNED = (
-    "steps", "teacher_steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy", "minibatch",
+    "steps", "resolution", "teacher_steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy",
+    "minibatch",
 )  # fmt: skip
 """Fields of ``Recipe`` that options may change."""
 
@@ -53,6 +54,8 @@ class Args(CommonOptions):
     tactile: str = "task,none"
     """What is felt, joined by commas, each trained with the same seeds: ``task`` (as the environment has it), ``none``, or
     modalities joined by ``+``, as in ``markers+wrench``."""
+    resolution: str | None = None
+    """WIDTHxHEIGHT of images in pixels, where ``rgb`` is felt; at least 36x36, 48x36 if not given."""
     seeds: str = "0,1,2"
     """Seeds joined by commas; the same seed gives the same weights."""
     steps: int | None = None
@@ -107,10 +110,10 @@ def main(args: Args) -> dict[str, Metric]:
         raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
     kinds = parse_names(args.tactile, "tactile")
     seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
-    from experiments.ppo_learner import tactile_settings
+    from experiments.ppo_learner import Recipe, tactile_settings
 
-    for kind in kinds:
-        tactile_settings(kind)  # so that an unknown modality is told before anything is trained
+    for kind in kinds:  # so that what cannot be observed is told before anything is trained
+        tactile_settings(kind, Recipe.resolution if args.resolution is None else args.resolution)
     jobs = [_Job(args, kind, seed, start) for seed in seeds for kind in kinds]
     found: dict[str, Metric] = {"device": "cpu" if args.device == "auto" else args.device, **machine()}
     interrupted = False
@@ -181,7 +184,7 @@ def _train(job: _Job) -> None:
         write_metrics(job.folder / "metrics.json", found | versions(("stable_baselines3", "torch")))
         print(f"{args.task} {job.name}: success {result.successes}/{result.episodes} ({low:.2f} to {high:.2f})", flush=True)
     finally:
-        training.learner.close()
+        training.close()
 
 
 def _final_s(args: Args, last: float, recipe: Any) -> float:

@@ -1,10 +1,14 @@
-"""Finds surfaces that cross, touch or contain each other, and says which primitives and how deep. Plain NumPy: it runs once a start."""
+"""Finds surfaces that cross, touch or contain each other, and says which primitives and how deep. Plain NumPy, on the host.
+
+Whether an edge meets a triangle is decided exactly (:mod:`ipc.crossing`).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipc.crossing import APART, CROSSING, meet
 from ipc.errors import OverlapError
 from ipc.layout import Layout, rotation_matrix
 from ipc.state import State
@@ -37,31 +41,25 @@ def _box_pairs(a_low: Floats, a_high: Floats, b_low: Floats, b_high: Floats) -> 
     return np.concatenate(first), np.concatenate(second)
 
 
-def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int, float] | None:
-    """The crossing of an edge and a triangle that goes deepest: edge, face, and depth of the edge's end behind the face [m]."""
+def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int, float | None] | None:
+    """The deepest crossing of an edge and a triangle: edge, face, and how far it ends behind the face [m], None if they only touch."""
     ends, corners = x[edges], x[faces]
     i, j = _box_pairs(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
     apart = (edges[i][:, :, None] != faces[j][:, None, :]).all(axis=(1, 2))
     i, j = i[apart], j[apart]
-    if len(i) == 0:
+    how = meet(ends[i, 0], ends[i, 1], *(corners[j, k] for k in range(3)))
+    if (how == APART).all():
         return None
-    p, q = ends[i, 0], ends[i, 1]
+    if not (how == CROSSING).any():
+        first = int(np.argmax(how))
+        return int(i[first]), int(j[first]), None
+    i, j = i[how == CROSSING], j[how == CROSSING]
     a, b, c = (corners[j, k] for k in range(3))
     normal = np.cross(b - a, c - a)
-    size = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.maximum(size, 1e-300)
-    hp, hq = ((p - a) * normal).sum(axis=1), ((q - a) * normal).sum(axis=1)
-    across = (hp * hq <= 0) & (hp != hq)
-    s = np.where(across, hp / np.where(across, hp - hq, 1.0), 0.0)[:, None]
-    point = p + s * (q - p)
-    inside = across.copy()
-    for u, v in ((a, b), (b, c), (c, a)):
-        inside &= (np.cross(v - u, point - u) * normal).sum(axis=1) >= 0
-    if not inside.any():
-        return None
-    depth = np.where(inside, -np.minimum(hp, hq), -np.inf)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    depth = -((ends[i] - a[:, None]) * normal[:, None]).sum(axis=-1).min(axis=1)
     worst = int(np.argmax(depth))
-    return int(i[worst]), int(j[worst]), float(depth[worst])
+    return int(i[worst]), int(j[worst]), abs(float(depth[worst]))
 
 
 def _contains(x: Floats, faces: NDArray, point: Floats) -> bool:
@@ -78,24 +76,23 @@ def _is_closed(faces: NDArray) -> bool:
     return bool((np.unique(sides, axis=0, return_counts=True)[1] == 2).all())
 
 
-def find_overlap(layout: Layout, y: Floats, rotation: Floats, position: Floats) -> str | None:
+def find_overlap(layout: Layout, x: Floats, normal: Floats, origin: Floats) -> str | None:
     """Describe the first overlap of one environment, or None.
 
     Args:
         layout: the flat arrays.
-        y: node positions [m] (N, 3), in their frames.
-        rotation, position: frames, quaternions (bodies, 4) and [m] (bodies, 3).
+        x: surface vertices in the world [m] (V, 3).
+        normal, origin: of the half-spaces among the bodies, world frame, (bodies, 3) and [m] (bodies, 3).
     """
-    x = world_vertices(layout, y, rotation, position)
-    normals = rotation_matrix(rotation)[:, :, 2]
     for a, b in layout.pairs:
         na, nb = layout.names[a], layout.names[b]
         va = slice(layout.vert_start[a], layout.vert_start[a + 1])
         if layout.half_space[b]:
-            height = (x[va] - position[b]) @ normals[b]
+            height = (x[va] - origin[b]) @ normal[b]
             low = int(np.argmin(height))
             if height[low] <= 0:
-                return f"vertex {low} of {na!r} lies {-height[low]:.3g} m inside the half-space {nb!r}"
+                where = f"lies {-height[low]:.3g} m inside" if height[low] < 0 else "touches"
+                return f"vertex {low} of {na!r} {where} the half-space {nb!r}"
             continue
         for first, second in ((a, b), (b, a)) if a != b else ((a, b),):
             edges = layout.edges[layout.edge_start[first] : layout.edge_start[first + 1]]
@@ -103,15 +100,16 @@ def find_overlap(layout: Layout, y: Floats, rotation: Floats, position: Floats) 
             hit = _edge_face_hits(x, edges, faces)
             if hit is not None:
                 e, f = edges[hit[0]] - layout.vert_start[first], hit[1]
+                meets = "touches" if hit[2] is None else f"goes {hit[2]:.3g} m through"
                 return (
-                    f"edge {hit[0]} (vertices {e[0]}, {e[1]}) of {layout.names[first]!r} goes {hit[2]:.3g} m through "
-                    f"triangle {f} of {layout.names[second]!r}: start with the surfaces apart"
+                    f"edge {hit[0]} (vertices {e[0]}, {e[1]}) of {layout.names[first]!r} {meets} triangle {f} of "
+                    f"{layout.names[second]!r}"
                 )
         if a != b:
             for inner, outer in ((a, b), (b, a)):
                 faces = layout.faces[layout.face_start[outer] : layout.face_start[outer + 1]]
                 if _is_closed(faces) and _contains(x, faces, x[layout.vert_start[inner]]):
-                    return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}: start with the surfaces apart"
+                    return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}"
     return None
 
 
@@ -127,6 +125,8 @@ def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None
         if key in seen or state.failed[env] or not np.isfinite(state.y[env]).all():
             continue
         seen.add(key)
-        found = find_overlap(layout, state.y[env], state.frame_rotation[env], state.frame_position[env])
+        rotation, position = state.frame_rotation[env], state.frame_position[env]
+        x = world_vertices(layout, state.y[env], rotation, position)
+        found = find_overlap(layout, x, rotation_matrix(rotation)[:, :, 2], position)
         if found is not None:
-            raise OverlapError(f"environment {env}: {found}")
+            raise OverlapError(f"environment {env}: {found}: start with the surfaces apart")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
-import os
 import subprocess
 import sys
 import tempfile
@@ -14,6 +12,7 @@ import numpy as np
 
 from ipc.errors import IpcError
 from ipc.meshes import TetMesh, TriMesh, tet_volumes
+from ipc.tet_cache import default_cache, keep_tets, kept_tets, tets_name
 
 __all__ = ["tetrahedralize"]
 
@@ -26,41 +25,30 @@ np.savez("tets.npz", vertices=np.asarray(found[0], np.float64), tets=np.asarray(
 """
 
 
-def _default_cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "raytac-ipc" / "tets"
-
-
 def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = None) -> TetMesh:
     """Fill a closed surface with tetrahedra of about ``edge_length`` [m] (fTetWild, Hu et al. 2020).
 
     Args:
         surface: the closed surface.
         edge_length: target edge length [m].
-        cache: folder of finished meshes, named by the SHA-256 of surface and target; by default under the user's cache folder.
+        cache: folder of finished meshes, named by the SHA-256 of surface and target; by default under the user's cache folder. A mesh
+            there that is damaged or of another surface is made again, and a folder that cannot be written is left out, with a warning.
 
     Raises:
         IpcError: without pytetwild (``pip install "raytac[ipc]"``), if the target is not positive, or if pytetwild fails.
     """
     if not edge_length > 0:
         raise IpcError(f"edge_length = {edge_length} m: it must be positive")
-    digest = hashlib.sha256(b"tetwild-1")
-    for part in (surface.vertices, surface.faces, np.array([edge_length])):
-        digest.update(np.ascontiguousarray(part).tobytes())
-    folder = cache or _default_cache()
-    path = folder / f"{digest.hexdigest()[:32]}.npz"
-    if path.is_file():
-        with np.load(path) as stored:
-            return TetMesh(stored["vertices"], stored["tets"])
+    folder = cache or default_cache()
+    path = None if folder is None else folder / tets_name(surface, edge_length)
+    kept = kept_tets(path, surface, edge_length)
+    if kept is not None:
+        return kept
     vertices, tets = _fill(surface, edge_length)
     negative = tet_volumes(vertices, tets) < 0
     tets[negative] = tets[negative][:, [0, 1, 3, 2]]
     mesh = TetMesh(vertices, tets)
-    folder.mkdir(parents=True, exist_ok=True)
-    # Written beside and renamed, so that a reader never sees half a file.
-    with tempfile.NamedTemporaryFile(dir=folder, suffix=".npz", delete=False) as handle:
-        np.savez(handle, vertices=mesh.vertices, tets=mesh.tets)
-    Path(handle.name).replace(path)
+    keep_tets(path, mesh, surface, edge_length)
     return mesh
 
 

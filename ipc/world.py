@@ -14,12 +14,13 @@ from ipc.errors import IpcError
 from ipc.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
 from ipc.layout import build_layout, rotation_matrix
 from ipc.newton import Newton
-from ipc.overlap import check_overlap
+from ipc.overlap import check_overlap, find_overlap
 from ipc.patch_motion import RestPatches
 from ipc.potential import Potential
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
 from ipc.state import State, start_state, teleported
+from ipc.warp_start import start_warp
 
 __all__ = ["State", "World"]
 
@@ -57,7 +58,7 @@ class World:
         self.bodies = tuple(bodies)
         self.num_envs = num_envs
         self.layout = build_layout(self.bodies, self.settings.friction, friction or {}, ignored)
-        wp.init()
+        start_warp()
         if device == "auto":
             device = "cuda" if wp.is_cuda_available() else "cpu"
         try:
@@ -317,6 +318,17 @@ class World:
     def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
         """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
         return touching(self.layout, self._potential, self._index(name))
+
+    def overlap(self, env: int = 0) -> str | None:
+        """Say which surfaces cross, touch or contain each other in one environment as it is now; None where all are apart.
+
+        Edges and triangles are compared exactly, on the host: a check for tests and experiments, not for every step of a batch. Only
+        pairs of bodies that may touch are looked at, a body with itself where it has ``self_contact``.
+        """
+        if not 0 <= env < self.num_envs:
+            raise IpcError(f"env = {env}: environments are 0 to {self.num_envs - 1}")
+        s = self._potential
+        return find_overlap(self.layout, host(s.x)[env], host(s.R)[env, :, :, 2], host(s.t)[env])
 
     # --- state -----------------------------------------------------------------------------------------------------------------
 

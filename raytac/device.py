@@ -120,8 +120,8 @@ def optix_library() -> str | None:
 def llvm_library() -> Path | None:
     """The libLLVM that Dr.Jit should use, or None if there is none.
 
-    In this order: ``DRJIT_LIBLLVM_PATH`` as the user set it (even if the file is missing: Dr.Jit then says so), the one that the
-    ``karellen-llvm-core`` package brought, the newest one of version 16 or later on the system.
+    In this order: ``DRJIT_LIBLLVM_PATH`` as the user set it (even if the file is missing: Dr.Jit then says so; empty is not set), the
+    one that the ``karellen-llvm-core`` package brought, the newest one of version 16 or later on the system.
     """
     if chosen := os.environ.get("DRJIT_LIBLLVM_PATH"):
         return Path(chosen)

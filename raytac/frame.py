@@ -49,7 +49,8 @@ class TactileFrame:
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
     traction: np.ndarray | None = None
     """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
-    Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model)."""
+    Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
+    over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is the wrench's force."""
     contact_area: np.ndarray | None = None
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
     contact_cells: np.ndarray | None = None
@@ -62,6 +63,9 @@ class TactileFrame:
     ``force``, and for a simulated pad, which follows no such law."""
     failed: np.ndarray | None = None
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
+    unconverged: np.ndarray | None = None
+    """Steps of a simulated pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
+    shape (B,), int. An environment whose last step is one of them has ``failed``. None for the rigid pad, and as for ``force``."""
     time_ms: dict[str, float] = field(default_factory=dict)
     """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 

@@ -131,3 +131,11 @@ def sensor_spec() -> SensorSpec:
 @pytest.fixture(scope="session")
 def ball_surface() -> GelSurface:
     return make_surface()
+
+
+@pytest.fixture
+def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user whom the machine does not know and whose environment names no folder, as in many containers."""
+    for name in ("HOME", "XDG_CACHE_HOME", "RAYTAC_CACHE", "WARP_CACHE_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.getuid", lambda: 4242424)

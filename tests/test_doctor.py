@@ -73,18 +73,20 @@ def test_each_extra_says_what_lacks_and_what_needs_it(
     assert extra in check.fix and not check.required
 
 
-@pytest.mark.parametrize("by_user", [False, True])
-def test_who_named_llvm(by_user: bool) -> None:
+@pytest.mark.parametrize("by_user", [None, "", "a library"])
+def test_who_named_llvm(by_user: str | None) -> None:
+    """An empty path names none: Dr.Jit would abort the process over it."""
     library = str(llvm_library())
     env = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
     code = (
         "import os, raytac.optics\n"
         "from raytac.doctor import PROBES, run_probe\n"
         "from dataclasses import replace\n"
-        "assert os.environ['DRJIT_LIBLLVM_PATH']\n"
+        "assert os.environ['DRJIT_LIBLLVM_PATH'] and 'DRJIT_LIBOPTIX_PATH' not in os.environ\n"
         "print(run_probe(replace(PROBES[1], code='print()')).detail)"
     )
-    env |= {"PYTHONPATH": str(Path(doctor.__file__).parents[1])} | ({"DRJIT_LIBLLVM_PATH": library} if by_user else {})
+    env |= {"PYTHONPATH": str(Path(doctor.__file__).parents[1]), "DRJIT_LIBOPTIX_PATH": ""}
+    env |= {} if by_user is None else {"DRJIT_LIBLLVM_PATH": by_user and library}
     told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
     assert f"LLVM {'set by DRJIT_LIBLLVM_PATH' if by_user else 'found'}: {library}" in told
 

@@ -10,20 +10,24 @@ import tyro
 
 from raytac.checks import check_whole
 from raytac.errors import InputError
-from raytac.io.options import DeviceName, parse_resolution
+from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.physics.solver import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
+from raytac.sensor.options import sensor_spec
 from raytac.specs import PressScene, TaskScene, load_scene
 from raytac.specs.press import chosen_physics
 from raytac.specs.task import COUPLINGS
 
 if TYPE_CHECKING:
+    from raytac.specs.sensor import SensorSpec
     from raytac.view.session import Session
 
 __all__ = ["ViewArgs"]
 
 _OUTPUTS = ("rgb", "wrench", "traction")
+_LONGEST = 320
+"""Side of a tactile image [px] that is drawn quickly and large enough to be seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +55,13 @@ class ViewArgs:
     """Whether what simulated pads feel acts back on a task's robot; as the task says if not given."""
     steps: int | None = None
     """Control steps of a task from one shown state to the next; 1 if not given, 4 with rigid pads without markers."""
-    resolution: str = "320x240"
-    """WIDTHxHEIGHT of the tactile image in pixels."""
+    resolution: str | None = None
+    """WIDTHxHEIGHT of the tactile image in pixels; the sensor's own if not given, a larger one scaled down to 320 pixels a side."""
     host: str = "127.0.0.1"
     """Address to serve at. Whoever can reach it can move the sliders: 127.0.0.1 is this machine only, 0.0.0.0 everyone."""
+    allow_host: str | None = None
+    """Names beside this machine's addresses that browsers may open the page by, joined by commas: gpu3.example.org, or NAME:PORT where
+    something forwards another port. All other names are refused."""
     port: int = 8080
     """Port to serve at; 0 takes any that is free."""
     device: DeviceName = "auto"
@@ -68,7 +75,8 @@ class ViewArgs:
         from raytac.view.viewer import Viewer, check_address, check_viewer
 
         check_viewer()
-        check_address(self.host, self.port)
+        allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
+        check_address(self.host, self.port, allowed)
         if self.optics not in OPTICS:
             raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
         scene = load_scene(self.scene)
@@ -78,7 +86,7 @@ class ViewArgs:
             if not self.verbose:
                 hush_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
-        with Viewer(session, host=self.host, port=self.port) as viewer:
+        with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")
             print(
                 f"raytac: open {viewer.url} (elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST); Ctrl-C ends",
@@ -98,9 +106,8 @@ class ViewArgs:
             if value is not None:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
         pad = self.pad or scene.pad if physics == "ipc" else self.pad
-        sensor = TactileSensor(
-            self.sensor or "gelsight_mini", physics=physics, pad=pad, outputs=_OUTPUTS, seed=self.seed, **self._settings()
-        )
+        spec = sensor_spec(self.sensor or "gelsight_mini")
+        sensor = TactileSensor(spec, physics=physics, pad=pad, outputs=_OUTPUTS, seed=self.seed, **self._settings(spec))
         return PressSession(sensor, scene)
 
     def _task(self, scene: TaskScene, physics: str) -> Session:
@@ -112,14 +119,27 @@ class ViewArgs:
         if self.sensor is not None:
             scene = replace(scene, robot=replace(scene.robot, sensor=self.sensor))
         world = TactileWorld(
-            scene, physics=physics, pad=self.pad, coupling=self.coupling, outputs=_OUTPUTS, seed=self.seed, **self._settings()
+            scene,
+            physics=physics,
+            pad=self.pad,
+            coupling=self.coupling,
+            outputs=_OUTPUTS,
+            seed=self.seed,
+            **self._settings(sensor_spec(scene.robot.sensor)),
         )
         return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
 
-    def _settings(self) -> dict[str, Any]:
+    def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
         return {
             "optics": self.optics,
             "markers": self.markers,
-            "resolution": parse_resolution(self.resolution),
+            "resolution": _fitting(sensor.camera.resolution) if self.resolution is None else parse_resolution(self.resolution),
             "device": self.device,
         }
+
+
+def _fitting(resolution: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) [px] of the same shape, of at most ``_LONGEST`` a side."""
+    scale = min(1.0, _LONGEST / max(resolution))
+    width, height = (max(1, round(scale * side)) for side in resolution)
+    return width, height

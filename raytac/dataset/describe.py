@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,27 @@ from raytac.dataset.arrays import ARRAYS, COLUMNS, SHARED
 from raytac.dataset.plan import DatasetPlan
 from raytac.dataset.shard import ShardRecord, sha256_of
 from raytac.errors import InputError
+from raytac.io.atomic import read_regular, write_atomic
 
 __all__ = ["FILE", "FORMAT_VERSION", "describe", "read_description", "write_description"]
 
 FILE = "dataset.json"
 FORMAT_VERSION = 1
+_KEYS = {
+    "name": str,
+    "complete": bool,
+    "presses": int,
+    "shards": int,
+    "manifest_sha256": str,
+    "arrays": dict,
+    "arrays_of_a_shard": dict,
+    "sensors": dict,
+    "plan_sha256": str,
+    "plan": dict,
+}
+"""Keys that readers need, and their types."""
+_DTYPES = tuple(sorted({kind.dtype for kind in (*ARRAYS.values(), *SHARED.values())}))
+"""Types that an array of a data set may have."""
 _FRAME = (
     "pad frame: origin at the centre of the undeformed outer gel surface, +z out of the sensor towards the object, +x image right, "
     "+y image down; SI units"
@@ -73,26 +88,40 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
 def write_description(folder: Path, found: dict[str, Any]) -> None:
     """Write ``README.md`` and ``dataset.json``, the latter last."""
     for name, text in (("README.md", _readme(found)), (FILE, json.dumps(found, indent=1, ensure_ascii=False) + "\n")):
-        partial = folder / f".{name}.partial"
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / name)
+        write_atomic(folder / name, text.encode())
 
 
 def read_description(folder: Path) -> dict[str, Any]:
     """``dataset.json`` of a data set.
 
     Raises:
-        InputError: there is none, it cannot be read, or it is of a later format.
+        InputError: there is none, it cannot be read, it lacks a key or has one of another kind, or it is of a later format.
     """
     path = Path(folder) / FILE
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_regular(path))
         version = found["format_version"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("data set", value=folder, rule=f"must be a folder with a {FILE} ({type(error).__name__})") from error
     if version != FORMAT_VERSION:
         raise InputError("data set", value=version, rule=f"must be of format version {FORMAT_VERSION}")
+    for key, kind in _KEYS.items():
+        if type(found.get(key)) is not kind:
+            raise InputError("data set", value=path, rule=f"must have a key {key!r} of type {kind.__name__}")
+    for name, item in {**found["arrays"], **found["arrays_of_a_shard"]}.items():
+        if not isinstance(item, dict) or item.get("dtype") not in _DTYPES or not _is_shape(item.get("shape")):
+            rule = f"must declare array {name!r} by a shape and a known dtype"
+            raise InputError("data set", value=path, rule=rule, choices=_DTYPES)
+    for name, sensor in found["sensors"].items():
+        shapes = sensor.get("arrays") if isinstance(sensor, dict) else None
+        if not isinstance(shapes, dict) or set(shapes) != set(found["arrays"]) or not all(map(_is_shape, shapes.values())):
+            raise InputError("data set", value=path, rule=f"must have the shape of every array for sensor {name!r}")
     return found
+
+
+def _is_shape(shape: object) -> bool:
+    """Whether it is a list of whole numbers >= 0 and names of sizes."""
+    return isinstance(shape, list) and all((type(n) is int and n >= 0) or (isinstance(n, str) and n) for n in shape)
 
 
 def _readme(found: dict[str, Any]) -> str:

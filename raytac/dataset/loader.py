@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Sequence
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from raytac.dataset.arrays import COLUMNS
+from raytac.dataset.arrays import COLUMNS, ArrayKind
 from raytac.dataset.describe import read_description
 from raytac.dataset.manifest import read_manifest
+from raytac.dataset.shard import FOLDER, is_shard_file
+from raytac.dataset.shard_reader import open_shard
 from raytac.errors import InputError
 
 __all__ = ["PressDataset", "open_shard"]
-
-_HEADER = 30
-"""Bytes of a zip member's local header before its name and extra field."""
 
 
 class PressDataset:
@@ -30,7 +30,8 @@ class PressDataset:
         loader = torch.utils.data.DataLoader(data, batch_size=64, shuffle=True, num_workers=4)
 
     Arrays that are not compressed are mapped into memory, so that a press is read without the rest of its shard. What is given is a copy
-    that may be changed.
+    that may be changed. Manifest and shards are compared with their checksums when they are opened, which reads a shard once as a whole;
+    ``verify=False`` leaves that out. Whatever the files hold, only arrays of the types and shapes that ``dataset.json`` declares are given.
 
     Attributes:
         folder: of the data set.
@@ -38,21 +39,30 @@ class PressDataset:
         manifest: rows of the presses that are given, a ``pyarrow.Table``.
     """
 
-    def __init__(self, folder: str | Path, names: Sequence[str] | None = None, *, sensor: str | None = None) -> None:
+    def __init__(
+        self, folder: str | Path, names: Sequence[str] | None = None, *, sensor: str | None = None, verify: bool = True
+    ) -> None:
         """Read the manifest.
 
         Args:
             folder: of the data set.
             names: arrays of the shards, or columns of numbers of the manifest; None is all arrays.
             sensor: presses into this sensor only; must be given where the data set has several of different shapes and a stack is wanted.
+            verify: compare manifest and shards with their checksums.
 
         Raises:
-            InputError: no data set, or a name that it does not have.
+            InputError: no data set, one that is damaged or (with ``verify``) not complete, or a name that it does not have.
             BackendError: pyarrow is not installed.
         """
         self.folder, self.description = Path(folder), read_description(Path(folder))
-        table = read_manifest(self.folder)
+        if verify and not self.description["complete"]:
+            raise InputError(
+                "data set", value=self.folder, rule="is not complete: the command that renders it goes on with the rest"
+            )
+        table = read_manifest(self.folder, self.description["manifest_sha256"] if verify else None)
         keep = np.asarray(table["status"].to_pylist()) == "ok"
+        self._files = _shard_files(self.folder, table.filter(keep), self.description["sensors"])
+        self._verify = verify
         if sensor is not None:
             if sensor not in self.description["sensors"]:
                 raise InputError(
@@ -76,46 +86,85 @@ class PressDataset:
         return len(self._rows)
 
     def __getitem__(self, i: int) -> dict[str, np.ndarray]:
-        """Press ``i`` of those in ``manifest``."""
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"press {i} of {len(self)}")
+        """Press ``i`` of those in ``manifest``, counted from the end if it is negative.
+
+        Raises:
+            IndexError: there is no such press.
+            InputError: ``i`` is no whole number, or the shard is damaged.
+        """
+        i = self._place(i)
         shard, row = self._shards[i], self._rows[i]
         found = {name: np.array(self._shard(shard)[name][row]) for name in self._arrays}
         return found | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
     def shared(self, i: int) -> dict[str, np.ndarray]:
-        """What the presses of press ``i``'s shard have in common: grid, height and image at rest."""
-        shard = self._shard(self._shards[i])
+        """What the presses of press ``i``'s shard have in common: grid, height and image at rest. Errors as for ``data[i]``."""
+        shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
+
+    def _place(self, i: int) -> int:
+        try:
+            place = operator.index(i)
+        except TypeError as error:
+            raise InputError("press", value=i, rule="must be a whole number") from error
+        if not -len(self) <= place < len(self):
+            raise IndexError(f"press {i} of {len(self)}")
+        return place
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": {}}  # each process of a loader maps files of its own
 
     def _shard(self, name: str) -> dict[str, np.ndarray]:
         if name not in self._open:
-            arrays, mapped = open_shard(self.folder / name)
+            file, path = self._files[name], self.folder / name
+            if not path.resolve().is_relative_to(self.folder.resolve()):
+                raise InputError("shard", value=path, rule="must not be a link to a file outside the data set")
+            kinds, sizes = _declared(self.description, file)
+            arrays, mapped = open_shard(path, kinds, sizes=sizes, sha256=file.sha256 if self._verify else None)
             if not mapped:
                 self._open.clear()  # it was read as a whole
             self._open[name] = arrays
         return self._open[name]
 
 
-def open_shard(path: Path) -> tuple[dict[str, np.ndarray], bool]:
-    """Arrays of an ``.npz``, mapped into memory if none is compressed, else read; and which of the two."""
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            with np.load(path) as arrays:
-                return dict(arrays), False
-        data = np.memmap(path, np.uint8, "r")  # one map a shard: an operating system has tens of thousands
-        found = {}
-        with path.open("rb") as stream:
-            for member in members:
-                stream.seek(member.header_offset)
-                header = stream.read(_HEADER)
-                stream.seek(int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little"), 1)
-                version = np.lib.format.read_magic(stream)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(stream)
-                found[member.filename.removesuffix(".npy")] = np.ndarray(shape, dtype, data, stream.tell())
-    return found, True
+@dataclass(frozen=True)
+class _ShardFile:
+    """What the manifest says of a shard."""
+
+    sensor: str
+    sha256: str
+    count: int
+    """Presses in it."""
+
+
+def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[str, _ShardFile]:
+    """Every shard that rows of sound presses name, by its path in the folder.
+
+    Raises:
+        InputError: a path that is no shard's, an unknown sensor, shards of two sensors or checksums, or rows that are not those of a shard.
+    """
+    rows: dict[tuple[str, str, str], list[int]] = {}
+    for *key, row in zip(*(table[name].to_pylist() for name in ("shard", "sensor", "shard_sha256", "row")), strict=True):
+        rows.setdefault((key[0], key[1], key[2]), []).append(row)
+    found: dict[str, _ShardFile] = {}
+    for (shard, sensor, sha256), places in rows.items():
+        if not is_shard_file(shard):
+            raise InputError("data set", value=shard, rule=f"names a shard that is not in {folder / FOLDER}")
+        if sensor not in sensors:
+            raise InputError("data set", value=sensor, rule=f"is not a sensor of {folder}", choices=tuple(sensors))
+        if shard in found or sorted(places) != list(range(len(places))):
+            rule = "must be of one sensor and one checksum, and its presses in rows 0, 1, … of it"
+            raise InputError("data set", value=shard, rule=rule)
+        found[shard] = _ShardFile(sensor, sha256, len(places))
+    return found
+
+
+def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:
+    """Kinds of the arrays of a shard as ``dataset.json`` has them, with its sensor's shapes; and the sizes that are known."""
+    own: dict[str, list[int | str]] = description["sensors"][file.sensor]["arrays"]
+    declared = {**description["arrays"], **description["arrays_of_a_shard"]}
+    kinds = {name: ArrayKind(item["dtype"], tuple(own.get(name, item["shape"])), "", "") for name, item in declared.items()}
+    sizes = {"N": file.count}
+    for name, item in description["arrays"].items():
+        sizes |= {key: n for key, n in zip(item["shape"], own[name], strict=False) if isinstance(key, str) and isinstance(n, int)}
+    return kinds, sizes

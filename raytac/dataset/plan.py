@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -88,10 +89,15 @@ class DatasetPlan:
         """Check all that can be told before anything is rendered.
 
         Raises:
-            InputError: an output that no data set has, a model that the sensor lacks, or randomisation of markers that are not asked for.
+            InputError: a count, shard size or seed out of its range, an output that no data set has, a model that the sensor lacks, or
+                randomisation of markers that are not asked for.
             SpecError: a range that no press into one of the sensors can follow; names the file and key.
         """
         self.sweep = sweep
+        for name, least, most in (("count", 1, 10**9), ("shard_size", 1, 10**5), ("seed", 0, 2**32 - 1)):
+            value = getattr(sweep, name)
+            if not isinstance(value, int) or not least <= value <= most:
+                raise InputError(name, value=value, rule=f"must be a whole number in [{least}, {most}]")
         for name in sweep.outputs:
             if name not in DATASET_OUTPUTS:
                 raise InputError("outputs", value=name, rule="must be known names", choices=DATASET_OUTPUTS)
@@ -212,6 +218,19 @@ class DatasetPlan:
         sensor = self.sweep.sensors[self.variant(shard)[0]]
         count = min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
         return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
+
+    def total_bytes(self, without: Collection[int] = ()) -> int:
+        """What all shards but those ``without`` take on disk, as ``shard_bytes``; in a time that does not grow with their number."""
+        kinds, last = len(self.sweep.sensors), self.shards - 1
+        done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
+        total = 0
+        for k, sensor in enumerate(self.sweep.sensors):
+            full = self.sweep.shard_size * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
+            total += full * (len(range(k, self.shards, kinds)) - done[k])
+        if last not in without:
+            absent = self.shards * self.sweep.shard_size - self.sweep.count
+            total -= absent * self.press_bytes(self.sweep.sensors[last % kinds])
+        return total
 
     # --- identity --------------------------------------------------------------------------------------------------------------
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +22,7 @@ from raytac.dataset.ray_engine import render_on_ray
 from raytac.dataset.renderer import RenderJob
 from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
 from raytac.errors import InputError
+from raytac.io.lock import FolderLock
 
 __all__ = ["Check", "RunReport", "render_dataset", "verify_dataset"]
 
@@ -91,20 +92,20 @@ def render_dataset(
     """
     if engine not in ENGINES:
         raise InputError("engine", value=engine, rule="must be a known name", choices=ENGINES)
-    if batch < 1:
+    if not isinstance(batch, int) or batch < 1:
         raise InputError("batch", value=batch, rule="must be a whole number >= 1")
     if engine == "local" and (workers is not None or address is not None):
         raise InputError("workers, address", value=(workers, address), rule="are settings of engine='ray'")
     check_pyarrow()
     folder = Path(folder)
-    with _alone(folder):
-        _check_same(folder, plan)
+    with FolderLock(folder):
         store = ShardStore(folder, plan.digest, compress=compress)
-        store.clear_partial()
-        records = _whole(store, plan, progress, say)
+        _check_same(folder, plan, store)
+        with _told(folder):
+            store.clear_partial()
+        records = _whole(store, progress, say)
+        _check_room(folder, plan, records, say)
         missing = [shard for shard in range(plan.shards) if shard not in records]
-        _check_room(folder, plan, missing, say)
-        write_description(folder, describe(plan, _ordered(records), None))
         job = RenderJob(plan, device, batch)
         start, done, first = time.perf_counter(), 0, None
         if missing:
@@ -114,13 +115,18 @@ def render_dataset(
             total = sum(len(record.rows) for record in records.values())
             with tqdm(total=plan.sweep.count, initial=total, unit="press", disable=None if progress else True) as bar:
                 for result in results:
-                    records[result.shard] = store.write(result)
+                    with _told(folder):
+                        if first is None:
+                            # Not before something is rendered: a refusal leaves nothing at which a corrected command would stop.
+                            write_description(folder, describe(plan, _ordered(records), None))
+                        records[result.shard] = store.write(result)
                     done += len(result.rows)
                     first = first or (time.perf_counter(), done)
                     bar.update(len(result.rows))
         took = time.perf_counter() - start
         whole = _ordered(records)
-        write_description(folder, describe(plan, whole, write_manifest(folder, whole)))
+        with _told(folder):
+            write_description(folder, describe(plan, whole, write_manifest(folder, whole)))
     failed = sum(row["status"] == "failed" for record in whole for row in record.rows)
     steady = (done - first[1]) / (start + took - first[0]) if first is not None and done > first[1] else None
     return RunReport(folder, len(missing), done, failed, took, steady, str(whole[-1].made_by["device"]))
@@ -148,17 +154,15 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     return Check(found["shards"], wrong)
 
 
-def _whole(store: ShardStore, plan: DatasetPlan, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
+def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
     """Records of the shards that are there and whole."""
-    records = {}
-    for shard in tqdm(range(plan.shards), "checking", unit="shard", disable=None if progress else True, leave=False):
+    records, there = {}, store.present()
+    for shard in tqdm(there, "checking", unit="shard", disable=None if progress else True, leave=False):
         record = store.read(shard)
         if isinstance(record, ShardRecord):
             records[shard] = record
-        elif record != "missing":
+        else:
             say(f"{record}: rendered again")
-    if records:
-        say(f"{len(records)} of {plan.shards} shards are there and whole")
     return records
 
 
@@ -166,11 +170,15 @@ def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
     return [records[shard] for shard in sorted(records)]
 
 
-def _check_same(folder: Path, plan: DatasetPlan) -> None:
-    if not (folder / FILE).is_file():
-        if (folder / FOLDER).is_dir() and any((folder / FOLDER).iterdir()):
-            raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
+def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
+    """Refuse a folder with shards of something else; a description without any shard is of a run that rendered nothing."""
+    shards = folder / FOLDER
+    if os.path.lexists(shards) and not shards.is_dir():
+        raise InputError("out", value=shards, rule="must be a folder, or not exist")
+    if not shards.is_dir() or not any(shards.iterdir()):
         return
+    if not (folder / FILE).is_file():
+        raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
     found = read_description(folder)
     if found["plan_sha256"] != plan.digest:
         changed = _differences(found["plan"], plan.description)
@@ -184,27 +192,23 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
 
 
-def _check_room(folder: Path, plan: DatasetPlan, missing: list[int], say: Callable[[str], object]) -> None:
+def _check_room(folder: Path, plan: DatasetPlan, records: dict[int, ShardRecord], say: Callable[[str], object]) -> None:
     """Compare what is missing with the free disk; arrays that are to be compressed are counted in full."""
-    need, free = sum(plan.shard_bytes(shard) for shard in missing), shutil.disk_usage(folder).free
+    need, free, missing = plan.total_bytes(without=records), shutil.disk_usage(folder).free, plan.shards - len(records)
+    if records:
+        say(f"{len(records)} of {plan.shards} shards are there and whole")
     if missing:
-        say(f"{len(missing)} of {plan.shards} shards to render: about {need / 1e9:.3g} GB, {free / 1e9:.3g} GB free")
+        say(f"{missing} of {plan.shards} shards to render: about {need / 1e9:.3g} GB, {free / 1e9:.3g} GB free")
     if need * _SPARE > free:
         rule = f"has {free / 1e9:.3g} GB free, and the data set takes about {need / 1e9:.3g} GB"
         raise InputError("out", value=folder, rule=rule)
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keep other runs out of the folder; the lock goes with the process, however it ends."""
+def _told(folder: Path) -> Iterator[None]:
+    """Say in a sentence that the folder cannot be written, as where the disk becomes full."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError as error:
-        raise InputError("out", value=folder, rule=f"must be a folder that can be written ({error.strerror})") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError("out", value=folder, rule="is in use by another run") from error
         yield
+    except OSError as error:
+        rule = f"cannot be written ({error.strerror}): shards that are done stay, and the same command goes on with the others"
+        raise InputError("out", value=folder, rule=rule) from error

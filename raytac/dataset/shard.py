@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import os
-import zipfile
-from collections.abc import Mapping
+import re
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from raytac.dataset.renderer import Row, ShardResult
+from raytac.io.arrays import npz_bytes
+from raytac.io.atomic import PARTIAL, open_regular, read_regular, write_atomic
 
-__all__ = ["FOLDER", "ShardRecord", "ShardStore", "npz_bytes", "sha256_of"]
+__all__ = ["FOLDER", "ShardRecord", "ShardStore", "is_shard_file", "sha256_of"]
 
 FOLDER = "shards"
 """Folder of the shards in a data set."""
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Date of every member of an archive, so that equal arrays are equal files."""
+_FILE = re.compile(rf"{FOLDER}/[0-9]{{6,12}}\.npz")
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class ShardStore:
         arrays = self._path(result.shard, "npz")
         if result.arrays:
             data, file = npz_bytes(result.arrays, compress=self._compress), f"{FOLDER}/{arrays.name}"
-            _replace(arrays, data)
+            write_atomic(arrays, data)
         else:
             arrays.unlink(missing_ok=True)
         record = ShardRecord(
@@ -65,67 +62,68 @@ class ShardStore:
             "rows_sha256": _rows_digest(record.rows),
             "rows": record.rows,
         }
-        _replace(self._path(result.shard, "json"), (json.dumps(kept, allow_nan=False) + "\n").encode())
+        write_atomic(self._path(result.shard, "json"), (json.dumps(kept, allow_nan=False) + "\n").encode())
         return record
 
     def read(self, shard: int) -> ShardRecord | str:
         """The record of a shard whose files are whole; else what is wrong with them, ``missing`` if there are none."""
-        path = self._path(shard, "json")
-        if not path.is_file():
-            return "missing"
+        path, arrays = self._path(shard, "json"), self._path(shard, "npz")
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))
+            kept = json.loads(read_regular(path))
             record = ShardRecord(shard, kept["file"], kept["sha256"], kept["bytes"], kept["rows"], kept["made_by"])
             if kept["plan_sha256"] != self._plan:
                 return f"{path.name} is of another plan"
             if kept["rows_sha256"] != _rows_digest(record.rows):
                 return f"{path.name} differs from its checksum"
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            _check_record(record, f"{FOLDER}/{arrays.name}")
+        except FileNotFoundError:
+            return "missing"
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             return f"{path.name} cannot be read ({type(error).__name__})"
-        if record.file:
-            arrays = self._path(shard, "npz")
-            if not arrays.is_file():
-                return f"{arrays.name} is missing"
-            if arrays.stat().st_size != record.bytes or sha256_of(arrays) != record.sha256:
+        try:
+            if record.file and (arrays.stat().st_size != record.bytes or sha256_of(arrays) != record.sha256):
                 return f"{arrays.name} differs from its checksum"
+        except FileNotFoundError:
+            return f"{arrays.name} is missing"
+        except OSError as error:
+            return f"{arrays.name} cannot be read ({error.strerror})"
         return record
+
+    def present(self) -> list[int]:
+        """Numbers of the shards of which there is a ``.json``, whole or not."""
+        folder = self.folder / FOLDER
+        names = [path.stem for path in folder.glob("*.json")] if folder.is_dir() else []
+        return sorted(int(name) for name in names if is_shard_file(f"{FOLDER}/{name}.npz"))
 
     def clear_partial(self) -> None:
         """Remove what a killed run left half-written."""
-        for path in (self.folder / FOLDER).glob(".*.partial"):
-            path.unlink(missing_ok=True)
+        for folder in (self.folder, self.folder / FOLDER):
+            for path in folder.glob(f".*{PARTIAL}"):
+                if path.is_file():
+                    path.unlink()
 
     def _path(self, shard: int, suffix: str) -> Path:
         return self.folder / FOLDER / f"{shard:06d}.{suffix}"
 
 
-def npz_bytes(arrays: Mapping[str, np.ndarray], *, compress: bool = False) -> bytes:
-    """An ``.npz`` for ``numpy.load``; equal arrays give equal bytes, which ``numpy.savez`` does not promise: it writes the time of day."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive:
-        for name, values in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy", _EPOCH)
-            member.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-            with archive.open(member, "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.ascontiguousarray(values), allow_pickle=False)
-    return out.getvalue()
-
-
 def sha256_of(path: Path) -> str:
     """Hex digest of a file."""
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file so that it is never seen half-written, also after the power failed."""
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, path)
 
 
 def _rows_digest(rows: list[Row]) -> str:
     return hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
+
+
+def is_shard_file(name: str) -> bool:
+    """Whether a path is one that a data set gives its shards: in the folder of the shards and nowhere else."""
+    return _FILE.fullmatch(name) is not None
+
+
+def _check_record(record: ShardRecord, file: str) -> None:
+    """Raise ``ValueError`` for a record that agrees with its checksum and yet is none."""
+    sound: Any = isinstance(record.rows, list) and isinstance(record.made_by, dict) and "device" in record.made_by
+    sound = sound and all(isinstance(row, dict) and row.get("status") in ("ok", "failed") for row in record.rows)
+    if not sound or record.file not in ("", file):
+        raise ValueError("a record needs its own file, rows with a status, and what made it")

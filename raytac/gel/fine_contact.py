@@ -171,9 +171,13 @@ class FineContact:
         return load > _LEAST * load.max()
 
     def _holding(self, upwards: np.ndarray, touching: np.ndarray) -> np.ndarray:
-        """Forces along z [N], (V,), on ``touching`` vertices that give them the heights they have, by linear elasticity of the mesh."""
+        """Forces along z [N], (V,), on ``touching`` vertices that give them the heights they have, by linear elasticity of the mesh.
+
+        Vertices that are bonded cannot move and bear no force here.
+        """
+        free = touching & (np.diagonal(self._compliance) > 0.0)
         held = np.zeros(len(upwards))
-        held[touching] = np.linalg.solve(self._compliance[np.ix_(touching, touching)], upwards[touching])
+        held[free] = np.linalg.solve(self._compliance[np.ix_(free, free)], upwards[free])
         return held
 
 

@@ -151,8 +151,10 @@ class Grip:
             waves = found.waves
         layer = self._back(waves, (self._vertex_x, self._vertex_y)).reshape(2, -1)
         trust = _trust(layer.T[touching], dragged[touching], load[touching])
+        if trust == 0.0:
+            return np.zeros_like(dragged)
         compliance = self._compliance[:, :, :, touching]
-        here = np.ascontiguousarray(compliance[:, :, touching].transpose(1, 2, 0, 3).reshape(2 * touching.sum(), -1))
+        here = compliance[:, :, touching].transpose(1, 2, 0, 3).reshape(2 * touching.sum(), -1)
         force = _held(here, dragged[touching].T.ravel().astype(np.float32))
         mesh = product(compliance.transpose(1, 2, 0, 3).reshape(-1, len(force)), force[:, None]).reshape(2, -1)
         return trust * (layer - mesh).T.astype(float)
@@ -160,7 +162,7 @@ class Grip:
     def hold(self, pressure: np.ndarray, goal: RigidMotion, friction: float) -> Held | None:
         """Friction under a ``pressure`` [Pa], (Ny, Nx) on the contact's fine grid, that moves the skin in contact by ``goal`` on the mean.
 
-        None where no node is in contact.
+        None where no node is in contact, or none of those can move.
         """
         place = np.stack(np.meshgrid(self._x, self._y), axis=-1)
 
@@ -185,7 +187,10 @@ class Grip:
 
         moved, motion = np.moveaxis(goal.at(place), -1, 0), goal
         bound = friction * pressed(goal.at(place), place)
-        stride = 1.0 / _stiffest(lambda traction: answer(traction)[1], bound > 0.0)
+        softest = _softest(lambda traction: answer(traction)[1], bound > 0.0)
+        if not softest > 0.0:
+            return None
+        stride = 1.0 / softest
         traction, held = np.zeros((2, *bound.shape), np.float32), None
         for _ in range(_ROUNDS):
             wanted = np.moveaxis(motion.at(place), -1, 0)
@@ -250,29 +255,42 @@ def _within(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:
     return (traction * np.minimum(1.0, bound / np.maximum(size, 1e-12))).astype(np.float32)
 
 
-def _stiffest(answer, inside: np.ndarray) -> float:
-    """A little more than the greatest motion over traction [m/Pa] within the contact, by power iteration."""
+def _softest(answer, inside: np.ndarray) -> float:
+    """A little more than the greatest motion over traction [m/Pa] within the contact, by power iteration; 0 where nothing can move."""
     trial = np.stack([inside, inside]).astype(np.float32)
     size = 0.0
     for _ in range(3):
         moved = answer(trial) * inside
+        if not moved.any():
+            return 0.0
         size = float(np.linalg.norm(moved) / np.linalg.norm(trial))
         trial = moved / np.float32(np.abs(moved).max())
     return 1.15 * size
 
 
 def _held(compliance: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Forces [N] whose linear answer is ``moved`` [m], (n,), float32, by conjugate gradients."""
-    force, left = np.zeros_like(moved), moved.copy()
-    way, size = left.copy(), float(left @ left)
+    """Forces [N], (n,), whose linear response is ``moved`` [m], (n,), by conjugate gradients; float32.
+
+    What cannot move (the sides of the pad across themselves: rows of ``compliance`` that are 0) is left out and bears no force.
+    """
+    free = np.diagonal(compliance) > 0.0
+    a, b = np.ascontiguousarray(compliance[np.ix_(free, free)]), moved[free]
+    x, r, p = np.zeros_like(b), b.copy(), b.copy()
+    rr = float(r @ r)
     for _ in range(_HOLDS):
-        if np.abs(left).max() < _CLOSE:
+        if np.abs(r).max(initial=0.0) < _CLOSE:
             break
-        answer = product(compliance, way[:, None])[:, 0]
-        stride = np.float32(size / float(way @ answer))
-        force, left = force + stride * way, left - stride * answer
-        size, before = float(left @ left), size
-        way = left + np.float32(size / before) * way
+        ap = product(a, p[:, None])[:, 0]
+        curvature = float(p @ ap)
+        if not curvature > 0.0:  # rounding of float32 is all that is left
+            break
+        alpha = np.float32(rr / curvature)
+        x, r = x + alpha * p, r - alpha * ap
+        rr, before = float(r @ r), rr
+        beta = np.float32(rr / before)
+        p = r + beta * p
+    force = np.zeros_like(moved)
+    force[free] = x
     return force
 
 

@@ -49,6 +49,8 @@ class Part:
     elevation: np.ndarray | None = None
     max_slope: float = 0.0
     """Relief only: greatest slope of the elevation."""
+    joined: bool = False
+    """Whether it grows out of the flat lower face, z = 0 in the object frame, of the object's first part and is one solid with it."""
 
 
 def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndarray | None = None) -> Part:

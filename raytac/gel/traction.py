@@ -89,7 +89,8 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
 
     The normal traction is in proportion to the indentation where ``surface.contact`` (K. L. Johnson, Contact Mechanics, section 4.3);
     the tangential force is shared as the normal one is, and the twist about the contact's centre likewise, growing with the distance
-    from it. Where the pressure really is, a load law does not know: totals are exact, the distribution is a model.
+    from it. Where the pressure really is, a load law does not know: the sum of traction × ``cell_areas`` is exact, the distribution is a
+    model. A contact that is narrower than a cell, which the nodes cannot twist, shows no twist.
 
     Args:
         surface: gives contact and indentation.
@@ -97,6 +98,7 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
         twist: torque about +z through the contact's centre [N m], shape (B,).
     """
     grid, area = surface.grid, cell_areas(surface.grid)
+    cell = (grid.pitch[0] ** 2 + grid.pitch[1] ** 2) / 12.0  # mean square distance of a cell's area from its middle
     out = np.zeros((*surface.height.shape, 3), np.float32)
     for b in range(surface.batch):
         share = np.where(surface.contact[b], np.maximum(surface.indentation[b], 0.0), 0.0)
@@ -108,7 +110,7 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
         x, y = grid.x[None, :], grid.y[:, None]
         x, y = x - (share * area * x).sum(), y - (share * area * y).sum()
         arm = float((share * area * (x**2 + y**2)).sum())
-        if arm > 0.0:
+        if arm > cell:
             out[b, ..., 0] -= share * twist[b] / arm * y
             out[b, ..., 1] += share * twist[b] / arm * x
     return out

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from raytac.errors import InputError
+from raytac.io.atomic import write_atomic
 
 __all__ = ["REQUIRED", "VERSIONED", "Metric", "check_metrics", "read_metrics", "versions", "write_metrics"]
 
@@ -77,7 +78,7 @@ def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]
     """
     checked = check_metrics(values)
     text = json.dumps(checked, indent=1, ensure_ascii=False) + "\n"
-    path.write_text(text, encoding="utf-8", errors="backslashreplace")  # a path's undecodable bytes become JSON's own escapes
+    write_atomic(path, text.encode("utf-8", "backslashreplace"))  # a path's undecodable bytes become JSON's own escapes
     return checked
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["read_png", "write_png"]
+__all__ = ["png_bytes", "read_png", "write_png"]
 
 
-def write_png(path: Path, rgb_u8: np.ndarray) -> None:
-    """Write ``rgb_u8``, shape (H, W, 3), uint8.
+def png_bytes(rgb_u8: np.ndarray) -> bytes:
+    """``rgb_u8``, shape (H, W, 3), uint8, as the contents of a PNG file.
 
     Raises:
         InputError: another shape or type.
@@ -21,7 +22,18 @@ def write_png(path: Path, rgb_u8: np.ndarray) -> None:
         raise InputError("rgb_u8", value=(rgb_u8.shape, str(rgb_u8.dtype)), rule="must have shape (H, W, 3) and type uint8")
     from PIL import Image
 
-    Image.fromarray(np.ascontiguousarray(rgb_u8)).save(path)
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(rgb_u8)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def write_png(path: Path, rgb_u8: np.ndarray) -> None:
+    """Write ``png_bytes(rgb_u8)``.
+
+    Raises:
+        InputError: another shape or type.
+    """
+    path.write_bytes(png_bytes(rgb_u8))
 
 
 def read_png(path: Path) -> np.ndarray:

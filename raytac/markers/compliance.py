@@ -7,14 +7,13 @@ order, held where the case holds the pad; inverted once and kept on disk.
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
-from pathlib import Path
+import io
 
 import numpy as np
 
+from raytac.io.arrays import npy_bytes
+from raytac.io.cache import cache_folder, keep_cached, read_cached
 from raytac.io.code_digest import code_digest
-from raytac.optics.table_cache import cache_root
 from raytac.physics.soft_mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
@@ -64,27 +63,15 @@ def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
 
 
 def cached_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
-    """``coat_compliance``, float32, from the cache (``RAYTAC_CACHE``) if it was made before; a cache that cannot be written is no error."""
-    basis = repr(gelpad), mesh.tets.vertices.tobytes(), mesh.tets.tets.tobytes(), mesh.bonded.tobytes(), code_digest(__name__)
+    """``coat_compliance``, float32, from the user's cache if it was made before; one that is damaged is made again, with a warning."""
+    arrays = mesh.tets.vertices, mesh.tets.tets, mesh.bonded, mesh.coat_vertices
+    basis = repr(gelpad), *(array.tobytes() for array in arrays), code_digest(__name__)
     digest = hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
-    path = cache_root() / "markers" / f"compliance-{digest}.npy"
-    try:
-        kept = np.load(path, allow_pickle=False)
-        if kept.shape == (3 * len(mesh.coat_vertices),) * 2:
-            return kept
-    except (OSError, ValueError):
-        pass
+    folder = cache_folder("markers")
+    path = None if folder is None else folder / f"compliance-{digest}.npy"
+    kept = read_cached(path)
+    if kept is not None:
+        return np.load(io.BytesIO(kept), allow_pickle=False)
     fields = coat_compliance(mesh, gelpad).astype(np.float32)
-    _keep(path, fields)
+    keep_cached(path, npy_bytes(fields))
     return fields
-
-
-def _keep(path: Path, array: np.ndarray) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(suffix=".npy", dir=path.parent)
-        with os.fdopen(handle, "wb") as stream:
-            np.save(stream, array)
-        os.replace(name, path)
-    except OSError:
-        return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -57,8 +57,8 @@ def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
     return ArraySpec(shape, spec.dtype, spec.low, spec.high)
 
 
-def gymnasium_space(specs: Mapping[str, ArraySpec | Mapping[str, Any]]) -> gymnasium.spaces.Dict:
-    """The same as a ``gymnasium.spaces.Dict`` of boxes, nested as ``specs`` are.
+def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
+    """The same as a ``gymnasium.spaces.Dict`` of boxes.
 
     Raises:
         BackendError: Gymnasium is not installed.
@@ -67,10 +67,4 @@ def gymnasium_space(specs: Mapping[str, ArraySpec | Mapping[str, Any]]) -> gymna
         from gymnasium import spaces
     except ImportError as error:
         raise BackendError(f"spaces need Gymnasium ({error}): `pip install 'raytac[rl]'`") from error
-    made: dict[str, Any] = {}
-    for name, spec in specs.items():
-        if isinstance(spec, ArraySpec):
-            made[name] = spaces.Box(spec.low, spec.high, spec.shape, spec.dtype)
-        else:
-            made[name] = gymnasium_space(spec)
-    return spaces.Dict(made)
+    return spaces.Dict({name: spaces.Box(spec.low, spec.high, spec.shape, spec.dtype) for name, spec in specs.items()})

@@ -17,11 +17,14 @@ __all__ = ["AddTactile"]
 
 
 class AddTactile(gymnasium.Wrapper):
-    """Observations become a Dict: the environment's own (its keys if it is a Dict, else ``observation``) and one of every sensor.
+    """Observations become a Dict: the environment's own (its keys if it is a Dict, else ``observation``) and the modalities of each sensor.
 
     .. code-block:: python
 
-        env = AddTactile(MyEnv(world), {"sensor": observer}, world.observe)
+        env = AddTactile(MyEnv(world), {"left": observer}, world.observe)
+        env.reset()[0]["left_rgb"]
+
+    Names are flat, ``<sensor>_<modality>`` as in the tasks of ``raytac.envs``, since stable-baselines3 refuses a Dict in a Dict.
 
     ``reset(seed=…)`` seeds the observers' cameras too. Noise of markers is drawn by the sensor that gives the frames: seed that in the
     environment's own ``reset``.
@@ -36,7 +39,7 @@ class AddTactile(gymnasium.Wrapper):
         """``observers``: one a sensor, of one environment, without ``difference``; ``frames``: gives the present frame of each.
 
         Raises:
-            InputError: an observer of several environments, or a name that the environment's observation has already.
+            InputError: an observer of several environments, or a name that is in the observation already.
         """
         super().__init__(env)
         for name, observer in observers.items():
@@ -48,10 +51,11 @@ class AddTactile(gymnasium.Wrapper):
         own = env.observation_space
         spaces: dict[str, Any] = dict(own.spaces) if isinstance(own, gymnasium.spaces.Dict) else {"observation": own}
         for name, observer in observers.items():
-            if name in spaces:
-                rule = "must not be a key of the environment's observation"
-                raise InputError("observers", value=name, rule=rule)
-            spaces[name] = gymnasium_space(observer.arrays)
+            for modality, box in gymnasium_space(observer.arrays).items():
+                key = f"{name}_{modality}"
+                if key in spaces:
+                    raise InputError("observers", value=name, rule=f"gives {key!r}, which is a key of the observation already")
+                spaces[key] = box
         self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -77,5 +81,5 @@ class AddTactile(gymnasium.Wrapper):
         for name, observer in self.observers.items():
             if name not in frames:
                 raise InputError("observers", value=name, rule="must be names of frames that are given", choices=tuple(frames))
-            made[name] = {key: np.asarray(value[0]) for key, value in observer.observe(frames[name]).items()}
+            made |= {f"{name}_{modality}": np.asarray(value[0]) for modality, value in observer.observe(frames[name]).items()}
         return made

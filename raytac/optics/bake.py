@@ -21,7 +21,6 @@ from raytac.optics.bake_presses import ball_presses, pin_presses
 from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.bake_shadow import ShadowSums
 from raytac.optics.bake_views import Calibration, Views
-from raytac.optics.calib_folder import load_calibration
 from raytac.optics.table import PolyTable, ShadowTable, TaximConstants, slope_bins
 from raytac.optics.table_cache import cached, keep, table_folder
 from raytac.specs.sensor import SensorSpec
@@ -71,11 +70,12 @@ def baked_table(
 ) -> PolyTable:
     """The table of ``bake_table``, baked once and kept on disk under a digest of sensor, lights, settings and code.
 
-    It is kept in ``cache_root()``, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
-    nothing there. A cached table may come from the other device, whose images differ by rounding.
+    It is kept in the user's cache, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
+    nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may come from the
+    other device, whose images differ by rounding.
 
     Raises:
-        InputError: a value out of its choices, or a cache that cannot be written.
+        InputError: a value out of its choices.
         BackendError: the table is not cached, and the ray tracer cannot run on ``device``.
     """
     settings = BakeSettings() if settings is None else settings
@@ -83,10 +83,11 @@ def baked_table(
     table = cached(folder)
     if table is None:
         if progress:
-            print(f"raytac: no table of {sensor.name} yet, so it is baked once and kept in {folder.parent}", file=sys.stderr)
-        keep(bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress), folder)
-        # What later processes will read, to the last bit.
-        table = load_calibration(folder)
+            where = "" if folder is None else f" and kept in {folder.parent}"
+            print(f"raytac: no table of {sensor.name} yet, so it is baked once{where}", file=sys.stderr)
+        table = bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress)
+        if keep(table, folder):
+            table = cached(folder) or table  # what later processes will read, to the last bit
     return table
 
 

@@ -138,9 +138,8 @@ class BounceField:
 
     @staticmethod
     def memory_per_env(layout: CoatLayout, channels: int) -> int:
-        """Bytes that the grid takes while it is filled: packed results and the loop's sums before and after, patches and their light."""
-        nodes = math.prod(patch_counts(layout))
-        return nodes * (channels * (16 + 2 * 12) + 16 * (channels // 3) + 60)
+        """Bytes that the grid takes while it is filled: packed results of each channel, patches, their light by layer, heights."""
+        return math.prod(patch_counts(layout)) * (16 * channels + 16 + 16 * (channels // 3) + 4)
 
     def _node(self, i: Any) -> tuple[Any, Any, Any]:
         """(env, ix, iy) of patch index ``i``."""

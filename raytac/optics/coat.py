@@ -76,6 +76,12 @@ class CoatField:
         self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
         dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
 
+    @staticmethod
+    def memory_per_env(layout: CoatLayout) -> int:
+        """Bytes of one surface: normals and corners of every node, and three bounds of the tiles by rows, then by columns, then spread."""
+        g = layout
+        return 32 * g.nx * g.ny + 12 * g.ny * g.tiles_x + 24 * g.tiles_x * g.tiles_y
+
     def _cell(self, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         mi, g = self.mi, self.layout
         fx = dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001)

@@ -25,7 +25,7 @@ from raytac.optics.memory import ROUNDING, check_batch, largest_batch
 from raytac.optics.raytrace import RayTracer
 from raytac.optics.recording import no_collection
 from raytac.optics.refraction import Slab
-from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, safe_heights
+from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, device_envs, safe_heights
 from raytac.optics.variant import load_mitsuba
 from raytac.specs.sensor import SensorSpec
 
@@ -176,9 +176,9 @@ class ImageMode(ABC):
     def memory_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment of a batch on ``grid`` takes [byte]: nodes, height images, those on the way, the last."""
         width, height = self.camera.resolution
-        nodes = grid.shape[0] * grid.shape[1] * (5 if self.needs_contact else 4)
-        # Heights and displacement, what the mode holds; contact and flags; three channels and their bytes.
-        return ROUNDING * (nodes + round(width * height * (4 * (2 + self._floats_per_pixel()) + 2 + 15)))
+        nodes = grid.rest.size * (9 if self.needs_contact else 8)  # height, ink and contact
+        # Heights, displacement and ink, what the mode holds; contact and flags; three channels and their bytes.
+        return ROUNDING * (nodes + round(width * height * (4 * (3 + self._floats_per_pixel()) + 2 + 15)))
 
     def largest_batch(self, grid: PadGrid) -> int:
         """Largest number of environments that one call may render on ``grid``."""
@@ -202,7 +202,7 @@ class ImageMode(ABC):
             return
         check_view(self.camera, grid)
         self.layout = CoatLayout.from_grid(grid)
-        self._rest = self.mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
+        self._rest = self.mi.Float(grid.rest.astype(np.float32).ravel())  # a copy: see ``recording``
         self._inputs = self._build(grid)
         self._grid = grid
 
@@ -253,17 +253,13 @@ class ImageMode(ABC):
         replays them afterwards.
 
         Raises:
-            InputError: nothing was rendered or prepared before, a width that is no whole number of grids, or a batch too large.
+            InputError: nothing was rendered or prepared before, heights of no whole number of grids, contact or ink of another width, or
+                a batch too large.
         """
         if self._grid is None:
             raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
-        nodes = self.layout.nx * self.layout.ny
-        if dr.width(heights) == 0 or dr.width(heights) % nodes:
-            raise InputError("heights", value=dr.width(heights), rule=f"must hold a whole number of grids of {nodes} nodes")
-        if self.needs_contact and (contact is None or dr.width(contact) != dr.width(heights)):
-            value = None if contact is None else dr.width(contact)
-            raise InputError("contact", value=value, rule=f"this mode needs one value a node, {dr.width(heights)} here")
-        envs = dr.width(heights) // nodes
+        others = ({"contact": contact} if self.needs_contact else {}) | ({} if ink is None else {"ink": ink})
+        envs = device_envs(self.layout.nx * self.layout.ny, heights, **others)
         self._check_batch(envs, self._grid)
         key = "frame" if ink is None else "frame-ink", envs
         if key not in self._frozen:

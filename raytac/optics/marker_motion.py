@@ -75,7 +75,7 @@ class FotsConstants:
 
 
 class FotsKernel:
-    """Marker displacements from contact samples and contacts; recorded once for each batch size and number of contacts."""
+    """Marker displacements from contact samples and contacts; recorded once for each number of environments, markers and contacts."""
 
     def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
         """``x`` (nx,), ``y`` (ny,) [m]: where the contact is sampled, evenly spaced.
@@ -88,7 +88,7 @@ class FotsKernel:
         self._packets = -(-self.nx // _PACKET)
         self._origin = float(x[0]), float(y[0])
         self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
-        self._frozen: dict[tuple[int, int, bool], Any] = {}
+        self._frozen: dict[tuple[int, int, int, bool], Any] = {}
         self._markers: tuple[np.ndarray, np.ndarray, Any] | None = None
         self._numbers: tuple[FotsConstants, Any] | None = None
 
@@ -123,7 +123,7 @@ class FotsKernel:
         frame[sample:].reshape(batch, self.ny, -1)[..., : self.nx] = depth
         inputs = self._on_device(markers), mi.Float(frame), self._constants(constants)
         is_punch = constants.punch is not None
-        key = batch, k, is_punch
+        key = batch, count, k, is_punch
         if key not in self._frozen:
             # All inputs are arrays in memory: there is nothing to make opaque.
             self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays), auto_opaque=False)

@@ -25,7 +25,7 @@ from raytac.optics.reference import ReferenceIntegrator, StockPathIntegrator
 from raytac.optics.refraction import Slab
 from raytac.optics.response import Response
 from raytac.optics.scene import UNIT, SensorScene
-from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, safe_heights
+from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, device_envs, safe_heights
 from raytac.optics.variant import load_mitsuba
 from raytac.specs.sensor import SensorSpec
 
@@ -160,7 +160,7 @@ class RayTracer:
         check_view(self.camera, grid)
         mi = self.mi
         self.layout = CoatLayout.from_grid(grid)
-        self._rest = mi.Float(np.ascontiguousarray(grid.rest, dtype=np.float32).ravel())
+        self._rest = mi.Float(grid.rest.astype(np.float32).ravel())  # a copy: see ``recording``
         # Only what the outputs need: normals and depth take camera rays on the height field alone.
         sampled = self.integrator != "fast"
         needs_scene = self._lit and (sampled or self.bounce)
@@ -185,17 +185,21 @@ class RayTracer:
     def memory_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment of a ``fast`` batch on ``grid`` takes [byte]: the field at the nodes, the images."""
         width, height = self.camera.resolution
-        # A node has its height, a normal, corners packed for one gather and its share of the tiles' bounds; a pixel has its channels, the
-        # image in linear light and in bytes, and where it looks.
-        nodes, pixels = grid.rest.size * 32, width * height * (4 * 3 * len(self.layer_names) + 15 + 24)
-        channels = 3 * len(self.layer_names)
-        indirect = BounceField.memory_per_env(CoatLayout.from_grid(grid), channels) if self.bounce else 0
-        return ROUNDING * (nodes + pixels + indirect)
+        layout, channels, asked = CoatLayout.from_grid(grid), 3 * len(self.layer_names), set(self.outputs)
+        # A pixel's levels before and after they are interleaved, and in bytes; a channel each; where it looks.
+        pixel = 27 * ("rgb" in asked) + 4 * channels * ("layers" in asked) + 24 * bool({"normals", "depth"} & asked)
+        indirect = BounceField.memory_per_env(layout, channels) if self.bounce and self._lit else 0
+        inputs = 8 * grid.rest.size  # height and ink
+        return ROUNDING * (inputs + CoatField.memory_per_env(layout) + indirect + width * height * pixel)
 
     def largest_batch(self, grid: PadGrid) -> int:
         """Largest number of environments that one call of ``fast`` may render on ``grid``; sampled images take one at a time."""
         width, height = self.camera.resolution
         return largest_batch(self._memory, self.memory_per_env(grid), max(4 * grid.rest.size, 3 * width * height))
+
+    def _check_batch(self, envs: int, grid: PadGrid) -> None:
+        each = self.memory_per_env(grid)
+        check_batch(envs, self.largest_batch(grid), per_env=each, memory=self._memory, device=self.device)
 
     # ---------------------------------------------------------------- images
 
@@ -248,10 +252,7 @@ class RayTracer:
         """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
         check_shapes(surface)
         if self.integrator == "fast" or {"normals", "depth"} & set(self.outputs):
-            each = self.memory_per_env(surface.grid)
-            check_batch(
-                len(surface.height), self.largest_batch(surface.grid), per_env=each, memory=self._memory, device=self.device
-            )
+            self._check_batch(len(surface.height), surface.grid)
         self._prepare(surface.grid)
         return safe_heights(surface)
 
@@ -274,13 +275,21 @@ class RayTracer:
         """``fast`` on device arrays: heights (B·Ny·Nx) [m] to ``rgb`` (B·H·W·3, UInt8-valued) and ``layers`` (list of channels).
 
         ``ink`` (B·Ny·Nx): share of marker dots at each node, in [0, 1]. Heights must be finite, which is not checked here.
-        Nothing leaves the device. Dr.Jit records the kernels at the first call and replays them afterwards.
+        Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and replays them afterwards.
+
+        Raises:
+            InputError: another integrator, nothing was rendered before, heights of no whole number of grids, ink of another width, or a
+                batch too large.
         """
+        if self.integrator != "fast":
+            raise InputError(
+                "integrator", value=self.integrator, rule="device arrays need the fast integrator", choices=("fast",)
+            )
         if self._grid is None:
             raise InputError("heights", value=type(heights).__name__, rule="render a GelSurface first: it tells the grid")
-        nodes = self.layout.nx * self.layout.ny
-        if dr.width(heights) == 0 or dr.width(heights) % nodes:
-            raise InputError("heights", value=dr.width(heights), rule=f"must hold a whole number of grids of {nodes} nodes")
+        others = {} if ink is None else {"ink": ink}
+        envs = device_envs(self.layout.nx * self.layout.ny, heights, **others)
+        self._check_batch(envs, self._grid)
         rgb, layers = self._recorded(self._fast_frame, heights, ink)
         return {"rgb": rgb, "layers": layers}
 

@@ -1,4 +1,15 @@
-"""Calling frozen Dr.Jit functions safely."""
+"""Calling frozen Dr.Jit functions safely.
+
+A recording is replayed with other inputs, so what follows must be the same at every call of one recorded function:
+
+- **The width of every array that it makes.** An array of one value is compiled as a scalar, and a replay reads it as one however long it
+  has become. So there is no ``dr.compress`` in a recorded function, whose width comes from values; whatever else sets a width (number of
+  environments, of markers, of contacts) is part of the key that recordings are kept by.
+- **Which inputs lie on the same memory.** Dr.Jit tells arrays apart by their address, and on the CPU those made from NumPy arrays lie on
+  NumPy's memory. So an input that is kept is a copy: a surface may lie on the same memory as the grid's heights at rest.
+
+Dr.Jit itself makes another recording where an input is a literal, of another alignment, or where two inputs are one variable.
+"""
 
 from __future__ import annotations
 

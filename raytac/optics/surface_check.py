@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import drjit as dr
 import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 
-__all__ = ["check_same_grid", "check_shapes", "check_view", "safe_heights"]
+__all__ = ["check_same_grid", "check_shapes", "check_view", "device_envs", "safe_heights"]
 
 
 def check_shapes(surface: GelSurface) -> None:
     """Raise InputError for a surface without environments; the surface itself checks its shapes."""
     if surface.batch < 1:
         raise InputError("surface.height", value=surface.height.shape, rule="must have at least one environment")
+
+
+def device_envs(nodes: int, heights: Any, **others: Any) -> int:
+    """Number of environments B in device heights (B·``nodes``); raise InputError unless each of ``others`` has one value a node too."""
+    width = dr.width(heights)
+    if width == 0 or width % nodes:
+        raise InputError("heights", value=width, rule=f"must hold a whole number of grids of {nodes} nodes")
+    for name, array in others.items():
+        if array is None or dr.width(array) != width:
+            value = None if array is None else dr.width(array)
+            raise InputError(name, value=value, rule=f"must have one value a node, {width} here")
+    return width // nodes
 
 
 def safe_heights(surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:

@@ -109,13 +109,10 @@ class ShadowCaster:
         d = depth_bin(seen.moved)
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
-        # Only a few pixels cast: bring them together, so that no lane idles.
-        caster: Any = dr.compress(casts | (i == 0))  # never none, which no kernel may have; pixel 0 goes no way unless it casts
-        a, d, x0, y0, first_of = (dr.gather(type(v), v, caster) for v in (a, d, mi.Int32(column), mi.Int32(row), first))
-        origin = dr.gather(mi.Float, of, caster)
-        moved = dr.gather(mi.Float, seen.moved, caster)
+        # Every pixel is a lane, though few cast: how many do changes from frame to frame, and a recording must not depend on it.
+        x0, y0 = mi.Int32(column), mi.Int32(row)
         entry = a * n_depth + d
-        end = dr.gather(mi.UInt32, arrays.ends, entry, dr.gather(mi.Bool, casts, caster))
+        end = dr.gather(mi.UInt32, arrays.ends, entry, casts)
         places = dr.width(arrays.ways) // (4 * n_dir)
         # Integers, since not every device has an atomic minimum of floats.
         least = dr.full(mi.Int32, int(ordered(np.array([_NOTHING]))[0]), 3 * dr.width(i))
@@ -129,11 +126,11 @@ class ShadowCaster:
             # Upstream truncates towards zero, so what falls just outside the first row or column is in it.
             x, y = dr.select(x == -1, 0, x), dr.select(y == -1, 0, y)
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            at = first_of + mi.UInt32(y) * width + mi.UInt32(x)
-            shaded = inside & (origin > dr.gather(mi.Float, of, at, inside))
+            at = first + mi.UInt32(y) * width + mi.UInt32(x)
+            shaded = inside & (of > dr.gather(mi.Float, of, at, inside))
             row_of = entry
             if by_drop:
-                drop = depth_bin(moved - dr.gather(mi.Float, seen.moved, at, inside))
+                drop = depth_bin(seen.moved - dr.gather(mi.Float, seen.moved, at, inside))
                 shaded &= drop >= 0
                 row_of = a * n_depth + mi.UInt32(dr.maximum(drop, 0))
             value = dr.gather(mi.Vector4i, arrays.values, row_of * length + mi.UInt32(place.z), shaded)
@@ -141,7 +138,7 @@ class ShadowCaster:
                 dr.scatter_reduce(dr.ReduceOp.Min, least, value[c], at * 3 + c, shaded, mode=dr.ReduceMode.Direct)
             return (k + 1,)
 
-        dr.while_loop((dr.zeros(mi.UInt32, dr.width(caster)),), unfinished, march, label="table shadow")
+        dr.while_loop((mi.UInt32(0),), unfinished, march, label="table shadow")
         dark = [dr.minimum(change[c], unordered(mi, dr.gather(mi.Int32, least, i * 3 + c))) for c in range(3)]
         packed = dr.ravel(mi.Vector4f(*dark, 0))
         for axis, taps in enumerate(self._shadow_taps):

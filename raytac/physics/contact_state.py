@@ -19,7 +19,7 @@ class ContactState:
     scene moves it (world and pad frame are one at first touch). depth [m], (B,): travel below first touch at zero shear and twist;
     negative when lifted. normal_force [N], (B,): towards −z, >= 0. shear_force [N], (B, 2): along x and y. twist_torque [N m],
     (B,): about +z. force_law_area [m²], (B,): area of contact by the load law, which the forces follow. failed, (B,) bool: the
-    state of this environment is not finite or did not settle (its pose is then NaN).
+    state of this environment is not finite, did not settle, or did not converge (its pose is then NaN).
     """
 
     stage: int
@@ -38,3 +38,5 @@ class ContactState:
     failed: np.ndarray
     scene: PressScene | None = None
     """Scene that the object belongs to; None if it is not known."""
+    unconverged: np.ndarray | None = None
+    """Steps of the solver since the start that did not meet its tolerance, (B,), int; None for the rigid pad, which has no solver."""

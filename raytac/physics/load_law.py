@@ -55,10 +55,12 @@ class LoadLaw:
     count as one of the same area. F is strictly increasing in δ and 0 at δ <= 0.
     """
 
-    def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec) -> None:
+    def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
         """``gap`` [m]: distance along z from the resting gel to the object at first touch, any shape, >= 0, ``inf`` where there
-        is none; ``cell_area`` [m²] of one node."""
+        is none; ``cell_area`` [m²] of one node; ``deepest`` [m]: where there is gel for, at most the pad's thickness."""
         self._gelpad = gelpad
+        self.deepest = min(deepest, gelpad.thickness)
+        """Greatest depth that a press may have [m]."""
         self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
         near = np.sort(gap[gap < 0.5 * gelpad.thickness], axis=None)
@@ -73,17 +75,17 @@ class LoadLaw:
 
     @property
     def greatest(self) -> float:
-        """Force at a depth of the pad's whole thickness [N]."""
-        return float(self.table[-1])
+        """Force at the greatest depth [N]."""
+        return self.force(self.deepest)
 
     def force(self, depth: float) -> float:
         """Normal force [N] at ``depth`` [m]; 0 out of contact."""
         return float(np.interp(depth, self.depth, self.table))
 
     def depth_at(self, force: float) -> float:
-        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is deeper than the pad."""
+        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is deeper than ``deepest``."""
         if force > self.greatest:
-            rule = f"would press deeper than the pad's {self.thickness} m (at most {self.greatest:.4g} N)"
+            rule = f"would press deeper than the pad is there: at most {self.greatest:.4g} N, {self.deepest * 1e3:.4g} mm deep"
             raise InputError("force", value=force, rule=rule)
         return float(np.interp(force, self.table, self.depth))
 

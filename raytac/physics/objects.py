@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -81,14 +82,14 @@ def _pins(spec: Shape) -> tuple[Part, ...]:
     for j in range(rows):
         for i in range(columns):
             x, y = (i - 0.5 * (columns - 1)) * pitch, (j - 0.5 * (rows - 1)) * pitch
-            parts.append(primitive("cylinder", (radius, 0.5 * height), _shift(x, y, -0.5 * height)))
+            parts.append(replace(primitive("cylinder", (radius, 0.5 * height), _shift(x, y, -0.5 * height)), joined=True))
     return tuple(parts)
 
 
 def _coin(spec: Shape) -> tuple[Part, ...]:
     radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
     body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
-    return body, relief_part(coin_elevation(radius, relief), radius)
+    return body, replace(relief_part(coin_elevation(radius, relief), radius), joined=True)
 
 
 def _mjcf(spec: Shape) -> tuple[Part, ...]:

@@ -26,6 +26,8 @@ class PadReading:
     """Environments whose physics broke down, shape (B,), bool."""
     traction: Callable[[], np.ndarray]
     """Computes the traction on the pad [Pa], shape (B, Ny, Nx, 3), as ``TactileFrame.traction``; called only if it is asked for."""
+    unconverged: np.ndarray | None = None
+    """Steps of the solver since the reset that did not meet its tolerance, shape (B,), int; None for rigid pads."""
 
     def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
         """The same of the environments named, one row each."""
@@ -43,7 +45,8 @@ class PadReading:
             coat=coat,
             **others,
         )
-        return PadReading(surface, self.wrench[rows], self.failed[rows], lambda: self.traction()[rows])
+        unconverged = None if self.unconverged is None else self.unconverged[rows]
+        return PadReading(surface, self.wrench[rows], self.failed[rows], lambda: self.traction()[rows], unconverged)
 
     @property
     def force(self) -> np.ndarray:

@@ -9,26 +9,24 @@ import numpy as np
 import ipc
 from raytac.errors import InputError
 from raytac.gel.part import Part
-from raytac.gel.relief import relief_part
+from raytac.physics.facets import SAG, around, coarse_relief, grid_facets
+from raytac.physics.joined_surface import joined_surface
 
-__all__ = ["SAG", "enclosed_volume", "object_surface", "part_surface"]
-
-SAG = 2e-6
-"""How far a facet may lie inside a curved part [m]: far below what a pad's own triangles miss."""
-_FEWEST, _MOST = 16, 256
-"""Facets around a circle."""
-_RELIEF_SPACING = 0.2e-3
-"""Spacing of a relief's facets [m]: below the cells of the finest pad, since the map's own would be half a million."""
+__all__ = ["enclosed_volume", "object_surface", "part_surface"]
 
 
 def object_surface(parts: Sequence[Part], sag: float = SAG) -> ipc.TriMesh:
-    """Surfaces of all parts in one mesh, object frame [m]. Parts that overlap keep the walls inside each other.
+    """Surfaces of all parts in one mesh, object frame [m].
+
+    Parts that are ``joined`` to the first one make one closed surface with it; others that overlap keep the walls inside each other.
 
     Raises:
-        InputError: no parts, or a ``plane``, which has no closed surface.
+        InputError: no parts, a ``plane``, which has no closed surface, or joined parts of a shape that ``joined_surface`` does not know.
     """
     if not parts:
         raise InputError("parts", value=(), rule="an object without parts has no surface")
+    if any(part.joined for part in parts):
+        return joined_surface(parts, sag)
     vertices, faces, start = [], [], 0
     for part in parts:
         surface = part_surface(part, sag)
@@ -62,7 +60,7 @@ def part_surface(part: Part, sag: float = SAG) -> ipc.TriMesh:
     if part.kind == "cylinder":
         return _turned([(size[0], -size[1]), (size[0], size[1])], sag)
     if part.kind == "capsule":
-        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * (_around(size[0], sag) // 4) + 1)[1:-1]
+        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * (around(size[0], sag) // 4) + 1)[1:-1]
         shift = np.where(angle < 0.0, -size[1], size[1])
         profile = np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle) + shift], axis=1)
         ends = (-size[1] - size[0], size[1] + size[0])
@@ -83,12 +81,6 @@ _BOX = np.array(
 )  # fmt: skip
 
 
-def _around(radius: float, sag: float) -> int:
-    """Facets around a circle [m], a multiple of 4 so that the polygon is symmetric as the circle is."""
-    steps = np.pi / np.arccos(1.0 - min(sag / radius, 0.5))
-    return 4 * int(np.clip(np.ceil(steps / 4.0), _FEWEST // 4, _MOST // 4))
-
-
 def _ball(radii: np.ndarray, sag: float) -> ipc.TriMesh:
     """An icosphere stretched to three radii [m]; symmetric in its three planes."""
     # An edge of 1.05 r / 2ⁿ lies e² / 8r inside, and a facet's middle a third more than that.
@@ -102,7 +94,7 @@ def _turned(
 ) -> ipc.TriMesh:
     """A solid of revolution about z from its (radius, z) from low to high; ``ends`` are z of the poles, else the ends are flat."""
     rings = np.asarray(profile, float)
-    count = _around(float(rings[:, 0].max()), sag)
+    count = around(float(rings[:, 0].max()), sag)
     angle = 2.0 * np.pi * np.arange(count) / count
     low, high = ends if ends is not None else (rings[0, 1], rings[-1, 1])
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -125,39 +117,33 @@ def _cone_profile(size: tuple[float, ...], sag: float) -> np.ndarray:
     if tip == 0.0:
         return np.array([[radius, height]])
     half = np.arctan2(radius, height - tip) - np.arcsin(tip / np.hypot(radius, height - tip))
-    angle = np.linspace(0.0, 0.5 * np.pi - half, max(_around(tip, sag) // 4, 4) + 1)[1:]
+    angle = np.linspace(0.0, 0.5 * np.pi - half, max(around(tip, sag) // 4, 4) + 1)[1:]
     ball = np.stack([tip * np.sin(angle), tip * (1.0 - np.cos(angle))], axis=1)
     return np.concatenate([ball, [[radius, height]]])
 
 
 def _ring(size: tuple[float, ...], sag: float) -> ipc.TriMesh:
     major, minor = size
-    around, across = _around(major + minor, sag), _around(minor, sag)
-    u, v = 2.0 * np.pi * np.arange(around) / around, 2.0 * np.pi * np.arange(across) / across
+    turns, across = around(major + minor, sag), around(minor, sag)
+    u, v = 2.0 * np.pi * np.arange(turns) / turns, 2.0 * np.pi * np.arange(across) / across
     rho, z = major + minor * np.cos(v)[None, :], minor * np.sin(v)[None, :]
-    vertices = np.stack([rho * np.cos(u)[:, None], rho * np.sin(u)[:, None], np.broadcast_to(z, (around, across))], axis=-1)
-    index = np.arange(around * across).reshape(around, across)
+    vertices = np.stack([rho * np.cos(u)[:, None], rho * np.sin(u)[:, None], np.broadcast_to(z, (turns, across))], axis=-1)
+    index = np.arange(turns * across).reshape(turns, across)
     a, b, c, d = (m.ravel() for m in (index, np.roll(index, -1, 0), np.roll(index, -1, 1), np.roll(index, (-1, -1), (0, 1))))
     return ipc.TriMesh(vertices.reshape(-1, 3), np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]))
 
 
 def _relief(part: Part) -> ipc.TriMesh:
     """The relief's map read at a wider spacing, as far as it rises, and closed by the plane behind it."""
-    assert part.elevation is not None
-    half_width, data = part.size[0], part.elevation
-    step = max(int(_RELIEF_SPACING / (2.0 * half_width / (len(data) - 1))), 1)
-    coarse = np.zeros((len(range(0, len(data), step)) + 1,) * 2)
-    taken = data[::step, ::step]
-    coarse[: len(taken), : len(taken)] = taken
-    sheet = relief_part(coarse, 0.5 * (len(coarse) - 1) * step * 2.0 * half_width / (len(data) - 1))
-    assert sheet.vertices is not None and sheet.faces is not None
-    # The sheet starts at the corner of the map, not at its middle.
-    front = sheet.vertices + np.array([1.0, 1.0, 0.0]) * (sheet.size[0] - half_width)
+    x, elevation = coarse_relief(part)
+    n = len(x)
+    front = np.stack([*np.meshgrid(x, x), -elevation], axis=-1).reshape(-1, 3)
+    facets = grid_facets(n)
     risen = front[:, 2] < 0.0
-    back_of = np.where(risen, np.arange(len(front)) + len(front), np.arange(len(front)))
+    back_of = np.where(risen, np.arange(n * n) + n * n, np.arange(n * n))
     back = front * [1.0, 1.0, 0.0]
     # Facets with all corners at z = 0 would lie on their own backs.
-    rising = sheet.faces[risen[sheet.faces].any(axis=1)]
+    rising = facets[risen[facets].any(axis=1)]
     faces = np.concatenate([rising, back_of[rising][:, ::-1]])
     used, faces = np.unique(faces, return_inverse=True)
     return ipc.TriMesh(np.concatenate([front, back])[used], faces.reshape(-1, 3))

@@ -111,14 +111,18 @@ class PressTargets:
         Args:
             index: the stage's number in the scene, −1 if it is none of the scene's: then ``error`` stays as it is, if nothing is its own.
             stage: as environment ``b`` runs it.
-            error: of a place (its ``rule`` is a sentence) or of a force (its ``name`` is "force", its rule lacks the subject).
+            error: of a place (its ``rule`` is a sentence), or of a force or depth (its ``name`` is "force" or "depth [mm]", its rule lacks
+                the subject).
         """
         trajectory = self._scene.trajectory
         behind = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
         own = self._own(b, [one.kind for one in reversed(behind)])
-        kept = f"the force kept here, {error.value:.4g} N, " if error.name == "force" and stage.kind != "indent" else ""
+        noun, unit = error.name.split()[0], {"force": "N", "depth [mm]": "mm"}.get(error.name)
+        kept = f"the {noun} kept here, {error.value:.4g} {unit}, " if unit and stage.kind != "indent" else ""
+        if error.name == "depth [mm]" and stage.kind == "indent" and self.depths is not None:
+            own = "depths [mm]", error.value
         if own is not None:
-            subject = kept or (f"the force, {error.value:.4g} N, " if error.name == "force" else "")
+            subject = kept or (f"the {noun}, {error.value:.4g} {unit}, " if unit and own[0] != "depths [mm]" else "")
             where = f"trajectory[{index}]" if index >= 0 else f"a further {stage.kind}"
             return InputError(own[0], value=own[1], rule=f"in environment {b}, in {where}: {subject}{error.rule}")
         if index < 0:
@@ -128,7 +132,7 @@ class PressTargets:
         elif stage.kind == "twist":
             name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
         else:
-            name, value = "force_n", error.value
+            name, value = {"depth [mm]": "depth_mm"}.get(error.name, "force_n"), error.value
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
 
     def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:

@@ -12,6 +12,7 @@ from raytac.errors import InputError, SpecError
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height
 from raytac.gel.pad import make_grid
+from raytac.gel.pierced import without_pierced
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.contact_state import ContactState
@@ -115,8 +116,8 @@ class RigidPad:
 
         Raises:
             InputError: ``steps_per_stage`` below 1.
-            SpecError: a force that would press deeper than the pad, or an object that does not start over the pad or is sheared or
-                twisted off it; names the scene's file and key.
+            SpecError: a depth or force that would take the object's lowest point past the gel's bonded face, or an object that does not
+                start over the pad or is sheared or twisted off it; names the scene's file and key.
             InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
         """
         check_whole("steps_per_stage", steps_per_stage)
@@ -180,11 +181,12 @@ class RigidPad:
     def surface_from_pose(self, pad_from_object: np.ndarray) -> GelSurface:
         """Gel surface with the object at given poses (B, 4, 4), for a loop in which another simulation moves it.
 
-        A pose that is not finite gives a surface of NaN. Raises ``InputError`` for another shape.
+        A pose that is not finite, or that would press the gel below its bonded face, gives a surface of NaN. Raises ``InputError`` for
+        another shape.
         """
         highest = float(self.grid.rest.max())
         height = object_height(self.parts, pad_from_object, self.grid.x, self.grid.y, below=highest)
-        return self._surround.surface(height, pad_from_object if self.parts else None)
+        return without_pierced(self._surround.surface(height, pad_from_object if self.parts else None), self.sensor.gelpad)
 
     def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[ContactState]:
         """``steps`` states through a stage; ``index``: its number in the scene, −1 if it is none of the scene's."""
@@ -219,9 +221,8 @@ class RigidPad:
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
-            touch, gap = first_touch(self.parts, pose, self.sensor.gelpad, self.grid)
-            pitch = self.grid.pitch
-            self._touches[key] = touch, LoadLaw(gap, pitch[0] * pitch[1], self.sensor.gelpad)
+            touch, pitch = first_touch(self.parts, pose, self.sensor.gelpad, self.grid), self.grid.pitch
+            self._touches[key] = touch.z, LoadLaw(touch.gap, pitch[0] * pitch[1], self.sensor.gelpad, touch.deepest)
         return self._touches[key]
 
     def _advance(
@@ -251,6 +252,10 @@ class RigidPad:
             e.depth = old.depth + fraction * (lift - CLEARANCE - old.depth)
         elif stage.kind == "indent" and stage.depth is not None:
             e.depth = max(old.depth, 0.0) + fraction * (stage.depth - max(old.depth, 0.0))
+        if not e.by_force and stage.kind != "release":
+            end = stage.depth if stage.kind == "indent" and stage.depth is not None else e.depth
+            if end - lift > law.deepest:
+                raise self._targets.stage_error(index, stage, b, _too_deep(end, law.deepest + lift))
         if e.by_force:
             target = old.force + fraction * ((stage.force or old.force) - old.force)
             try:
@@ -286,6 +291,19 @@ class RigidPad:
             e.stuck_twist = e.twist - np.sign(angle) * widest
 
     def _state(self, stage: int, kind: str, fraction: float) -> ContactState:
+        """The present state; an environment whose gel would lie below its bonded face fails."""
+        state = self._present(stage, kind, fraction)
+        # The gel moves by no more than the greatest overlap: one that is less than the pad's thinnest place cannot take it there.
+        thinnest = self.sensor.gelpad.thickness + float(self.grid.rest.min())
+        if any(e.rig.depth > thinnest and not e.failed for e in self._environments):
+            pierced = np.isnan(self.surface(state).height).any(axis=(1, 2))
+            if (pierced & ~state.failed).any():
+                for b in np.flatnonzero(pierced).tolist():
+                    self._environments[b].failed = True
+                state = self._present(stage, kind, fraction)
+        return state
+
+    def _present(self, stage: int, kind: str, fraction: float) -> ContactState:
         batch, environments = self.num_envs, self._environments
         pose, case = np.tile(np.eye(4), (2, batch, 1, 1))
         depth, force, torque, area = np.zeros((4, batch))
@@ -306,3 +324,8 @@ class RigidPad:
                 for array in (pose, case, depth, force, shear, torque, area):
                     array[b] = np.nan
         return ContactState(stage, kind, fraction, pose, case, depth, force, shear, torque, area, failed, self.scene)
+
+
+def _too_deep(depth: float, deepest: float) -> InputError:
+    rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
+    return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)

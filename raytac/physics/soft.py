@@ -217,13 +217,15 @@ class SoftPad:
             surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
             none = np.full(batch, np.nan)
             still = coat.positions, np.zeros_like(coat.positions)
-            reading = SoftReading(surface, *still, none, (), np.full(rest.shape, np.inf), none)
             failed = np.zeros(batch, bool)
+            reading = SoftReading(surface, *still, none, (), np.full(rest.shape, np.inf), none, failed)
+            none_yet = np.zeros(batch, int)
             return SoftState(
-                stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed, self.scene, reading
+                *(stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed),
+                *(self.scene, none_yet, reading),
             )
-        failed: np.ndarray = self._drive.failed.copy()
-        reading = self._reader.read(self.solver.seen(self._drive.poses()), failed)
+        reading = self._reader.read(self.solver.seen(self._drive.poses()), self._drive.failed)
+        failed = self._drive.failed = reading.failed
         self._last = reading
         self._drive.read(reading.clearance)
         surface, forces = reading.surface, reading.forces
@@ -247,8 +249,9 @@ class SoftPad:
             total[:, :2],
             torque,
             area,
-            failed,
+            failed.copy(),
             self.scene,
+            self._drive.unconverged,
             reading,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -10,9 +11,12 @@ import numpy as np
 import ipc
 from raytac.errors import InputError
 from raytac.gel.part import Part
-from raytac.physics.part_surface import SAG, enclosed_volume, object_surface
+from raytac.io.cache import cache_folder
+from raytac.physics.facets import SAG
+from raytac.physics.part_surface import enclosed_volume, object_surface
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_skin import SoftSkin
+from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec
 
@@ -55,9 +59,9 @@ class SceneBody:
 
 
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
-    """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names."""
+    """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names; its folds touch and never pass through each other."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded)
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
 
 
 def scene_body(
@@ -88,7 +92,7 @@ def scene_body(
         sag: how far facets may lie inside a curved part [m].
 
     Raises:
-        InputError: an unknown kind, a surface that it cannot be made from, or ``held`` that names no vertex.
+        InputError: an unknown kind, a surface that it cannot be made from or that crosses itself, or ``held`` that names no vertex.
     """
     if kind not in BODY_KINDS:
         raise InputError("kind", value=kind, rule=f"of body {name!r} must be a known kind of body", choices=BODY_KINDS)
@@ -106,7 +110,7 @@ def scene_body(
         if kind == "soft":
             solid = _soft(name, parts, density, youngs_modulus, poisson_ratio, cell, held)
             return SceneBody(solid, (), friction, SoftSkin(parts, solid.mesh))
-        surface = object_surface(parts, sag)
+        surface = _checked_surface(name, parts, sag)
         if kind == "affine":
             return SceneBody(ipc.AffineBody(name, surface, ipc.Stiff(density=density)), parts, friction)
         return SceneBody(ipc.KinematicBody(name, surface), parts, friction)
@@ -131,7 +135,7 @@ def _soft(
         pose = parts[0].object_from_part
         tets = ipc.TetMesh(cut.vertices @ pose[:3, :3].T + pose[:3, 3], cut.tets)
     else:
-        tets = ipc.tetrahedralize(object_surface(parts, 0.05 * cell), cell)
+        tets = ipc.tetrahedralize(_checked_surface(name, parts, 0.05 * cell), cell, cache_folder("tets"))
     bonded = np.zeros(0, np.int64)
     if held is not None:
         bonded = np.flatnonzero(held(tets.vertices))
@@ -169,9 +173,9 @@ def object_body(
         lowest: height above the object's lowest point [m] beyond which a kinematic body's triangles are left out; 0 keeps all.
 
     Raises:
-        InputError: an unknown kind of body, or a surface that it cannot be made from.
+        InputError: an unknown kind of body, or a surface that it cannot be made from or that crosses itself.
     """
-    surface = object_surface(parts, sag)
+    surface = _checked_surface(OBJECT, parts, sag)
     if spec.dynamics == "kinematic":
         if lowest > 0.0:
             heights = (surface.vertices @ row for row in rotations[:, 2])
@@ -184,7 +188,7 @@ def object_body(
             volume = _volume(surface)
             return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
-            tets = ipc.tetrahedralize(surface, edge_length)
+            tets = ipc.tetrahedralize(surface, edge_length, cache_folder("tets"))
             if not np.allclose(rotations[:, 2], rotations[0, 2], atol=1e-9):
                 rule = "held at its top, so a soft object must be tilted the same in all environments"
                 raise InputError("rotations", value=rotations[:, 2].tolist(), rule=rule)
@@ -195,6 +199,27 @@ def object_body(
     except ipc.IpcError as error:
         raise InputError("object.dynamics", value=spec.dynamics, rule=f"cannot be made from this object: {error}") from error
     raise InputError("object.dynamics", value=spec.dynamics, rule="must be a known kind of body", choices=DYNAMICS)
+
+
+def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMesh:
+    """``object_surface`` of a body, without a mesh that crosses itself: whether a pad passes through such a body cannot be told.
+
+    Parts that overlap are common in models of robots, and only their outer walls touch anything, so they are a warning.
+    """
+    for part in parts:
+        if part.kind == "mesh":
+            assert part.vertices is not None and part.faces is not None
+            crossings = find_crossings(part.vertices, part.faces)
+            if crossings:
+                rule = f"a mesh must not cross itself with physics='ipc': {crossings.text(1e-3, 'mm')}"
+                raise InputError(name, value=f"a mesh of {len(part.faces)} triangles", rule=rule)
+    surface = object_surface(parts, sag)
+    if len(parts) > 1 and not any(part.joined for part in parts):
+        crossings = find_crossings(surface.vertices, surface.faces)
+        if crossings:
+            told = f"the parts of {name!r} overlap: {crossings.text(1e-3, 'mm')}; tests of whether a pad passes through it see them too"
+            warnings.warn(told, stacklevel=3)
+    return surface
 
 
 def _volume(surface: ipc.TriMesh) -> float:

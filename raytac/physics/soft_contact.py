@@ -10,6 +10,7 @@ from raytac.physics.rotation import inverse
 from raytac.physics.soft_bodies import OBJECT, PAD, SceneBody
 from raytac.physics.soft_mesh import PadMesh
 from raytac.physics.soft_reading import SeenObject, SeenPad
+from raytac.physics.soft_report import SceneReport
 from raytac.physics.soft_scene import ScenePad, SoftScene
 from raytac.specs.sensor import SensorSpec
 
@@ -57,6 +58,10 @@ class SoftContact:
         except OverlapError as error:
             raise RaytacError(f"the object overlaps the pad where it starts, 1 mm above the first touch: {error}") from error
         self._world_from_pad = here
+        self.converged: np.ndarray = np.ones(len(starts), bool)
+        """Whether the last step of each environment met its tolerance, shape (B,)."""
+        self.unconverged: np.ndarray = np.zeros(len(starts), int)
+        """How many steps of each environment did not, shape (B,); ``reset`` leaves it as it is."""
 
     @property
     def world(self) -> ipc.World:
@@ -66,7 +71,14 @@ class SoftContact:
     def reset(self) -> None:
         """Back to the start, without history."""
         self.scene.reset()
+        self.converged[:] = True
         self._world_from_pad = np.tile(np.eye(4), (len(self._world_from_pad), 1, 1))
+
+    def fail(self, envs: np.ndarray) -> None:
+        """Step environments of a mask (B,) no more until the next ``reset``, so that they cost nothing and keep no other waiting."""
+        new = envs & ~self.scene.failed
+        if new.any():
+            self.scene.fail(new)
 
     def drive(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None = None) -> np.ndarray:
         """One step that takes the object to ``pad_from_object`` (B, 4, 4); the case moves if ``world_from_pad`` (B, 4, 4) is given.
@@ -76,7 +88,7 @@ class SoftContact:
         if world_from_pad is not None:
             self._world_from_pad = world_from_pad.copy()
         driven = {OBJECT: self._world_from_pad @ pad_from_object} if self.body.is_driven else {}
-        report = self.scene.advance(self._world_from_pad[:, None], driven)
+        report = self._advance(driven)
         failed = report.failed
         for _ in range(_STIFFENINGS):
             jammed = ~failed & (report.blocked > _BLOCKED)
@@ -85,9 +97,15 @@ class SoftContact:
             state = self.world.save()
             state.kappa[jammed] *= _STIFFER
             self.world.restore(state, jammed)  # the others keep their forces, which bound friction in the next step
-            report = self.scene.advance(self._world_from_pad[:, None], driven)
+            report = self._advance(driven)
             failed = failed | report.failed
         return failed | (report.blocked > _BLOCKED)
+
+    def _advance(self, driven: dict[str, np.ndarray]) -> SceneReport:
+        report = self.scene.advance(self._world_from_pad[:, None], driven)
+        self.converged = report.last_converged
+        self.unconverged = self.unconverged + report.unconverged
+        return report
 
     def settle_friction(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None, failed: np.ndarray) -> np.ndarray:
         """Stand still until friction is that of the contacts there are; poses as for ``drive``.
@@ -100,6 +118,7 @@ class SoftContact:
         for _ in range(_SETTLINGS):
             if not forces[~lost].any():
                 break
+            self.fail(lost)
             lost |= self.drive(pad_from_object, world_from_pad)
             before, forces = forces, self.forces()
             changed, borne = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces - before, forces))

@@ -115,6 +115,7 @@ class SoftDrive:
             self._force[:] = np.nan
             start = np.maximum(depth, 0.0)
             self._indent(start + fraction * (self._targets.depth(stage) - start), is_last=fraction == 1.0)
+        self._converge()
 
     def _forget(self) -> None:
         batch = self.num_envs
@@ -128,6 +129,12 @@ class SoftDrive:
         """Clearance in the state that was read last [m]; NaN out of contact."""
         self._stiffness = np.full(batch, np.nan)
         self.failed: np.ndarray = self._targets.lost.copy()
+        self._solver.unconverged[:] = 0
+
+    @property
+    def unconverged(self) -> np.ndarray:
+        """Steps since the start that did not meet the solver's tolerance, shape (B,)."""
+        return self._solver.unconverged.copy()
 
     def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
         """Drive the coat to a depth, without passing it on the way; exactly there at the stage's end."""
@@ -164,8 +171,22 @@ class SoftDrive:
                 self._kept = self._kept + np.clip(self._off(), -STEP, STEP)
 
     def _step(self) -> None:
-        self.failed |= self._solver.drive(self.poses(), self.case())
-        self.bar.update()
+        self._solver.fail(self.failed)
+        if not self.failed.all():
+            self.failed |= self._solver.drive(self.poses(), self.case())
+            self.bar.update()
+
+    def _converge(self) -> None:
+        """Stand still for some steps where the last one did not meet the solver's tolerance; what does not meet it then has failed."""
+        for _ in range(_REFINEMENTS):
+            if (self._solver.converged | self.failed).all():
+                return
+            self._step()
+            if np.isfinite(self._force).any():
+                self._load()
+            else:
+                self._settle_depth()
+        self.failed |= ~self._solver.converged
 
     def _settle_friction(self) -> None:
         self.failed |= self._solver.settle_friction(self.poses(), self.case(), self.failed)
@@ -245,6 +266,7 @@ class SoftDrive:
         assert self._weight > 0.0
         self._solver.weigh(float(self._force[0]) / self._weight)
         for _ in range(4 * _PATIENCE):
+            self._solver.fail(self.failed)
             self.failed |= self._solver.drive(self.poses())
             self.bar.update()
             if (self._solver.speed()[~self.failed] < _STILL).all() and (self._normal_force()[~self.failed] > 0.0).all():

@@ -77,6 +77,13 @@ class SeenPad:
     """What touches does to each of them [N], shape (B, V, 3)."""
     objects: tuple[SeenObject, ...]
 
+    def is_finite(self) -> np.ndarray:
+        """Whether every number of an environment is finite, (B,) bool."""
+        arrays = [self.coat, self.forces]
+        for thing in self.objects:
+            arrays += [thing.poses] if thing.surface is None else [thing.poses, thing.surface[0]]
+        return np.all([np.isfinite(values).all(axis=(1, 2)) for values in arrays], axis=0)
+
 
 @dataclass(frozen=True)
 class SoftReading:
@@ -98,6 +105,8 @@ class SoftReading:
     residual: np.ndarray
     """Deepest overlap or widest gap under pressure [m], (B,), that the search for the contact below the size of a cell left, before the
     coat was laid on the object; NaN out of contact."""
+    failed: np.ndarray
+    """Environments of which nothing is shown, (B,) bool: those that had failed, and those in which a number is not finite."""
 
 
 class SoftReader:
@@ -123,7 +132,7 @@ class SoftReader:
         return np.array([self._fit(seen, b)[1] for b in range(len(seen.coat))])
 
     def read(self, seen: SeenPad, failed: np.ndarray) -> SoftReading:
-        """All that is shown of every pad; NaN for those that ``failed``, (B,)."""
+        """All that is shown of every pad; NaN for those that ``failed``, (B,), or of which a number is not finite."""
         coat, vertices, forces = seen.coat.copy(), seen.coat.copy(), seen.forces.copy()
         poses = tuple(thing.poses.copy() for thing in seen.objects)
         batch = len(coat)
@@ -132,12 +141,8 @@ class SoftReader:
         touched = np.zeros(height.shape, bool)
         centre, undersides = np.full((batch, 2), np.nan), np.full(height.shape, np.inf)
         rest = self.mesh.coat.rest
-        for b in range(batch):
-            if failed[b]:
-                coat[b] = vertices[b] = forces[b] = height[b] = np.nan
-                for pose in poses:
-                    pose[b] = np.nan
-                continue
+        failed = failed | ~seen.is_finite()
+        for b in np.flatnonzero(~failed).tolist():
             places, kept = self._fit(seen, b)
             upwards = vertices[b, :, 2] - rest[:, 2]
             height[b] = self._rest + sandwich(self._rows, self._surface.rise(places, upwards), self._columns)
@@ -161,10 +166,14 @@ class SoftReader:
             coat[b, :, :2] = rest[:, :2] + skin.sideways(shape, vertices[b] - rest, load, _friction(seen, b))
             coat[b, :, 2] = self._on_surface(height[b], coat[b, :, :2])
             centre[b] = load @ vertices[b, :, :2] / load.sum()
+        failed |= ~(np.isfinite(height).all(axis=(1, 2)) & np.isfinite(coat).all(axis=(1, 2)))
+        for shown in (coat, vertices, forces, height, clearance, residual, centre, *poses):
+            shown[failed] = np.nan
+        touched[failed], undersides[failed] = False, np.inf
         self._tell(residual)
         deformed = DeformedCoat(self.mesh.coat, coat)
         surface = GelSurface(self.grid, height, touched, centre, _touched_pose(seen, poses), deformed)
-        return SoftReading(surface, vertices, forces, clearance, poses, undersides, residual)
+        return SoftReading(surface, vertices, forces, clearance, poses, undersides, residual, failed)
 
     def _fit(self, seen: SeenPad, b: int) -> tuple[CoatPlaces, float]:
         """Material points of one coat under the lattice, and the clearance [m]."""

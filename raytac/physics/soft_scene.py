@@ -172,7 +172,7 @@ class SoftScene:
             if refused:
                 for b, pair in refused.items():
                     warnings.warn(f"failed: {self._travel.refusal(b, pair, begun, goal)}", RuntimeWarning, stacklevel=2)
-                self._fail(list(refused))
+                self.fail(list(refused))
                 continue
             if part < MOST_SUBSTEPS and before is None:
                 before = self.save()
@@ -194,6 +194,8 @@ class SoftScene:
         self._failed = report.failed
         return SceneReport(
             report.failed,
+            report.converged,
+            (~report.converged & ~report.failed).astype(int),
             report.converged,
             report.min_gap,
             report.min_det,
@@ -355,13 +357,13 @@ class SoftScene:
             raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
         self.restore(SceneState(self.world.save(), Poses(cases, self._cast.driven(places))), mask)
 
-    # --- inner -----------------------------------------------------------------------------------------------------------------
+    def fail(self, envs: ArrayLike) -> None:
+        """Let environments, a mask (B,) or a list, stay as they are until they are reset."""
+        state, chosen = self.save(), chosen_envs(envs, self.num_envs)
+        state.world.failed[chosen] = True
+        self.restore(state, chosen)
 
-    def _fail(self, envs: list[int]) -> None:
-        """Let environments stay as they are until they are reset."""
-        state = self.save()
-        state.world.failed[envs] = True
-        self.restore(state, envs)
+    # --- inner -----------------------------------------------------------------------------------------------------------------
 
     def _contact_wrench(self, name: str) -> np.ndarray:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):

@@ -7,6 +7,7 @@ import importlib.util
 import os
 from collections.abc import Iterator
 
+from raytac import foreign_ipc
 from raytac.device import cuda_device_count
 from raytac.errors import BackendError
 
@@ -27,16 +28,19 @@ def check_solver(user: str) -> None:
 
 
 def hush_solver() -> None:
-    """Let Warp print warnings and errors only, in this whole process; nothing happens without Warp.
+    """Let Warp print warnings and errors only, in this whole process; nothing happens without Warp or without raytac's own ``ipc``.
 
     Warp otherwise lists devices and every module that it loads. Its level belongs to the process, so neither ``ipc`` nor
     ``TactileSensor`` touches it: this is for programs, such as the ``raytac`` command. Call it before the solver is first used.
     """
-    if importlib.util.find_spec("warp") is None:
+    if importlib.util.find_spec("warp") is None or foreign_ipc() is not None:
         return
     import warp as wp
 
+    from ipc.warp_start import use_writable_cache
+
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    use_writable_cache()
     with _no_standard_error() if cuda_device_count() == 0 else contextlib.nullcontext():
         wp.init()
 

@@ -36,7 +36,7 @@ def run_bake(
     """Bake, keep the table in the cache, and write calibration files, coverage.png, sheet.png and metrics.json to ``out``.
 
     ``scenes`` are the presses on which the table is compared; ``start`` is ``time.perf_counter()`` at the beginning of the job. Nothing
-    in ``out`` or in the cache changes until everything is computed. Returns the files written.
+    in ``out`` or in the cache changes until everything is computed. A cache that cannot be written is a warning. Returns the files written.
 
     Raises:
         SpecError: an unknown scene, before anything is baked.

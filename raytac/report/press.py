@@ -136,6 +136,8 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"] = (1e3 * float(v) for v in surface.contact_centre[0])
     if frame.contact_cells is not None and np.isfinite(frame.contact_cells[0]):
         metrics["contact.cells_across"] = float(frame.contact_cells[0])
+    if frame.unconverged is not None:
+        metrics["contact.unconverged_steps"] = int(frame.unconverged[0])
     if frame.force_law_area is not None:
         metrics["contact.force_law_area_mm2"] = 1e6 * float(frame.force_law_area[0])
     if frame.force is not None:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import os
-import zipfile
+import io
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
+from raytac.io.arrays import npz_bytes
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import versions
+from raytac.io.seal import read_sealed, write_sealed
 from raytac.markers.calibration_presses import Press, PressStates
 from raytac.specs.sensor import GelpadSpec
 
@@ -41,35 +42,21 @@ class PressStore:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as kept:
+            with np.load(io.BytesIO(read_sealed(path)), allow_pickle=False) as kept:
                 mesh = CoatMesh(*(kept[name] for name in ("rest", "faces", "lines_x", "lines_y")))
                 states = PressStates(tuple(kept["loads"].tolist()), kept["poses"], DeformedCoat(mesh, kept["positions"]))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:  # every member has a checksum
+        except (OSError, ValueError) as error:
             self._say(f"{path.name} cannot be used ({error}): pressed again")
             return None
         self.reused += 1
         return states
 
     def write(self, press: Press, states: PressStates) -> None:
-        """Keep the states of a press: the file is written beside its place and then renamed, so that no half of one looks finished."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path, mesh = self._path(press), states.coat.mesh
-        partial = self.folder / f".{path.name}.{os.getpid()}.partial"
-        try:
-            with partial.open("wb") as stream:
-                np.savez(
-                    stream,
-                    loads=np.array(states.loads),
-                    poses=states.poses,
-                    positions=states.coat.positions,
-                    rest=mesh.rest,
-                    faces=mesh.faces,
-                    lines_x=mesh.lines_x,
-                    lines_y=mesh.lines_y,
-                )
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        """Keep the states of a press, with a digest, so that neither half of a file nor a damaged one looks finished."""
+        mesh = states.coat.mesh
+        arrays = {name: getattr(mesh, name) for name in ("rest", "faces", "lines_x", "lines_y")}
+        arrays |= {"loads": np.array(states.loads), "poses": states.poses, "positions": states.coat.positions}
+        write_sealed(self._path(press), npz_bytes(arrays))
 
     def _path(self, press: Press) -> Path:
         return self.folder / f"{press.name}-{hashlib.sha256((self._basis + repr(press)).encode()).hexdigest()[:20]}.npz"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.io.arrays import npz_bytes
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import versions
+from raytac.io.seal import read_sealed, write_sealed
 from raytac.report.tracers import Tracers, path_trace
 
 __all__ = ["References"]
@@ -51,20 +53,17 @@ class References:
         )
         self.say(f"reference of {scene}, {self.size[0]}x{self.size[1]}: 2 x {half} spp")
         halves = np.stack([path_trace(tracer, surface, half, seed + k) for k in (0, 1)])
-        self.folder.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial.npz")
-        np.savez(partial, halves=halves)
-        os.replace(partial, path)
+        write_sealed(path, npz_bytes({"halves": halves}))
         return halves
 
     def _read(self, path: Path) -> np.ndarray | None:
         if not path.is_file():
             return None
         try:
-            with np.load(path) as kept:
+            with np.load(io.BytesIO(read_sealed(path)), allow_pickle=False) as kept:
                 halves = kept["halves"]
-        except Exception as error:  # a damaged archive ends in errors of many types
-            self.say(f"{path} cannot be read ({type(error).__name__}): computed again")
+        except (OSError, ValueError, KeyError) as error:
+            self.say(f"{path} cannot be used ({error}): computed again")
             return None
         if halves.shape != (2, self.size[1], self.size[0], 3) or not np.isfinite(halves).all():
             self.say(f"{path} does not hold two finite images of {self.size[0]}x{self.size[1]}: computed again")

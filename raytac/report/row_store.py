@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from raytac.io.png import read_png, write_png
+from raytac.io.atomic import write_atomic
+from raytac.io.png import png_bytes, read_png
 
 __all__ = ["Row", "RowStore", "row_key"]
 
@@ -59,18 +59,14 @@ class RowStore:
         """Keep a row; the JSON file comes last, so that an interrupt leaves no row that looks finished."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._path(name, key)
-        partial = self.folder / f".{path.stem}.partial.png"
-        write_png(partial, row.image)
-        os.replace(partial, path.with_suffix(".png"))
+        write_atomic(path.with_suffix(".png"), png_bytes(row.image))
         kept = {
             "key": key,
             "figures": row.figures,
             "figures_sha256": _digest_figures(row.figures),
             "image_sha256": _digest_image(row.image),
         }
-        partial = self.folder / f".{path.stem}.partial.json"
-        partial.write_text(json.dumps(kept, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(partial, path)
+        write_atomic(path, (json.dumps(kept, indent=1, allow_nan=False) + "\n").encode())
 
     def _path(self, name: str, key: str) -> Path:
         return self.folder / f"{name}-{key}.json"

@@ -9,6 +9,7 @@ import numpy as np
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.gel.traction import cell_areas
 from raytac.physics.pad_reading import PadReading
 from raytac.physics.solver import check_solver
 from raytac.sensor.contact_width import cells_across
@@ -93,9 +94,8 @@ def reading_forces(reading: PadReading, outputs: tuple[str, ...]) -> dict[str, n
 
 def _contact_size(surface: GelSurface, failed: np.ndarray) -> dict[str, np.ndarray]:
     """``contact_area`` and, of a simulated pad, ``contact_cells``."""
-    cell = surface.grid.pitch[0] * surface.grid.pitch[1]
-    nodes = np.array([np.count_nonzero(one) for one in surface.contact])
-    found = {"contact_area": np.where(failed, np.nan, nodes * cell)}
+    area = cell_areas(surface.grid)
+    found = {"contact_area": np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])}
     if surface.coat is not None:
         found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
     return found

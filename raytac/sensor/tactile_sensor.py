@@ -304,13 +304,13 @@ class TactileSensor:
         start = time.perf_counter()
         envs = None if envs is None else chosen_envs(envs, self.num_envs)
         if isinstance(state, GelSurface):
-            surface, force, area, failed = state, None, None, None
+            surface, force, area, failed, unconverged = state, None, None, None, None
             forces: dict[str, Any] = {}
         elif isinstance(state, PadReading):
-            surface, force, area, failed = state.surface, state.force, None, state.failed
+            surface, force, area, failed, unconverged = state.surface, state.force, None, state.failed, state.unconverged
             forces = reading_forces(state, self.outputs)
         else:
-            surface, failed = state_surface(self._pad, state), state.failed
+            surface, failed, unconverged = state_surface(self._pad, state), state.failed, state.unconverged
             assert self._pad is not None
             area = state.force_law_area if self.physics == "rigid" else None
             forces = pad_forces(self._pad, state, surface, self.outputs)
@@ -328,7 +328,8 @@ class TactileSensor:
             markers = self.marker_tracker.update(surface, envs)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
-        return self._frame(surface, markers, done, time_ms, force=force, force_law_area=area, failed=failed, **forces)
+        forces |= {"force": force, "force_law_area": area, "failed": failed, "unconverged": unconverged}
+        return self._frame(surface, markers, done, time_ms, **forces)
 
     def _check_width(self, state: ContactState, cells: np.ndarray | None) -> None:
         """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.

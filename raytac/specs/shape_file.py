@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +12,7 @@ from raytac.checks import is_number
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import is_file
 from raytac.specs.mesh import load_mesh
+from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, split_unit
 
 __all__ = ["OBJECT_SCHEMA", "check_params", "check_quaternion", "check_shape", "resolved", "unit_quaternion"]
@@ -118,12 +120,18 @@ def _check_lengths(kind: str, p: Mapping[str, Any], prefix: str, file: Path | No
 
 def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
     try:
-        load_mesh(values["path"], values["scale"])
+        vertices, faces = load_mesh(values["path"], values["scale"])
     except MeshError as error:
         key = "scale_m_per_unit" if error.key == "scale" else "path"
         rule = f"{error.rule} (mesh {values['path']})"
         dotted = f"{table.prefix}.{key}" if table.prefix else key
         raise MeshError(rule, file=table.file, key=dotted, value=table.data[key], choices=error.choices) from error
+    crossings = find_crossings(vertices, faces)
+    if crossings:
+        warnings.warn(
+            f"mesh {values['path']}: {crossings.text(1e-3, 'mm')}; the rigid pad takes its lowest faces, physics='ipc' refuses it",
+            stacklevel=2,
+        )
 
 
 def _mm(length: float) -> float:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import socket
+from collections.abc import Sequence
 from types import TracebackType
 
 from raytac.errors import BackendError, InputError
+from raytac.view.addresses import PageAddresses
 from raytac.view.page import Page
 from raytac.view.player import Player
 from raytac.view.session import Session
@@ -36,26 +38,29 @@ class Viewer:
             print(viewer.url)
             input("Enter ends")
 
-    Whoever can reach the port can move the sliders and sees what is shown; ``host="127.0.0.1"`` lets in this machine only.
+    Whoever can reach the port can move the sliders and sees what is shown; ``host="127.0.0.1"`` lets in this machine only. Other web pages
+    in a browser that can reach it are refused: see ``PageAddresses``.
     """
 
-    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080, allow_hosts: Sequence[str] = ()) -> None:
         """Start serving and compute the first state.
 
         Args:
             session: what is shown.
             host: address to listen at; ``0.0.0.0`` is every network that the machine is in.
             port: in [0, 65535]; 0 lets the system choose.
+            allow_hosts: names beside ``host`` that browsers may ask for, as of ``PageAddresses``.
 
         Raises:
-            BackendError: viser is not installed.
-            InputError: a port that cannot be, is taken or is not allowed, or an address that is not this machine's.
+            BackendError: viser is not installed, or cannot be guarded.
+            InputError: a port that cannot be, is taken or is not allowed, or an address that is not this machine's; a name that is none.
         """
         check_viewer()
-        check_address(host, port)
-        import viser
+        check_address(host, port, allow_hosts)
+        from raytac.view.server import guarded_server
 
-        self._server = viser.ViserServer(host, port, verbose=False)
+        self._addresses = PageAddresses(host, allow_hosts)
+        self._server = guarded_server(host, port, self._addresses)
         self.host, self.port = host, self._server.get_port()
         try:
             if port not in (0, self.port):  # taken since it was checked; viser then goes on to the next
@@ -71,8 +76,8 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
-        return f"http://{host}:{self.port}"
+        """Address that opens the page on this machine."""
+        return self._addresses.url(({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host), self.port))
 
     def close(self) -> None:
         """End the thread and the server, and free the port; a second call does nothing."""
@@ -88,8 +93,9 @@ class Viewer:
         self.close()
 
 
-def check_address(host: str, port: int) -> None:
-    """Raises ``InputError`` for a host and port that cannot be listened at."""
+def check_address(host: str, port: int, allow_hosts: Sequence[str] = ()) -> None:
+    """Raises ``InputError`` for a host and port that cannot be listened at, and for allowed names that are none."""
+    PageAddresses(host, allow_hosts)
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
         raise InputError("port", value=port, rule="must be a whole number in [0, 65535]; 0 takes any that is free")
     try:

@@ -38,6 +38,8 @@ def soft_answers(scene: SoftScene, links: Mapping[str, int]) -> list[Answer]:
         for name in held:
             _hold(scene, name, b, contacts, partners)
         for (one, two), found in pressing.items():
+            if one == two:  # folds of one gel
+                continue
             sides = [links.get(name, name if name in partners else None) for name in (one, two)]
             if not found.normal[b].any() or sides == [None, None] or (None in sides and any(side in held for side in sides)):
                 continue

@@ -53,6 +53,7 @@ _AT_REST = {
     "min_det": 1.0,
     "blocked": 0.0,
     "converged": True,
+    "unconverged": 0,
     "newton": 0,
     "substeps": 0,
     "inside_robot": 0.0,
@@ -124,6 +125,8 @@ class SoftPads:
         self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
         self._traction: dict[str, CoatTraction] = {}
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
+        self._unconverged = np.zeros(len(datas), int)
+        """Steps of the solver since the reset that did not meet its tolerance."""
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -151,6 +154,7 @@ class SoftPads:
             self._last_cases[b] = cases[b]
             for body in self._led:
                 self._last_led[body.spec.name][b] = starts[body.spec.name][b]
+            self._unconverged[b] = 0
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
             for key, values in self.report.items():
@@ -162,6 +166,7 @@ class SoftPads:
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
+        So are those whose last step did not meet the solver's tolerance: forces and places of such a step are not those of the physics.
         So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
 
         Raises:
@@ -186,7 +191,11 @@ class SoftPads:
             if since == interval or step == steps or early:
                 reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
                 since = 0
+        failed |= ~reports[-1].last_converged
+        if (failed & ~self.soft.failed).any():
+            self.soft.fail(failed)
         self.report = _joined(reports) | {"inside_robot": self._depth_inside(datas, failed)}
+        self._unconverged += self.report["unconverged"]
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -203,6 +212,7 @@ class SoftPads:
         """Surface and forces of one sensor, for the environments named, one row each; None is all."""
         left_out = failed if envs is None else failed | ~np.isin(np.arange(len(failed)), envs)
         reading = self.soft.reading(name, grid, left_out)
+        failed = failed | (reading.failed & ~left_out)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction() -> np.ndarray:
@@ -210,7 +220,7 @@ class SoftPads:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        found = PadReading(reading.surface, wrench, failed.copy(), traction)
+        found = PadReading(reading.surface, wrench, failed, traction, self._unconverged.copy())
         return found if envs is None else found.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
@@ -266,7 +276,9 @@ class SoftPads:
         if self._coupling is not None:
             answers = soft_answers(self.soft, self._felt)
             for b in alive:
-                self._coupling.update(datas[b], b, *answers[b])
+                failed[b] = not np.isfinite(answers[b][0]).all()
+                if not failed[b]:
+                    self._coupling.update(datas[b], b, *answers[b])
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
@@ -389,6 +401,7 @@ def _joined(reports: Sequence[SceneReport]) -> dict[str, np.ndarray]:
         "min_det": np.min([r.min_det for r in reports], axis=0),
         "blocked": np.max([r.blocked for r in reports], axis=0),
         "converged": np.all([r.converged for r in reports], axis=0),
+        "unconverged": np.sum([r.unconverged for r in reports], axis=0),
         "newton": np.sum([r.newton for r in reports], axis=0),
         "substeps": np.full(len(reports[0].failed), sum(r.substeps for r in reports)),
     }

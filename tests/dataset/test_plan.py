@@ -116,9 +116,24 @@ def test_shapes_and_bytes_are_those_of_the_arrays(sweep: SweepSpec) -> None:
     assert all(array.meaning for array in ARRAYS.values())
 
 
+def test_the_size_of_the_whole_is_the_sum_of_its_shards(sweep: SweepSpec) -> None:
+    light = replace(sweep, outputs=("rgb",), markers=None, randomization={"led_power": 0.1}, marker_perturbation={}, variants=2)
+    for count in (1, 4, 10, 33):
+        sensors = (sweep.sensors[0], replace(sweep.sensors[0], gelpad=replace(sweep.sensors[0].gelpad, size=(20e-3, 15e-3))))
+        plan = DatasetPlan(replace(light, sensors=(sensors[0], load_sensor("gelsight_mini"), sensors[1]), count=count))
+        assert plan.total_bytes() == sum(plan.shard_bytes(shard) for shard in range(plan.shards))
+        without = set(range(0, plan.shards, 2))
+        assert plan.total_bytes(without) == sum(plan.shard_bytes(shard) for shard in range(plan.shards) if shard not in without)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"count": 0}, "count = 0"),
+        ({"count": 10**9 + 1}, "count = 1000000001"),
+        ({"count": 2.5}, "count = 2.5"),
+        ({"shard_size": 0}, "shard_size = 0"),
+        ({"seed": -1}, "seed = -1"),
         ({"outputs": ("rgb", "layers")}, r"outputs = 'layers'.*rgb, normals"),
         ({"markers": None}, "randomization.markers"),
         ({"outputs": ("height",)}, "outputs must have 'rgb'"),

@@ -10,7 +10,7 @@ import pytest
 
 from raytac.dataset import ARRAYS, DatasetPlan, RenderJob, ShardRenderer
 from raytac.dataset.arrays import SHARED
-from raytac.dataset.shard import npz_bytes
+from raytac.io.arrays import npz_bytes
 from raytac.sensor import TactileSensor
 from raytac.specs import PressRanges, StageSpec, SweepSpec
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -11,12 +12,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 
-from raytac.dataset import DatasetPlan, RunReport, render_dataset, verify_dataset
-from raytac.errors import InputError
+from raytac.dataset import DatasetPlan, RunReport, ShardRenderer, ShardResult, render_dataset, verify_dataset
+from raytac.errors import BackendError, InputError
 from raytac.specs import SweepSpec
 
 
@@ -124,6 +126,105 @@ def test_a_full_disk_and_bad_arguments_are_told_before_anything_is_rendered(
     assert not (tmp_path / "other").exists()
     with pytest.raises(InputError, match=r"dataset\.json"):
         verify_dataset(tmp_path / "nowhere")
+
+
+def test_a_count_beyond_any_disk_is_told_at_once_and_leaves_nothing(
+    sweep: SweepSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a look at every one of its 250 million shards."""
+    huge = DatasetPlan(replace(light(sweep), count=10**9))
+    looked: list[int] = []
+    monkeypatch.setattr(DatasetPlan, "shard_bytes", lambda plan, shard: looked.append(shard))
+    monkeypatch.setattr("raytac.dataset.shard.ShardStore.read", lambda store, shard: looked.append(shard))
+    monkeypatch.setattr("raytac.dataset.run.shutil.disk_usage", lambda folder: SimpleNamespace(free=10**12))
+    with pytest.raises(InputError, match=r"1e\+03 GB free, and the data set takes about"):
+        rendered(huge, tmp_path / "data")
+    assert not looked and not (tmp_path / "data").exists()
+
+
+def test_a_refusal_does_not_block_the_corrected_command(
+    sweep: SweepSpec, plan: DatasetPlan, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(renderer: ShardRenderer, shard: int) -> ShardResult:
+        raise BackendError("the renderer does not work here")
+
+    out = tmp_path / "data"
+    other = DatasetPlan(replace(light(sweep), seed=6))
+    with monkeypatch.context() as patch:
+        patch.setattr(ShardRenderer, "render", broken)
+        with pytest.raises(BackendError):
+            rendered(other, out)
+    assert not out.exists()
+    (out / "shards").mkdir(parents=True)  # as a run leaves it that ends between its description and its first shard
+    (out / "dataset.json").write_text(json.dumps({"format_version": 1, "plan_sha256": other.digest, "plan": other.description}))
+    rendered(plan, out)
+    assert contents(out) == whole
+
+
+def test_a_lock_that_is_a_link_is_not_followed(plan: DatasetPlan, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/.lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(InputError, match="and no link: it is the lock"):
+        rendered(plan, tmp_path / "data")
+    assert (tmp_path / "precious").read_text() == "mine"
+
+
+def test_a_disk_that_fills_up_ends_in_a_sentence_and_can_be_gone_on_with(
+    plan: DatasetPlan, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fsync, calls = os.fsync, []
+
+    def full(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) > 10:  # README, description and the first shard with their folders take 8
+            raise OSError(28, "No space left on device")
+        fsync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("raytac.io.atomic.os.fsync", full)
+        with pytest.raises(InputError, match=r"No space left on device.*the same command goes on"):
+            rendered(plan, tmp_path / "data")
+    assert not [name for name in contents(tmp_path / "data") if name.endswith(".partial")]
+    assert verify_dataset(tmp_path / "data").wrong == {1: "missing", 2: "missing"}
+    assert rendered(plan, tmp_path / "data").rendered == 2 and contents(tmp_path / "data") == whole
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "[" * 100_000, '{"format_version": 1}', None])
+def test_damage_to_the_description_is_told(plan: DatasetPlan, folder: Path, whole: dict[str, bytes], text: str | None) -> None:
+    (folder / "dataset.json").unlink()
+    if text is not None:
+        (folder / "dataset.json").write_text(text)
+    with pytest.raises(InputError, match=r"dataset\.json"):
+        rendered(plan, folder)
+    assert {name: data for name, data in contents(folder).items() if name != "dataset.json"} == {
+        name: data for name, data in whole.items() if name != "dataset.json"
+    }
+
+
+def test_shards_that_agree_with_their_checksum_and_are_none_are_rendered_again(
+    plan: DatasetPlan, folder: Path, whole: dict[str, bytes]
+) -> None:
+    def forged(**changed: Any) -> str:
+        kept = json.loads(whole["shards/000001.json"]) | changed
+        kept["rows_sha256"] = hashlib.sha256(json.dumps(kept["rows"], sort_keys=True).encode()).hexdigest()
+        return json.dumps(kept)
+
+    path = folder / "shards/000001.json"
+    for text in ("", "[" * 100_000, "5", forged(rows=5), forged(rows=[{}]), forged(file="../x.npz"), forged(made_by={})):
+        path.write_text(text)
+        assert verify_dataset(folder).wrong[1].startswith("000001.json cannot be read")
+    path.unlink()
+    os.mkfifo(path)
+    assert verify_dataset(folder).wrong == {1: "000001.json cannot be read (OSError)"}
+    assert rendered(plan, folder).rendered == 1 and contents(folder) == whole
+
+
+def test_shards_that_are_no_folder_are_told(plan: DatasetPlan, tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/shards").write_text("")
+    with pytest.raises(InputError, match=r"shards: must be a folder"):
+        rendered(plan, tmp_path / "data")
 
 
 SLOW = """

@@ -1,5 +1,8 @@
 """Environments for stable-baselines3, and training with them: the same numbers as the vector's, alone and in processes; exact resuming."""
 
+# pyright: reportMissingImports=false
+# (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import csv
@@ -12,11 +15,18 @@ import pytest
 
 from raytac.envs import RollBallVectorEnv
 from raytac.errors import InputError
+from raytac.observe import ObservationSettings, TactileObserver
+from raytac.observe.wrapper import AddTactile
 
 pytest.importorskip("stable_baselines3")
 
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.torch_layers import CombinedExtractor
+
+from experiments import train_ppo
 from experiments.imitation import imitate, regress
-from experiments.ppo_learner import Checkpoint, Learner, Recipe, evaluate, tactile_settings
+from experiments.ppo_learner import SMALLEST_SIDE, Checkpoint, Learner, Recipe, evaluate, tactile_settings
 from experiments.ppo_training import Training
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
 
@@ -121,6 +131,7 @@ def test_a_training_that_was_interrupted_ends_with_the_same_weights(tmp_path: Pa
     first.run_segment()
     with (tmp_path / "cut" / "progress.csv").open("a", encoding="utf-8") as file:
         file.write("48,9.0,0,,,,0.3\n")  # what a training that was killed may leave beyond its checkpoint
+    first.close()
     second = Training(RECIPE, tmp_path / "cut", evaluation=2, say=lambda _: None)
     assert second.steps == 32 and not second.is_done
     second.run_segment()
@@ -136,8 +147,26 @@ def test_a_training_that_was_interrupted_ends_with_the_same_weights(tmp_path: Pa
         rows = [list(csv.DictReader((tmp_path / run / name).open(encoding="utf-8"))) for run in ("whole", "cut")]
         assert [row["steps"] for row in rows[0]] == [row["steps"] for row in rows[1]] == ["32", "64"]
     assert [row["return"] for row in rows[0]] == [row["return"] for row in rows[1]]
+    whole.close()
+    second.close()
     with pytest.raises(InputError, match="'gamma'"):
         Training(replace(RECIPE, gamma=0.5), tmp_path / "cut")
+
+
+def test_a_second_training_stays_out_of_the_folder_of_the_first(tmp_path: Path) -> None:
+    first = Training(RECIPE, tmp_path / "run", evaluation=2, say=lambda _: None)
+    first.run_segment()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    for recipe in (RECIPE, replace(RECIPE, seed=1)):
+        with pytest.raises(InputError, match="in use by another run"):
+            Training(recipe, tmp_path / "run", evaluation=2)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    first.close()
+    with pytest.raises(InputError, match="another recipe"):
+        Training(replace(RECIPE, seed=1), tmp_path / "run")
+    second = Training(RECIPE, tmp_path / "run", evaluation=2)  # the refusal gave the folder back
+    assert second.steps == 32
+    second.close()
 
 
 def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path) -> None:
@@ -186,12 +215,76 @@ def test_time_of_imitation_counts_after_a_resume(tmp_path: Path) -> None:
     first = Training(recipe, tmp_path, evaluation=2, say=lambda _: None)
     first.run_segment()
     assert not (tmp_path / "progress.csv").exists(), "no rollout of PPO yet"
-    assert Training(recipe, tmp_path, evaluation=2).wall_s == pytest.approx(first.wall_s, abs=0.01) and first.wall_s > 0.01
+    first.close()
+    second = Training(recipe, tmp_path, evaluation=2)
+    assert second.wall_s == pytest.approx(first.wall_s, abs=0.01) and first.wall_s > 0.01
+    second.close()
 
 
 def test_modalities_by_name() -> None:
-    assert tactile_settings("none") is None and tactile_settings("task") == "task"
+    assert tactile_settings("none", "48x36") is None and tactile_settings("task", "48x36") == "task"
+    felt = tactile_settings("rgb+wrench", "40x50")
+    assert isinstance(felt, ObservationSettings) and felt.modalities == ("rgb", "wrench") and felt.resolution == (40, 50)
     with pytest.raises(InputError, match="modality"):
-        tactile_settings("markers+taste")
+        tactile_settings("markers+taste", "48x36")
     with pytest.raises(InputError, match="task"):
         Learner(replace(RECIPE, task="Juggle"))
+
+
+class Turning(gymnasium.Env):
+    """Nothing but an angle; what is pressed comes from elsewhere."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.zeros(2, np.float32), float(action[0]), False, False, {}
+
+
+def test_an_environment_of_ones_own_with_two_sensors_is_trained() -> None:
+    """``AddTactile`` gives what ``MultiInputPolicy`` takes, at the smallest size of an image."""
+    settings = ObservationSettings(("rgb", "wrench"), resolution=(SMALLEST_SIDE, SMALLEST_SIDE), optics="phong")
+    observers = {name: TactileObserver("gelsight_mini", settings) for name in ("left", "right")}
+    frame = observers["left"].make_sensor(device="cpu", pitch=0.4e-3).press("sphere")
+    env = AddTactile(Turning(), observers, lambda: {"left": frame, "right": frame})
+    check_env(env, warn=False)
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu")
+    assert {"observation", "left_rgb", "left_wrench", "right_rgb", "right_wrench"} == set(model.observation_space.spaces)  # type: ignore[attr-defined]
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(8)
+    name = next(name for name in before if "left_rgb" in name and name.endswith("weight"))
+    assert not np.array_equal(model.policy.state_dict()[name], before[name]), "the image was not learned from"
+
+
+def test_the_smallest_image_is_what_the_network_takes() -> None:
+    def network(height: int, width: int) -> None:
+        CombinedExtractor(gymnasium.spaces.Dict({"rgb": gymnasium.spaces.Box(0, 255, (3, height, width), np.uint8)}))
+
+    network(SMALLEST_SIDE, SMALLEST_SIDE)
+    for height, width in ((SMALLEST_SIDE - 1, 64), (64, SMALLEST_SIDE - 1)):
+        with pytest.raises(RuntimeError, match="Kernel size"):
+            network(height, width)
+
+
+def test_images_that_are_too_small_are_refused_with_the_smallest_size(tmp_path: Path) -> None:
+    for size in ("32x32", "35x64", "64x35"):
+        with pytest.raises(InputError, match=f"resolution = '{size}': .*takes 36x36 pixels or more"):
+            train_ppo.main(train_ppo.Args(tactile="none,rgb", resolution=size, out=tmp_path / "out"))
+        with pytest.raises(InputError, match="36x36"):
+            Learner(replace(RECIPE, tactile="rgb", resolution=size))
+    assert not (tmp_path / "out").exists()
+    small = ObservationSettings(("rgb",), resolution=(64, 32), optics="phong")
+    with pytest.raises(InputError, match=r"resolution = '64x32'.*36x36"):
+        Learner(RECIPE, tactile=small)
+
+
+def test_a_policy_that_sees_images_is_made_at_the_default_size() -> None:
+    width, height = (int(side) for side in Recipe.resolution.split("x"))
+    seen = ObservationSettings(("rgb",), resolution=(width, height), optics="phong")
+    learner = Learner(replace(RECIPE, tactile="rgb"), tactile=seen, pitch=0.4e-3)
+    assert learner.normaliser.observation_space["sensor_rgb"].shape == (height, width, 6)  # type: ignore[index]  # a history of 2
+    assert np.isfinite(learner.predict(learner.normaliser.reset())).all()  # type: ignore[arg-type]

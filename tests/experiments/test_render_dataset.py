@@ -45,7 +45,14 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"count": 0}, "count = 0"), ({"resolution": "32"}, "resolution = '32'"), ({"optics": "x"}, "optics = 'x'")],
+    [
+        ({"count": 0}, "count = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"sheet": -3}, "sheet = -3"),
+        ({"sheet": 3, "outputs": "wrench"}, "sheet = 3"),
+        ({"resolution": "32"}, "resolution = '32'"),
+        ({"optics": "x"}, "optics = 'x'"),
+    ],
 )
 def test_bad_options_are_told(options: dict[str, Any], message: str, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SWEEP)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,6 +33,30 @@ def test_a_short_wave_feels_a_half_space_and_a_long_one_a_confined_layer():
     gentle = np.array([2.5])
     squeezed = (1.0 + nu) * thickness**2 * gentle * (1.0 - (1.0 - 2.0 * nu) * (3.0 - 4.0 * nu)) / (4.0 * young * (1.0 - nu) ** 2)
     assert layer_spread(gentle, GELPAD) == pytest.approx(squeezed, rel=1e-3)
+
+
+def test_bonded_vertices_of_the_coat_bear_no_force():
+    """A pad that is bonded at its sides too: a contact that reaches them has vertices that nothing moves."""
+    gelpad = replace(GELPAD, bonded="back_and_sides")
+    mesh = pad_mesh(gelpad, PadLevel(2.5e-3, 3, 1.5, 1.5, 5e-5))
+    grid = make_grid(gelpad, 0.4e-3)
+    compliance, continued = coat_compliance(mesh, gelpad)[0, 2], coat_compliance(mesh, gelpad, rollers=True)[0, 2]
+    fine = FineContact(CoatSurface(mesh.coat, gelpad), gelpad, grid.x, grid.y, compliance, continued)
+    rest = mesh.coat.rest
+    load = np.where(rest[:, 0] > 0.5 * gelpad.size[0] - 4e-3, 1.0, 0.0)
+    bonded = np.diagonal(compliance) == 0.0
+    assert (bonded & (load > 0.0)).any()
+    down = np.where(bonded, 0.0, -1e-4 * load)
+    shape = fine.solve(fine.surface.places(np.zeros((len(rest), 3))), down, load, np.full(grid.shape, np.nan))
+    assert np.isfinite(shape.held).all() and (shape.held[bonded] == 0.0).all()
+    pressed = ~bonded & (load > 0.0)
+    assert (compliance @ shape.held)[pressed] == pytest.approx(-1e-4, rel=1e-6)
+
+
+def test_a_field_read_at_no_place_is_no_number():
+    x, field = np.linspace(0.0, 1.0, 5), np.arange(20.0).reshape(4, 5)
+    found = sampled(field, x, np.linspace(0.0, 1.0, 4), np.array([np.nan, 0.5]), np.array([0.0, 0.0]))
+    assert np.isnan(found[0]) and found[1] == 2.0
 
 
 def test_cosines_pass_through_their_nodes():

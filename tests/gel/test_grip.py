@@ -9,9 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import raytac.gel.grip as grip_module
 from raytac.gel.coat_surface import CoatSurface
 from raytac.gel.fine_contact import FineContact
-from raytac.gel.grip import Grip, RigidMotion, _trust
+from raytac.gel.grip import Grip, RigidMotion, _held, _trust
 from raytac.gel.layer_compliance import layer_shear
 from raytac.gel.pad import make_grid
 from raytac.gel.skin_motion import SkinMotion, _share
@@ -202,6 +203,51 @@ def test_the_skin_follows_a_mirrored_or_turned_drag_likewise(contact):
     twist = dragged(contact, turn=0.05)[3]
     assert np.abs((twist * REST[:, :2]).sum(axis=1)).max() < 0.15 * np.abs(twist).max() * np.abs(REST[:, :2]).max()
     assert np.abs(twist.sum(axis=0)).max() < 1e-3 * np.abs(twist).sum()
+
+
+def test_forces_that_hold_are_those_of_a_direct_solve_and_what_cannot_move_bears_none():
+    rng = np.random.default_rng(0)
+    square = rng.normal(size=(12, 12))
+    whole = square @ square.T + np.eye(12)
+    whole[3] = whole[:, 3] = whole[7] = whole[:, 7] = 0.0
+    compliance, moved = (1e-3 * whole).astype(np.float32), rng.normal(size=12).astype(np.float32)
+    free = np.isin(np.arange(12), (3, 7), invert=True)
+    force = _held(compliance, moved)
+    assert (force[~free] == 0.0).all()
+    assert force[free] == pytest.approx(np.linalg.solve(1e-3 * whole[np.ix_(free, free)], moved[free]), rel=1e-2)
+    assert np.abs(compliance @ force - moved)[free].max() < 1e-6
+    assert not _held(np.zeros((4, 4), np.float32), moved[:4]).any()
+
+
+@pytest.mark.parametrize("corner", [False, True])
+def test_a_contact_at_the_pads_border_is_exchanged_too(contact, grip, corner, monkeypatch):
+    """The sides cannot move across themselves in the mesh that is held: their rows of the compliance are 0, and a solve of all is NaN."""
+    monkeypatch.setattr(grip_module, "_trust", lambda *args: 1.0)
+    fine, edge = contact[0], 0.5 * np.array(GELPAD.size)
+    at = edge * [1.0, 1.0 if corner else 0.0]
+    square = 1.0 - ((fine.x[None, :] - at[0]) ** 2 + (fine.y[:, None] - at[1]) ** 2) / RADIUS**2
+    shape = SimpleNamespace(pressure=1e5 * np.sqrt(np.maximum(square, 0.0)).astype(np.float32))
+    touching = np.hypot(*(REST[:, :2] - at).T) < 3.5e-3
+    assert (REST[touching, 0] > edge[0] - 1e-9).any()
+    moved = np.tile([0.0, -1e-4], (len(REST), 1))
+    shown = grip.exchange(shape, moved, touching, np.where(touching, 1.0, 0.0), 0.6)
+    assert np.isfinite(shown).all() and 1e-6 < np.abs(shown[:, 1]).max() < 1e-4
+
+
+def test_a_contact_that_nothing_moves_is_left_alone(contact, grip, monkeypatch):
+    monkeypatch.setattr(
+        grip_module.Grip, "_back", staticmethod(lambda waves, lines: np.zeros((2, len(lines[1][0]), lines[0][0].shape[1])))
+    )
+    assert grip.hold(dome(contact[0]), motion(1e-4), 0.6) is None
+
+
+def test_what_is_not_trusted_is_not_exchanged_whatever_it_is(contact, grip, monkeypatch):
+    monkeypatch.setattr(grip_module, "_trust", lambda *args: 0.0)
+    monkeypatch.setattr(grip_module, "_held", lambda compliance, moved: np.full_like(moved, np.nan))
+    touching = np.hypot(*REST[:, :2].T) < 2.2e-3
+    shape = SimpleNamespace(pressure=dome(contact[0]))
+    shown = grip.exchange(shape, np.full((len(REST), 2), 1e-4), touching, np.where(touching, 1.0, 0.0), 0.6)
+    assert (shown == 0.0).all()
 
 
 @pytest.mark.parametrize("angle", [0.2, 0.7, 1.2])

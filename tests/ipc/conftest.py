@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import ipc
+from ipc.layout import rotation_matrix
 
 wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
 wp.init()
@@ -34,3 +35,9 @@ def bonded_pad(mesh: ipc.TetMesh, **changes: object) -> ipc.SoftBody:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
+
+
+def turns(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random rotation matrices, (count, 3, 3)."""
+    q = rng.standard_normal((count, 4))
+    return rotation_matrix(q / np.linalg.norm(q, axis=1, keepdims=True))

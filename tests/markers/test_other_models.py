@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import PadGrid
+from raytac.io.arrays import npy_bytes
+from raytac.markers import compliance
 from raytac.markers.compliance import cached_compliance, coat_compliance, rest_stiffness
 from raytac.markers.pattern import marker_centres
 from raytac.markers.sampling import height_and_slope
@@ -67,18 +69,30 @@ def test_compliance_solves_the_bonded_pad(sensor: SensorSpec, small: PadMesh) ->
     assert field[v, 2] < 0 and np.abs(field[v, :2]).max() < 0.02 * -field[v, 2]
 
 
-def test_the_cache_gives_back_what_it_was_given(
+def test_the_cache_gives_back_what_it_was_given_and_nothing_damaged(
     sensor: SensorSpec, small: PadMesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAYTAC_CACHE", str(tmp_path))
     first = cached_compliance(small, sensor.gelpad)
-    kept = list((tmp_path / "markers").glob("*.npy"))
-    assert len(kept) == 1
-    np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
-    kept[0].write_bytes(b"broken")
-    np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
-    monkeypatch.setenv("RAYTAC_CACHE", str(kept[0]))  # a file, where nothing can be kept
-    np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
+    (kept,) = (tmp_path / "markers").glob("*.npy")
+    whole = kept.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(compliance, "coat_compliance", lambda *_: pytest.fail("it was kept"))
+        np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
+    made: list[int] = []
+    monkeypatch.setattr(compliance, "coat_compliance", lambda *_: (made.append(1), first)[1])
+    other = first.copy()
+    other[0, 0] = np.nan
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0x40
+    for count, data in enumerate((b"", whole[: len(whole) // 2], bytes(flipped), npy_bytes(other), b"broken"), 1):
+        kept.write_bytes(data)
+        with pytest.warns(RuntimeWarning, match="cannot be used and is made again"):
+            np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
+        assert len(made) == count and kept.read_bytes() == whole
+    monkeypatch.setenv("RAYTAC_CACHE", str(kept))  # a file, where nothing can be kept
+    with pytest.warns(RuntimeWarning, match="cannot be written"):
+        np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
 
 
 @pytest.fixture(scope="module")

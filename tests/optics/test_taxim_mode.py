@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -195,25 +196,32 @@ def test_what_it_cannot_do_is_refused(spec: SensorSpec, grid: PadGrid) -> None:
     mode.render(at_rest(grid))
     with pytest.raises(InputError, match="whole number of grids"):
         mode.render_device(mode.mi.Float([0, 1, 2]))
+    nodes = dr.zeros(mode.mi.Float, grid.rest.size)
+    with pytest.raises(InputError, match="contact"):
+        mode.render_device(nodes, mode.mi.UInt8(0))
+    with pytest.raises(InputError, match="ink = 3: must have one value a node"):
+        mode.render_device(nodes, dr.zeros(mode.mi.UInt8, grid.rest.size), mode.mi.Float([0, 1, 0]))
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("kind", ["table", "shadow", "phong"])
-def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadGrid, kind: str) -> None:
+def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadGrid, kind: str, device: str) -> None:
     """The peak of Dr.Jit's own arrays stays below what is stated, and that is no wild guess."""
     from raytac.optics.memory import peak_bytes
 
     size = (160, 120)
     mode = (
-        PhongMode(spec, background=np.zeros((120, 160, 3), np.uint8), resolution=size, device="cpu")
+        PhongMode(spec, background=np.zeros((120, 160, 3), np.uint8), resolution=size, device=device)
         if kind == "phong"
-        else TaximMode(spec, calibration=make_table(spec), shadow=kind == "shadow", resolution=size, device="cpu")
+        else TaximMode(spec, calibration=make_table(spec), shadow=kind == "shadow", resolution=size, device=device)
     )
     height, contact = ball(grid)
-    for envs in (1, 3, 7):  # the allocator's powers of two suit some batches better than others
+    for envs, inked in ((1, False), (3, False), (7, False), (7, True)):  # powers of two suit some batches better than others
         batch = surface(grid, *[height] * envs, contact=contact)
+        batch = replace(batch, ink=np.full(batch.height.shape, 0.3, np.float32)) if inked else batch
         mode.render(batch)
-        peak = peak_bytes(lambda batch=batch: mode.render(batch), "cpu")
-        assert 0.35 * envs * mode.memory_per_env(grid) < peak <= envs * mode.memory_per_env(grid)
+        peak = peak_bytes(lambda batch=batch: mode.render(batch), device)
+        assert 0.4 * envs * mode.memory_per_env(grid) < peak <= envs * mode.memory_per_env(grid)
 
 
 def test_a_batch_that_does_not_fit_is_refused(spec: SensorSpec, grid: PadGrid, monkeypatch: pytest.MonkeyPatch) -> None:

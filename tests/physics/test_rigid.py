@@ -156,7 +156,7 @@ def test_first_touch_has_no_overlap_and_no_gap(kind: str) -> None:
     pose = state.pad_from_object[0].copy()
     pose[2, 3] -= CLEARANCE
     gap = gap_at_touch(pad.parts, pose, pad.grid)
-    z, found = first_touch(pad.parts, pose, pad.sensor.gelpad, pad.grid)
+    z, found, _ = first_touch(pad.parts, pose, pad.sensor.gelpad, pad.grid)
     assert z == pytest.approx(pose[2, 3], abs=1e-9)
     np.testing.assert_allclose(found, gap, atol=1e-9)
     assert 0.0 <= gap.min() < 20e-6  # a sharp corner may lie between nodes

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
+from raytac.physics.soft_contact import SoftContact
+from raytac.physics.soft_scene import SoftScene
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import indent, press, soft
 
@@ -25,6 +27,99 @@ def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
         alone = one.peak(one.run())
         assert np.abs(one.surface(alone).height[0] - many.surface(state).height[b]).max() < 1e-6
         assert alone.normal_force[0] == pytest.approx(state.normal_force[b], rel=1e-3)
+
+
+def test_a_press_at_the_border_is_sound_and_leaves_the_others_as_they_are():
+    """It once ended in an IndexError, and took the whole batch with it."""
+    scene, offsets = press(indent(0.3e-3)), np.array([[0.0, 0.0], [11e-3, 0.0]])
+    many = soft(scene, num_envs=2, offsets=offsets)
+    state = many.peak(many.run())
+    surface = many.surface(state)
+    assert not state.failed.any() and (state.unconverged == 0).all()
+    assert surface.indentation[1].max() == pytest.approx(0.3e-3, rel=0.05) and np.isfinite(surface.coat.positions).all()
+    one = soft(scene)
+    alone = one.peak(one.run())
+    assert np.abs(one.surface(alone).height[0] - surface.height[0]).max() < 1e-6
+
+
+def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
+    scene, offsets = press(indent(0.2e-3)), np.array([[0.0, 0.0], [2e-3, 0.0]])
+    seen = SoftContact.seen
+
+    def spoilt(contact, poses):
+        found = seen(contact, poses)
+        found.forces[0, 7, 1] = np.inf
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SoftContact, "seen", spoilt)
+        many = soft(scene, num_envs=2, offsets=offsets)
+        state = many.peak(many.run())
+        surface, wrench = many.surface(state), many.wrench(state)
+    assert state.failed.tolist() == [True, False]
+    for values in (surface.height, surface.coat.positions, wrench, many.traction(state), state.normal_force, state.depth):
+        assert np.isnan(values[0]).all() and np.isfinite(values[1]).all()
+    assert not surface.contact[0].any() and surface.contact[1].any()
+    one = soft(scene, offsets=offsets[1:])
+    alone = one.peak(one.run())
+    assert np.abs(one.surface(alone).height[0] - surface.height[1]).max() < 1e-6
+
+
+class Converging:
+    """Lets the solver's reports say that the steps named did not converge, in environment 0 of as many as there are."""
+
+    def __init__(self, monkeypatch, *steps):
+        self.calls, advance = 0, SoftScene.advance
+
+        def told(scene, *args, **settings):
+            report = advance(scene, *args, **settings)
+            self.calls += 1
+            if self.calls in steps:
+                bad = np.arange(scene.num_envs) == 0
+                ends, count = report.last_converged & ~bad, report.unconverged + bad
+                report = replace(report, converged=report.converged & ~bad, unconverged=count, last_converged=ends)
+            return report
+
+        monkeypatch.setattr(SoftScene, "advance", told)
+
+
+def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_followed_by_still_ones(monkeypatch):
+    scene = press(indent(0.2e-3))
+    with monkeypatch.context() as patch:
+        steps = Converging(patch)
+        pad = soft(scene)
+        assert pad.peak(pad.run()).unconverged.tolist() == [0]
+        usual = steps.calls
+    with monkeypatch.context() as patch:
+        steps = Converging(patch, 2, usual)
+        many = soft(scene, num_envs=2)
+        state = many.peak(many.run())
+        assert steps.calls > usual and state.unconverged.tolist() == [2, 0] and not state.failed.any()
+    with monkeypatch.context() as patch:
+        Converging(patch, *range(usual, usual + 50))
+        many = soft(scene, num_envs=2)
+        state = many.peak(many.run())
+        assert state.failed.tolist() == [True, False] and state.unconverged[0] > 1 and state.unconverged[1] == 0
+        many.reset()
+        assert next(iter(many.run())).unconverged.tolist() == [0, 0]
+
+
+def test_a_solver_that_never_converges_fails_the_press(monkeypatch):
+    monkeypatch.setattr("raytac.physics.soft_contact._CLOSE", 1e-40)
+    pad = soft(press(indent(0.02e-3)))
+    state = pad.peak(pad.run())
+    assert state.failed.all() and state.unconverged[0] >= 2
+
+
+def test_what_has_failed_is_not_stepped(monkeypatch):
+    steps = Converging(monkeypatch)
+    pad = soft(press(indent(0.2e-3)), offsets=np.full((1, 2), np.nan))
+    assert pad.peak(pad.run()).failed.all() and steps.calls == 0
+    many = soft(press(indent(0.2e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    assert many.peak(many.run()).failed.tolist() == [False, True] and steps.calls > 0
+    assert many.solver.scene.failed.tolist() == [False, True]
+    many.reset()
+    assert not many.solver.scene.failed.any()
 
 
 def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():

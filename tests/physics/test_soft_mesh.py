@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
+import ipctk
 import numpy as np
 import pytest
 import trimesh
@@ -15,8 +17,10 @@ from raytac.gel.part import mesh_part, primitive
 from raytac.gel.rasterize import lowest_of_triangles
 from raytac.physics.objects import object_parts
 from raytac.physics.part_surface import object_surface, part_surface
+from raytac.physics.soft_bodies import object_body, scene_body
 from raytac.physics.soft_mesh import PAD_LEVELS, PadMesh, pad_mesh
 from raytac.specs import load_press, load_sensor
+from raytac.specs.files import available
 from raytac.specs.press import PADS
 
 GELPAD = load_sensor("gelsight_mini").gelpad
@@ -116,6 +120,90 @@ def test_object_surfaces_lie_on_the_rigid_pads_undersides(scene):
     assert both.sum() > 300
     off = np.abs(exact - facets)[both]
     assert np.percentile(off, 95) < (6e-5 if scene == "coin" else 1e-5)
+
+
+SHIPPED = ["sphere", "soft_ball", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh"]
+
+
+@pytest.mark.parametrize("scene", SHIPPED)
+def test_no_shipped_object_crosses_itself(scene):
+    """By ipctk, which is none of ours: as a whole, each is one closed surface that a pad can be checked against."""
+    assert set(SHIPPED) == set(available("press scene")) - {"none"}
+    surface = object_surface(object_parts(load_press(scene).object))
+    assert_sound(surface)
+
+
+def assert_sound(surface):
+    mesh = ipctk.CollisionMesh(surface.vertices, ipctk.edges(surface.faces), surface.faces)
+    assert not ipctk.has_intersections(mesh, surface.vertices)
+    solid = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 0
+
+
+@pytest.mark.parametrize("scene", ["coin", "pins"])
+def test_joined_parts_keep_the_underside_of_their_parts(scene):
+    """What touches a gel is what the parts' own surfaces are, put one over the other: only the walls between them are gone."""
+    parts = object_parts(load_press(scene).object)
+    x, y = np.linspace(-7.9e-3, 7.9e-3, 301), np.linspace(-7.4e-3, 7.3e-3, 290)
+    joined = lowest_of_triangles((one := object_surface(parts)).vertices[one.faces], x, y)
+    apart = np.full_like(joined, np.inf)
+    for part in parts:
+        surface = part_surface(part)
+        placed = surface.vertices @ part.object_from_part[:3, :3].T + part.object_from_part[:3, 3]
+        apart = np.minimum(apart, lowest_of_triangles(placed[surface.faces], x, y))
+    assert np.array_equal(np.isfinite(joined), np.isfinite(apart)) and np.isfinite(joined).mean() > 0.5
+    np.testing.assert_allclose(joined[np.isfinite(joined)], apart[np.isfinite(joined)], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "pitch", "radius"), [(1, 1, 1e-3, 0.5e-3), (2, 3, 1e-3, 0.5e-3), (5, 1, 2e-3, 0.4e-3)]
+)
+def test_pins_of_any_number_are_sound_also_where_they_touch(rows, columns, pitch, radius):
+    params = {"rows": rows, "columns": columns, "pitch": pitch, "pin_radius": radius, "pin_height": 2e-3}
+    surface = object_surface(object_parts(replace(load_press("pins").object, params=params)))
+    assert_sound(surface)
+    plate, pin = rows * columns * pitch**2 * 2e-3, math.pi * radius**2 * 2e-3
+    volume = trimesh.Trimesh(surface.vertices, surface.faces, process=False).volume
+    assert 0.99 < volume / (plate + rows * columns * pin) < 1 + 1e-9
+
+
+@pytest.mark.parametrize("radius", [0.1e-3, 3e-3, 10e-3, 12.345e-3])
+def test_coins_of_any_size_are_sound(radius):
+    params = {"radius": radius, "thickness": 0.2 * radius, "relief_height": 0.1 * radius}
+    surface = object_surface(object_parts(replace(load_press("coin").object, params=params)))
+    assert_sound(surface)
+    volume = trimesh.Trimesh(surface.vertices, surface.faces, process=False).volume
+    assert 1.0 < volume / (math.pi * radius**2 * 0.2 * radius) < 1.5
+
+
+def test_parts_that_cannot_be_joined_are_refused():
+    ball = replace(primitive("sphere", (1e-3,)), joined=True)
+    with pytest.raises(InputError, match=r"parts = .*box.*sphere.*: must be a disc and its relief, or a plate and its pins"):
+        object_surface((primitive("box", (1e-3,) * 3), ball))
+
+
+def test_the_contact_solver_refuses_a_mesh_that_crosses_itself_and_tells_of_parts_that_overlap():
+    cube = trimesh.creation.box(extents=(4e-3,) * 3)
+    moved = cube.copy().apply_translation([1e-3, 1.5e-3, 0.5e-3])
+    both = trimesh.util.concatenate([cube, moved])
+    crossing = (mesh_part(both.vertices, both.faces),)
+    driven = load_press("edge").object
+    for make in (
+        lambda: object_body(crossing, driven, np.eye(3)[None]),
+        lambda: scene_body("thing", crossing, "affine"),
+        lambda: scene_body("thing", crossing, "soft"),
+    ):
+        with pytest.raises(
+            InputError, match=r"24 triangles.*must not cross itself with physics='ipc': \d+ pairs .* near \(.*\) mm"
+        ):
+            make()
+    boxes = (primitive("box", (2e-3,) * 3), primitive("box", (1e-3, 1e-3, 3e-3)))
+    with pytest.warns(UserWarning, match=r"the parts of 'thing' overlap: \d+ pairs of triangles"):
+        scene_body("thing", boxes, "kinematic")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for scene in ("coin", "pins", "mesh"):
+            scene_body(scene, object_parts(load_press(scene).object), "kinematic")
 
 
 def test_a_relief_is_closed():

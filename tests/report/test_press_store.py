@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import raytac.report.press_store as press_store
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.markers.calibration_presses import QUICK_FIT, PressStates
 from raytac.report.press_store import PressStore, press_code
@@ -95,11 +94,10 @@ def test_a_damaged_file_is_said_and_not_used(harm: str, tmp_path: Path, sensor: 
 def test_an_interrupt_while_writing_leaves_nothing(
     tmp_path: Path, sensor: SensorSpec, states: PressStates, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(stream, **arrays: np.ndarray) -> None:
-        stream.write(b"half of it")
+    def interrupted(handle: int) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(press_store.np, "savez", interrupted)
+    monkeypatch.setattr("raytac.io.atomic.os.fsync", interrupted)
     with pytest.raises(KeyboardInterrupt):
         store(tmp_path, sensor, []).write(PRESS, states)
     assert list(tmp_path.iterdir()) == []

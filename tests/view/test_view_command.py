@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from raytac.cli import view as view_module
+from raytac.cli.view import ViewArgs
+from raytac.specs import SensorSpec, load_press, load_sensor
 from tests.view.page_client import PageClient
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +29,9 @@ def command(*args: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def test_it_serves_until_ctrl_c(tmp_path):
-    running = command("sphere", "--optics", "phong", "--resolution", "80x60", "--port", "0", cwd=tmp_path)
+    running = command(
+        "sphere", "--optics", "phong", "--resolution", "80x60", "--port", "0", "--allow-host", "gpu3.example.org:80", cwd=tmp_path
+    )
     try:
         assert running.stdout is not None
         for line in running.stdout:
@@ -33,6 +40,10 @@ def test_it_serves_until_ctrl_c(tmp_path):
                 break
         else:
             raise AssertionError(running.stderr.read() if running.stderr else "")
+        for name, status in (("gpu3.example.org", 200), ("evil.example", 403)):
+            link = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=10.0)
+            link.request("GET", "/", headers={"Host": name})
+            assert link.getresponse().status == status
         client = PageClient(int(found[1]))
         client.until(lambda: "sphere · gelsight_mini · rigid+phong" in client.texts(), "the title", 60.0)
         client.until(lambda: "paused" in client.texts(), "the first image", 60.0)
@@ -56,6 +67,7 @@ def test_it_serves_until_ctrl_c(tmp_path):
         (("sphere", "--physics", "soft"), "choose from: rigid, ipc"),
         (("sphere", "--resolution", "big"), "WIDTHxHEIGHT"),
         (("sphere", "--markers", "fots"), "markers"),
+        (("sphere", "--allow-host", "http://gpu3.example.org/"), "allow_host = .*must be a host name"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_nothing_is_served(tmp_path, args, said):
@@ -72,3 +84,25 @@ def test_a_port_that_is_taken_is_said(tmp_path):
         done = command("sphere", "--port", str(other.getsockname()[1]), cwd=tmp_path)
         _, err = done.communicate(timeout=60.0)
     assert done.returncode == 2 and "in use" in err and "choose another one" in err
+
+
+def upright(width: int, height: int) -> SensorSpec:
+    """A sensor whose image has this many pixels."""
+    spec = load_sensor("gelsight_mini")
+    size, middle = (width, height), (width / 2, height / 2)
+    return replace(spec, camera=replace(spec.camera, resolution=size, pixel_pitch=(0.0152 / width,) * 2, principal_point=middle))
+
+
+@pytest.mark.parametrize(
+    ("native", "shown"), [((240, 320), (240, 320)), ((960, 1280), (240, 320)), ((120, 90), (120, 90)), ((640, 480), (320, 240))]
+)
+def test_the_image_is_as_large_as_can_be_drawn_and_has_the_shape_of_the_sensor(native, shown):
+    assert ViewArgs(scene="sphere")._settings(upright(*native))["resolution"] == shown
+    assert ViewArgs(scene="sphere", resolution="60x80")._settings(upright(*native))["resolution"] == (60, 80)
+
+
+def test_an_upright_sensor_is_shown_upright(monkeypatch):
+    monkeypatch.setattr(view_module, "sensor_spec", lambda name: upright(240, 320))
+    args = ViewArgs(scene="sphere", optics="phong", device="cpu")
+    (view,) = args._press(load_press("sphere"), "rigid").snapshot().pads.values()
+    assert view.rgb is not None and view.rgb.shape == (320, 240, 3)

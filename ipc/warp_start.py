@@ -1,0 +1,52 @@
+"""Start Warp, also for a user whose cache folder is missing or cannot be written."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+
+import warp as wp
+
+__all__ = ["start_warp", "use_writable_cache"]
+
+
+def start_warp() -> None:
+    """``wp.init()`` after ``use_writable_cache``."""
+    use_writable_cache()
+    wp.init()
+
+
+@functools.cache
+def use_writable_cache() -> None:
+    """Give Warp a folder of this process alone for compiled kernels where the user's cannot be written, with a warning.
+
+    Warp itself stops at a read-only home, and for a user without one it makes a folder named ``~``.
+    """
+    folder = _kernel_folder()
+    try:
+        if folder.parts[0] == "~":
+            raise OSError("there is no home folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        own = tempfile.mkdtemp(prefix="warp-kernels-")
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
+        wp.config.kernel_cache_dir = own
+        text = (
+            f"Warp's cache {folder} cannot be written ({error.strerror or error}): kernels are compiled for this process alone; "
+            "WARP_CACHE_PATH names another folder"
+        )
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+
+def _kernel_folder() -> Path:
+    """Where Warp is going to keep compiled kernels: its setting, ``WARP_CACHE_PATH``, or the user's cache."""
+    chosen = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "warp"
+    return folder if folder.name == wp.config.version else folder / wp.config.version
