@@ -19,6 +19,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
+from raytac.checks import check_number, check_numbers, check_seed, check_whole
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
 from raytac.errors import InputError
@@ -76,6 +77,20 @@ class Recipe:
     """Of the steps, so many at first imitate the scripted policy, which knows the state; 0 is PPO alone."""
     device: str = "cpu"
     """Of the network and of the sensors."""
+
+    def __post_init__(self) -> None:
+        check_seed("seed", self.seed)
+        for name in ("steps", "num_envs", "processes", "rollout", "segment", "epochs", "minibatch"):
+            check_whole(name, getattr(self, name))
+        check_whole("teacher_steps", self.teacher_steps, 0)
+        check_whole("history", self.history, 1, 1000)
+        check_whole("hidden", self.hidden, 1, 65536)
+        ranges = {"learning_rate": "(0, inf)", "gamma": "[0, 1]", "gae_lambda": "[0, 1]", "clip_range": "(0, inf)"}
+        for name, interval in (ranges | {"log_std": "(-inf, inf)", "entropy": "[0, inf)"}).items():
+            check_number(name, getattr(self, name), interval)
+        for name in ("task", "tactile", "device"):
+            if not isinstance(getattr(self, name), str):
+                raise InputError(name, value=getattr(self, name), rule="must be a name")
 
 
 @dataclass(frozen=True)
@@ -193,7 +208,14 @@ class Checkpoint:
         """Raises ``InputError`` for a file that is none."""
         try:
             values = torch.load(path, map_location="cpu", weights_only=True)
-            return cls(Recipe(**values["recipe"]), *(values[name] for name in ("steps", "policy", "optimizer", "normaliser")))
+            recipe, saved = Recipe(**values["recipe"]), {name: values[name] for name in ("policy", "optimizer", "normaliser")}
+            for name, value in saved.items():
+                if not isinstance(value, dict):
+                    raise InputError(name, value=type(value).__name__, rule="must be a dictionary")
+            for name, tensor in saved["policy"].items():
+                if not isinstance(tensor, torch.Tensor) or not torch.isfinite(tensor).all():
+                    raise InputError(f"policy[{name!r}]", value=type(tensor).__name__, rule="must be a tensor of finite numbers")
+            return cls(recipe, check_whole("steps", values["steps"], 0), **saved)
         except FileNotFoundError as error:
             raise InputError("checkpoint", value=path, rule="must be a file that exists") from error
         except Exception as error:
@@ -274,20 +296,24 @@ class Learner:
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same recipe (but for how the environments are spread).
 
-        Raises ``InputError`` for a network of another shape.
+        Raises ``InputError`` for a network or a normaliser of another shape; nothing is changed then.
         """
+        assert isinstance(self.normaliser.obs_rms, dict)
+        moments = {"return": (self.normaliser.ret_rms, saved.normaliser.get("return"))}
+        observed = saved.normaliser.get("observation")
+        for name, rms in self.normaliser.obs_rms.items():
+            moments[f"observation.{name}"] = rms, observed.get(name) if isinstance(observed, dict) else None
+        checked = [(rms, _checked_moments(name, rms, values)) for name, (rms, values) in moments.items()]
         try:
             self.model.policy.load_state_dict(saved.policy)
-        except RuntimeError as error:
+            if saved.optimizer:
+                self.model.policy.optimizer.load_state_dict(saved.optimizer)
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 "checkpoint", value=saved.recipe, rule=f"must be of this task and these observations ({error})"
             ) from error
-        if saved.optimizer:
-            self.model.policy.optimizer.load_state_dict(saved.optimizer)
-        assert isinstance(self.normaliser.obs_rms, dict)
-        _set_moments(self.normaliser.ret_rms, saved.normaliser["return"])
-        for name, rms in self.normaliser.obs_rms.items():
-            _set_moments(rms, saved.normaliser["observation"][name])
+        for rms, (mean, var, count) in checked:
+            rms.mean, rms.var, rms.count = mean, var, count
         self.model.num_timesteps = saved.steps
 
     def predict(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -303,8 +329,16 @@ def _moments(rms: RunningMeanStd) -> dict[str, Any]:
     return {"mean": torch.as_tensor(np.asarray(rms.mean)), "var": torch.as_tensor(np.asarray(rms.var)), "count": float(rms.count)}
 
 
-def _set_moments(rms: RunningMeanStd, saved: Mapping[str, Any]) -> None:
-    rms.mean, rms.var, rms.count = saved["mean"].numpy().copy(), saved["var"].numpy().copy(), saved["count"]
+def _checked_moments(name: str, rms: RunningMeanStd, saved: object) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean, variance and count of a normaliser as saved, of the shape that it has here."""
+    if not isinstance(saved, Mapping) or not {"mean", "var", "count"} <= set(saved):
+        raise InputError(f"normaliser.{name}", value=type(saved).__name__, rule="must have mean, var and count")
+    mean, var = (
+        check_numbers(f"normaliser.{name}.{key}", saved[key], np.shape(rms.mean), finite=True) for key in ("mean", "var")
+    )
+    if (var < 0.0).any():
+        raise InputError(f"normaliser.{name}.var", value=float(var.min()), rule="must be >= 0")
+    return mean, var, check_number(f"normaliser.{name}.count", saved["count"], "[0, inf)")
 
 
 def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluation:

@@ -73,7 +73,7 @@ def check_whole(name: str, value: object, low: int = 1, high: int | None = None)
 
 def check_number(name: str, value: object, interval: str, unit: str = "") -> float:
     """A real number in an interval such as ``(0, inf)``."""
-    if not is_number(value) or value not in Interval.parse(interval):
+    if not is_number(value) or value not in Interval.parse(interval):  # type: ignore[operator]
         raise InputError(name, value=value, rule=f"must be a number in {interval}{' ' + unit if unit else ''}")
     return float(value)  # type: ignore[arg-type]
 

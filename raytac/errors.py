@@ -159,8 +159,7 @@ def _choices_text(value: object, choices: tuple[object, ...]) -> str:
     names = [
         name if len(name) <= _LONGEST_WORD else name[: _LONGEST_WORD - 1] + "…" for name in map(str, choices[:_MOST_CHOICES])
     ]
-    comparable = isinstance(value, str) and len(value) <= _LONGEST_WORD
-    close = difflib.get_close_matches(value, names, n=1) if comparable else []
+    close = difflib.get_close_matches(value, names, n=1) if isinstance(value, str) and len(value) <= _LONGEST_WORD else []
     hint = f"; did you mean {close[0]!r}?" if close else ";"
     more = f" and {len(choices) - len(names)} more" if len(choices) > len(names) else ""
     return f"{hint} choose from: {', '.join(names)}{more}"

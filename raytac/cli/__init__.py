@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -29,21 +33,51 @@ _Command = (
     | Annotated[ViewArgs, tyro.conf.subcommand("view")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""Errors of a disk, or of what standard output goes to."""
 _DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0 done, 1 the doctor found the default job broken, 2 wrong input."""
+    """Run the command line and return its exit code.
+
+    0: done; 1: the doctor found the default job broken; 2: wrong input, or a full disk; 130: Ctrl-C; 141: nobody reads the output any
+    more.
+    """
     args = sys.argv[1:] if args is None else args
-    if list(args) == ["--version"]:
-        print(f"raytac {__version__}")
-        return 0
-    command = tyro.cli(_Command, prog="raytac", description=_DESCRIPTION, args=args)  # type: ignore[call-overload]
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of paths that this locale cannot write, as standard error does
     try:
-        return command.run()
+        status = _run(args)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # as of `raytac press coin | head -1`
+        _drop_output()
+        return 128 + signal.SIGPIPE
     except RaytacError as error:
         print(f"raytac: error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        _drop_output()
+        print(f"raytac: error: cannot write ({error})", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("raytac: interrupted, nothing written", file=sys.stderr)
         return 130
+
+
+def _run(args: Sequence[str]) -> int:
+    if list(args) == ["--version"]:
+        print(f"raytac {__version__}")
+        return 0
+    command = tyro.cli(_Command, prog="raytac", description=_DESCRIPTION, args=args)  # type: ignore[call-overload]
+    return command.run()
+
+
+def _drop_output() -> None:
+    """Let what is still to be written to standard output go nowhere, so that the interpreter can end without another error."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

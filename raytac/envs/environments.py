@@ -30,6 +30,11 @@ def _checked_render_mode(mode: str | None) -> str | None:
     return mode
 
 
+def _check_open(closed: bool) -> None:
+    if closed:
+        raise InputError("environment", value="closed", rule="must not be used after close(): make another")
+
+
 def _action_space(size: int) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
 
@@ -46,6 +51,7 @@ class TactileEnv(gymnasium.Env):
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         """``render_mode``: None, or ``rgb_array``. Raises as ``TaskBatch``; ``InputError`` for another render mode."""
+        self.closed = False
         self.render_mode = _checked_render_mode(render_mode)
         self.batch = TaskBatch(self.task(), num_envs=1, **options)
         self.observation_space = gymnasium_space(self.batch.arrays)
@@ -57,7 +63,11 @@ class TactileEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode; a seed makes this and all later ones repeatable, sensors' noise too. ``options`` are not used."""
+        """Begin an episode; a seed makes this and all later ones repeatable, sensors' noise too. ``options`` are not used.
+
+        Raises ``InputError`` after ``close``.
+        """
+        _check_open(self.closed)
         super().reset(seed=seed)
         if seed is not None:
             self.batch.reseed([0], [seed])
@@ -65,7 +75,8 @@ class TactileEnv(gymnasium.Env):
         return _row(self._seen), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite."""
+        """Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite, or after ``close``."""
+        _check_open(self.closed)
         out = self.batch.step(np.asarray(action)[None])
         self._seen = out.observation
         info = {
@@ -82,6 +93,7 @@ class TactileEnv(gymnasium.Env):
             InputError: before the first ``reset``.
             BackendError: MuJoCo has no OpenGL to draw with (see ``SceneCamera``).
         """
+        _check_open(self.closed)
         if self.render_mode is None:
             return None
         if self._seen is None:
@@ -91,7 +103,8 @@ class TactileEnv(gymnasium.Env):
         return self._picture.draw(0, self._seen)
 
     def close(self) -> None:
-        """Free the renderer, if there is one."""
+        """Free the renderer, if there is one; the environment can then be neither reset nor stepped nor drawn."""
+        self.closed = True
         if self._picture is not None:
             self._picture.close()
             self._picture = None
@@ -157,8 +170,9 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         """Begin episodes: of all environments, or of those in ``options["reset_mask"]`` (B,).
 
         Raises:
-            InputError: seeds of another number than environments, or a mask of another shape.
+            InputError: seeds of another number than environments, a mask of another shape, or after ``close``.
         """
+        _check_open(self.closed)
         mask = (options or {}).get("reset_mask")
         envs = chosen_envs(mask, self.num_envs)
         if seed is not None:
@@ -176,8 +190,9 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of all; an action of an environment that begins anew in this step is ignored, whatever it holds.
 
-        Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite; it names the environment.
+        Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
+        _check_open(self.closed)
         late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
         actions = np.asarray(actions)
         if len(late) and actions.ndim and len(actions) == self.num_envs:
@@ -203,6 +218,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """One picture of each environment, as ``TactileEnv.render``; None without a render mode. Raises the same."""
+        _check_open(self.closed)
         if self.render_mode is None:
             return None
         if self._seen is None:

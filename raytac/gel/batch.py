@@ -24,7 +24,10 @@ def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
     """
     if envs is None:
         return list(range(batch))
-    chosen = np.asarray(envs)
+    try:
+        chosen = np.asarray(envs)
+    except ValueError as error:  # lists of several lengths
+        raise InputError("envs", value=envs, rule=f"must name environments 0 to {batch - 1}") from error
     if chosen.dtype == bool:
         if chosen.shape != (batch,):
             raise InputError("envs", value=chosen.shape, rule=f"a mask must have shape ({batch},)")

@@ -9,7 +9,7 @@ from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["COARSEST_PITCH", "MOST_CELLS", "grid_pitch", "make_grid", "rest_height"]
+__all__ = ["COARSEST_PITCH", "MOST_CELLS", "check_grid", "grid_pitch", "make_grid", "rest_height"]
 
 COARSEST_PITCH = 0.1e-3
 """Spacing of the pad's grid where the image does not ask for a finer one [m]."""
@@ -17,6 +17,8 @@ COARSEST_PITCH = 0.1e-3
 
 MOST_CELLS = 8192
 """Most cells of the pad's grid along an axis, as many as an image can have pixels."""
+_SAME = 1e-6
+"""Difference within which a grid is of a pad [m]."""
 
 
 def grid_pitch(pixel: tuple[float, float]) -> float:
@@ -31,6 +33,18 @@ def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     order, flat along an axis whose radius is ``inf``.
     """
     return -gelpad.sag(np.asarray(x, float), np.asarray(y, float))
+
+
+def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
+    """Raise ``InputError`` unless ``grid`` spans this gelpad, to a micrometre, and rests on its dome."""
+    ends = [float(nodes[k]) for nodes in (grid.x, grid.y) for k in (0, -1)]
+    own = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
+    if not np.allclose(ends, own, rtol=0.0, atol=_SAME):
+        rule = f"must be a grid of this sensor's pad, x and y from {own} m"
+        raise InputError("surface.grid", value=ends, rule=rule)
+    off = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
+    if not off <= _SAME:
+        raise InputError("surface.grid", value=off, rule="must rest on this sensor's dome; its nodes are so far off it [m]")
 
 
 def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from raytac.checks import check_numbers
 from raytac.errors import InputError
 
 __all__ = ["PART_KINDS", "Part", "hfield_part", "mesh_part", "primitive"]
@@ -20,6 +21,8 @@ _SIZES = {
     "cone": 3,
     "torus": 2,
 }
+_LONGEST = 1e3
+"""Longest length of a part, and farthest that it may be off [m]: beyond it, nothing of a pad's scale can be told."""
 PART_KINDS = (*_SIZES, "mesh", "relief")
 """What a ``Part`` can be. MuJoCo's ``hfield`` becomes a ``mesh`` through ``hfield_part``."""
 
@@ -59,10 +62,12 @@ def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndar
     if (
         len(size) != _SIZES[kind]
         or not np.isfinite(size).all()
+        or max(size, default=0.0) > _LONGEST
         or min(positive, default=1.0) <= 0.0
         or min(size, default=0.0) < 0.0
     ):
-        raise InputError("size", value=given, rule=f"a {kind} takes {_SIZES[kind]} finite lengths > 0 [m] (a cone's tip: >= 0)")
+        rule = f"a {kind} takes {_SIZES[kind]} lengths in (0, {_LONGEST:g}] m (a cone's tip may be 0)"
+        raise InputError("size", value=given, rule=rule)
     if kind == "torus" and size[1] >= size[0]:
         raise InputError("size", value=given, rule="a torus's minor radius must be less than its major radius")
     if kind == "cone" and (size[2] >= size[0] or size[2] >= np.hypot(size[0], size[1] - size[2])):
@@ -72,13 +77,12 @@ def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndar
 
 def mesh_part(vertices: np.ndarray, faces: np.ndarray, object_from_part: np.ndarray | None = None) -> Part:
     """A triangle mesh; a watertight one that is inside out is turned. Raises ``InputError`` for bad arrays."""
-    vertices = np.array(vertices, float)
-    faces = np.array(faces, np.int64)
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise InputError("vertices", value=vertices.shape, rule="must have shape (V, 3)")
-    if not np.isfinite(vertices).all():
-        raise InputError("vertices", value=vertices[~np.isfinite(vertices).all(axis=1)][0], rule="must be finite")
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+    vertices = check_numbers("vertices", vertices, (None, 3))
+    faces = check_numbers("faces", faces, (None, 3), finite=True).astype(np.int64)
+    far = ~(np.abs(vertices) <= _LONGEST).all(axis=1)
+    if far.any():
+        raise InputError("vertices", value=vertices[far][0], rule=f"must be finite and within {_LONGEST:g} m of the origin")
+    if len(faces) == 0:
         raise InputError("faces", value=faces.shape, rule="must have shape (F, 3) with F > 0")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces", value=(int(faces.min()), int(faces.max())), rule=f"must index {len(vertices)} vertices")
@@ -96,8 +100,8 @@ def hfield_part(size: tuple[float, ...], elevation: np.ndarray, object_from_part
     ``size`` [m]: half widths along x and y, elevation at data value 1, depth of the base below z = 0. ``elevation``: MuJoCo's
     normalised data in [0, 1], shape (nrow, ncol), rows along y.
     """
-    data = np.asarray(elevation, float)
-    if data.ndim != 2 or min(data.shape) < 2 or not np.isfinite(data).all():
+    data = check_numbers("elevation", elevation, (None, None))
+    if min(data.shape) < 2 or not np.isfinite(data).all():
         raise InputError("elevation", value=data.shape, rule="must be finite, with at least 2 rows and 2 columns")
     rows, columns = data.shape
     x, y = np.meshgrid(np.linspace(-size[0], size[0], columns), np.linspace(-size[1], size[1], rows))
@@ -115,7 +119,12 @@ def hfield_part(size: tuple[float, ...], elevation: np.ndarray, object_from_part
 
 
 def _pose(object_from_part: np.ndarray | None) -> np.ndarray:
-    return np.eye(4) if object_from_part is None else np.array(object_from_part, float)
+    if object_from_part is None:
+        return np.eye(4)
+    pose = check_numbers("object_from_part", object_from_part, (4, 4), finite=True)
+    if np.abs(pose[:3, 3]).max() > _LONGEST:
+        raise InputError("object_from_part", value=pose[:3, 3].tolist(), rule=f"must be within {_LONGEST:g} m of the origin")
+    return pose
 
 
 def _is_closed(faces: np.ndarray, vertices: int) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.coat_mesh import DeformedCoat
 
 __all__ = ["GelSurface", "PadGrid", "summary"]
@@ -72,6 +73,8 @@ class GelSurface:
     pad_from_object, shape (B, 4, 4): pose of the object, or None when there is no object.
     coat: the same surface as a mesh that moves sideways too, where the physics simulates the gel; None elsewhere.
     ink, shape (B, Ny, Nx), float32: share of the skin that marker dots cover around each node, in [0, 1]; None without dots.
+
+    Raises ``InputError`` for arrays of another kind or shape; heights of environments that failed may be NaN.
     """
 
     grid: PadGrid
@@ -81,6 +84,19 @@ class GelSurface:
     pad_from_object: np.ndarray | None = None
     coat: DeformedCoat | None = None
     ink: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        expected = (len(self.height) if isinstance(self.height, np.ndarray) and self.height.ndim else 0, *self.grid.shape)
+        shapes = {"height": ("f", expected), "contact": ("b", expected), "contact_centre": ("f", (expected[0], 2))}
+        if self.pad_from_object is not None:
+            shapes["pad_from_object"] = ("f", (expected[0], 4, 4))
+        for name, (kind, shape) in shapes.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.dtype.kind != kind or array.shape != shape:
+                shown = (str(array.dtype), array.shape) if isinstance(array, np.ndarray) else type(array).__name__
+                kinds = {"f": "floating-point numbers", "b": "truth values"}[kind]
+                rule = f"must be an array of {kinds} of shape {shape}, as grid and height say"
+                raise InputError(f"surface.{name}", value=shown, rule=rule)
 
     def __repr__(self) -> str:
         return summary(self)

@@ -6,6 +6,7 @@ Conventions (OpenEXR technical introduction): ``R G B`` linear; ``led_red.R`` â€
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -50,10 +51,16 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
     import OpenEXR
 
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    attributes |= {HEADER_PREFIX + key: value for key, value in (header or {}).items()}
+    attributes |= {HEADER_PREFIX + key: value.encode("utf-8", "backslashreplace").decode() for key, value in (header or {}).items()}
     images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
-    with OpenEXR.File(attributes, images) as file:
-        file.write(str(path))
+    # By another file, since the library takes no path that is not UTF-8.
+    with tempfile.TemporaryDirectory() as folder, OpenEXR.File(attributes, images) as file:
+        plain = Path(folder) / "image.exr"
+        try:
+            file.write(str(plain))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+        path.write_bytes(plain.read_bytes())
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -70,6 +77,6 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             header = {k.removeprefix(HEADER_PREFIX): v for k, v in file.header().items() if k.startswith(HEADER_PREFIX)}
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise InputError("EXR file", value=path, rule=f"must be readable as OpenEXR ({error})") from error
     return channels, header

@@ -1,4 +1,4 @@
-"""Write a folder of results so that an interrupt leaves nothing half-written."""
+"""Write a folder of results so that an interrupt or a full disk leaves nothing half-written."""
 
 from __future__ import annotations
 
@@ -16,32 +16,66 @@ __all__ = ["result_folder"]
 
 @contextmanager
 def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
-    """Give a temporary folder beside ``out``; when the block ends well, move its files into ``out``, else delete them.
+    """Give a temporary folder; when the block ends well, move its files into ``out``, else delete them and leave ``out`` as it was.
 
     A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run
-    that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` moves last:
-    where it is, the rest is complete.
+    that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` goes first and
+    comes last: where it is, the rest is complete.
 
     Raises:
-        InputError: ``out`` is a file, or its folder cannot be written.
+        InputError: ``out`` is a file or a link to nothing, its folder cannot be written, it holds a folder where a file is to be written
+            (found before the block, for those that are ``owned``), or the disk is full.
     """
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError("out", value=out, rule="must be a folder, and a file of that name exists")
+    out, owned = Path(out), tuple(owned)
     try:
+        if out.is_symlink() and not out.exists():
+            raise InputError("out", value=out, rule=f"is a link to {os.readlink(out)}, which does not exist")
+        if out.exists() and not out.is_dir():
+            raise InputError("out", value=out, rule="must be a folder, and a file of that name exists")
+        _check_no_folders(out, owned)
         out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+        # Inside of a folder that exists, which may be a link or another disk, so that files need only be renamed.
+        base = Path(tempfile.mkdtemp(prefix=".raytac.", suffix=".partial", dir=out if out.is_dir() else out.parent))
     except OSError as error:
         raise InputError("out", value=out, rule=f"must be a folder that can be written ({error.strerror})") from error
+    work, old = base / "new", base / "old"
     try:
-        yield work
-        out.mkdir(exist_ok=True)
-        written = {path.name for path in work.iterdir()}
-        # The old metrics.json goes first: while the files are of two runs, none says that they are complete.
-        for name in ("metrics.json", *(name for name in owned if name not in written)):
-            if name in written or name in owned:
-                (out / name).unlink(missing_ok=True)
-        for path in sorted(work.iterdir(), key=lambda path: path.name == "metrics.json"):
-            os.replace(path, out / path.name)
+        try:
+            work.mkdir()
+            old.mkdir()
+            yield work
+            _check_no_folders(out, (path.name for path in work.iterdir()))
+            out.mkdir(exist_ok=True)
+            _move(work, old, out, owned)
+        except OSError as error:
+            ours = error.filename is None or str(base) in os.fsdecode(error.filename)
+            if not ours or isinstance(error, ConnectionError):  # a reader that went away is no matter of the folder
+                raise
+            reason = error.strerror or f"{error}: the disk may be full"
+            raise InputError("out", value=out, rule=f"cannot be written ({reason}); nothing in it has changed") from error
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(base, ignore_errors=True)
+
+
+def _check_no_folders(out: Path, names: Iterable[str]) -> None:
+    for name in names:
+        if (out / name).is_dir() and not (out / name).is_symlink():
+            raise InputError("out", value=out, rule=f"holds a folder {name!r}, where a file of that name is to be written")
+
+
+def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
+    """Put the files of ``work`` into ``out``; if one cannot be put there, all that was there before goes back from ``old``."""
+    written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
+    try:
+        for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):
+            if os.path.lexists(out / name):
+                os.replace(out / name, old / name)
+        for name in written:
+            os.replace(work / name, out / name)
+    except BaseException:
+        for name in written:
+            if not (work / name).exists():
+                (out / name).unlink(missing_ok=True)
+        for path in sorted(old.iterdir(), key=lambda path: path.name == "metrics.json"):
+            os.replace(path, out / path.name)
+        raise

@@ -77,7 +77,8 @@ def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]
         InputError: see ``check_metrics``; nothing is written then.
     """
     checked = check_metrics(values)
-    write_atomic(path, (json.dumps(checked, indent=1, ensure_ascii=False) + "\n").encode())
+    text = json.dumps(checked, indent=1, ensure_ascii=False) + "\n"
+    write_atomic(path, text.encode("utf-8", "backslashreplace"))  # a path's undecodable bytes become JSON's own escapes
     return checked
 
 

@@ -33,6 +33,12 @@ from raytac.optics.table import PolyTable, ShadowTable, TaximConstants
 __all__ = ["CALIBRATION_FILES", "load_calibration", "processed_background", "save_calibration"]
 
 CALIBRATION_FILES = ("polycalib.npz", "dataPack.npz", "gelmap.npy", "shadowTable.npz", "params.json", "raytac.npz")
+_MOST_BINS = 1024
+"""Bins a side of a table; upstream's have 80 to 125."""
+_MOST_PIXELS = 2**23
+"""Pixels of an image at rest."""
+_HEADER = 2**16
+"""Bytes that the header of an array may have."""
 _BGR = ("b", "g", "r")
 """Upstream's names of the channels red, green, blue."""
 
@@ -117,21 +123,26 @@ def _blur_matrix(n: int, sigma: float) -> np.ndarray:
     return matrix
 
 
+def _bytes(*shape: int) -> int:
+    """Most bytes of an array of float64."""
+    return 8 * math.prod(shape) + _HEADER
+
+
 def _gradients(path: Path) -> np.ndarray:
-    arrays = npz_arrays(path, ("bins", *(f"grad_{c}" for c in _BGR)))
-    bins = arrays["bins"]
-    if bins.size != 1 or bins.dtype.kind not in "iu" or not 2 <= int(bins.reshape(())) <= 4096:
-        raise CalibrationError("must be one whole number in [2, 4096]", file=path, key="bins", value=str(bins)[:40])
+    bins = npz_arrays(path, ("bins",), _HEADER)["bins"]
+    if bins.size != 1 or bins.dtype.kind not in "iu" or not 2 <= int(bins.reshape(())) <= _MOST_BINS:
+        raise CalibrationError(f"must be one whole number in [2, {_MOST_BINS}]", file=path, key="bins", value=str(bins)[:40])
     n = int(bins.reshape(()))
+    arrays = npz_arrays(path, tuple(f"grad_{c}" for c in _BGR), _bytes(n, n, 6))
     for c in _BGR:
         check_numbers(path, f"grad_{c}", arrays[f"grad_{c}"], (n, n, 6))
     return np.stack([arrays[f"grad_{c}"].astype(np.float64) for c in _BGR])
 
 
 def _image(path: Path) -> np.ndarray:
-    f0 = npz_arrays(path, ("f0",))["f0"]
+    f0 = npz_arrays(path, ("f0",), 3 * _MOST_PIXELS + _HEADER)["f0"]
     if f0.ndim != 3 or f0.shape[2] != 3 or f0.dtype != np.uint8 or min(f0.shape) < 3 or max(f0.shape) > 8192:
-        rule = "must be a uint8 image of shape (H, W, 3), 3 to 8192 pixels a side"
+        rule = f"must be a uint8 image of shape (H, W, 3), 3 to 8192 pixels a side and at most {_MOST_PIXELS} in all"
         raise CalibrationError(rule, file=path, key="f0", value=f"{f0.dtype} {f0.shape}")
     return np.ascontiguousarray(f0[..., ::-1])
 
@@ -144,7 +155,8 @@ def _gel_map(path: Path, shape: tuple[int, int]) -> np.ndarray:
 def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     """``background``, and those of ``covered``, ``surround`` and ``gradients`` that are there."""
     names = npz_names(path)
-    arrays = npz_arrays(path, ("background", *(name for name in ("covered", "surround", "gradients") if name in names)))
+    arrays = npz_arrays(path, ("background",), _bytes(*shape))
+    arrays |= npz_arrays(path, tuple(name for name in ("covered", "surround", "gradients") if name in names), _bytes(3, n, n, 6))
     if "gradients" in arrays and "surround" not in arrays:
         raise CalibrationError("must come with the array 'surround'", file=path, key="gradients", value=arrays["gradients"].shape)
     for name in {"surround", "gradients"} & set(arrays):

@@ -47,8 +47,8 @@ def npz_names(path: Path) -> set[str]:
         raise CalibrationError(f"cannot be read ({error})", file=path) from error
 
 
-def npz_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The named arrays of an .npz file; no other one is touched."""
+def npz_arrays(path: Path, names: tuple[str, ...], most: int = _LARGEST) -> dict[str, np.ndarray]:
+    """The named arrays of an .npz file, each of at most ``most`` bytes with its header; no other one is touched."""
     missing = [name for name in names if name not in npz_names(path)]
     if missing:
         raise CalibrationError(f"must hold the array {missing[0]!r}", file=path, choices=sorted(npz_names(path)))
@@ -56,8 +56,9 @@ def npz_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     for name in names:
         try:
             with zipfile.ZipFile(path) as archive:
-                if archive.getinfo(f"{name}.npy").file_size > _LARGEST:
-                    raise CalibrationError(f"must be at most {_LARGEST} bytes", file=path, key=name)
+                size = archive.getinfo(f"{name}.npy").file_size
+                if size > most:  # before it is unpacked: a small archive can hold any number of zeros
+                    raise CalibrationError(f"must be at most {most} bytes long, and is {size}", file=path, key=name)
                 data = archive.read(f"{name}.npy")
         except RaytacError:
             raise

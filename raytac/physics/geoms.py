@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.part import Part, hfield_part, mesh_part, primitive
+from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.rotation import rotation_of
 
 __all__ = ["GEOM_TYPES", "body_parts", "geom_part", "load_mjcf"]
@@ -73,14 +74,15 @@ def load_mjcf(path: str | Path) -> mujoco.MjModel:
     """Compile an MJCF or URDF file.
 
     Raises:
-        InputError: the file does not exist or MuJoCo refuses it; the message is MuJoCo's.
+        InputError: the file does not exist, asks for too much (see ``check_mjcf_size``), or MuJoCo refuses it; the message is MuJoCo's.
     """
     if not Path(path).is_file():
         raise InputError("MJCF file", value=path, rule="must exist")
+    check_mjcf_size(path)
     try:
         return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError("MJCF file", value=path, rule=f"MuJoCo refuses it: {' '.join(str(error).split())}") from error
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError("MJCF file", value=path, rule=f"MuJoCo refuses it: {' '.join(str(error).split())[:500]}") from error
 
 
 def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int, what: str, given: int | str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,8 @@ from raytac.checks import check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.gel.pad import grid_pitch, make_grid
+from raytac.gel.batch import chosen_envs
+from raytac.gel.pad import check_grid, grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
@@ -55,7 +57,8 @@ class TactileSensor:
         frame = sensor.press("coin")
         frame.rgb  # (B, H, W, 3) uint8
 
-    The optical mode is built at the first image and reused for every later one.
+    The optical mode is built at the first image and reused for every later one. ``copy.copy``, ``copy.deepcopy`` and ``pickle`` give
+    another sensor of the same settings, before any scene: renderer and simulation stay with this one.
     """
 
     spec: SensorSpec
@@ -117,6 +120,9 @@ class TactileSensor:
             SpecError: the sensor, light or calibration file breaks a rule.
             BackendError: ``device="cuda"`` where there is no CUDA or no OptiX.
         """
+        settings = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        self._settings: dict[str, Any] = settings
+        """Arguments that make this sensor again."""
         check_physics(physics, pad)
         check_optics(optics, integrator, spp, optics_options)
         resolve_device(device)
@@ -135,6 +141,8 @@ class TactileSensor:
         self.device, self.num_envs = device, num_envs
         self.pitch = grid_pitch(self.spec.camera.pitch_at(self.resolution)) if pitch is None else pitch
         self.grid = make_grid(self.spec.gelpad, self.pitch)
+        self._known_grid = self.grid
+        """Grid of the last surface, which is of this pad."""
         self._level: str | PadMesh = pad or PADS[0]
         self.markers, self._marker_perturbation = markers, marker_perturbation
         if markers is not None:
@@ -154,6 +162,20 @@ class TactileSensor:
         self._pad: RigidPad | SoftPad | None = None
         self._is_narrow = False
         """Whether this press was warned of already."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A sensor of the same settings.
+
+        Raises:
+            InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
+        """
+        if not isinstance(self._settings["optics"], str):
+            rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
+            raise InputError("optics", value=self._settings["optics"], rule=rule)
+        if self._tracker is not None:
+            rule = "cannot be copied or pickled once they have a history: make another sensor with the same arguments"
+            raise InputError("markers", value=self.markers, rule=rule)
+        return partial(type(self), **self._settings), ()
 
     @property
     def label(self) -> str:
@@ -276,9 +298,11 @@ class TactileSensor:
         ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
 
         Raises:
-            InputError: a state, and no scene was loaded, or another one than the state is of.
+            InputError: a state, and no scene was loaded, or another one than the state is of; a surface of another sensor's pad; ``envs``
+                that do not exist, or not one for each row.
         """
         start = time.perf_counter()
+        envs = None if envs is None else chosen_envs(envs, self.num_envs)
         if isinstance(state, GelSurface):
             surface, force, area, failed, unconverged = state, None, None, None, None
             forces: dict[str, Any] = {}
@@ -292,6 +316,11 @@ class TactileSensor:
             forces = pad_forces(self._pad, state, surface, self.outputs)
             self._check_width(state, forces.get("contact_cells"))
             force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
+        if surface.grid is not self._known_grid:
+            check_grid(self.spec.gelpad, surface.grid)
+            self._known_grid = surface.grid
+        if envs is not None and len(envs) != surface.batch:
+            raise InputError("envs", value=len(envs), rule=f"must name one environment for each of {surface.batch} rows")
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None

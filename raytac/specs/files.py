@@ -9,7 +9,7 @@ from typing import Final
 from raytac.assets import AssetKind, asset_root
 from raytac.errors import SpecError
 
-__all__ = ["available", "find_file", "is_file"]
+__all__ = ["available", "find_file", "is_file", "name_of"]
 
 _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "sensor": ("scenes", "sensors"),
@@ -37,6 +37,8 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
     Raises:
         SpecError: no such name (the message lists those there are), or no such file.
     """
+    if not isinstance(name_or_path, (str, Path)):
+        raise SpecError(f"must be a name or a path, not {type(name_or_path).__name__}", key=what, value=name_or_path)
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set(text) & {"/", "\\"}:
         names = available(what)
@@ -57,6 +59,11 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
             return candidate.resolve()
     shipped = ", and none of this path comes with raytac" if base is None and not path.is_absolute() else ""
     raise SpecError(f"the file does not exist{shipped}", file=candidates[0], key=what, value=text)
+
+
+def name_of(path: Path) -> str:
+    """Stem of a file as text that can be written anywhere: bytes that are no UTF-8 as ``\\udcXX``."""
+    return path.stem.encode("utf-8", "backslashreplace").decode()
 
 
 def is_file(path: Path) -> bool:

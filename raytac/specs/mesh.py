@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +63,10 @@ def _read(path: Path) -> Any:
     import trimesh
 
     try:
+        # As bytes, so that no other file is read that this one names: materials and textures do not matter, and may be anything.
         # process=False: trimesh would otherwise drop vertices that are not finite without a word.
-        mesh = trimesh.load_mesh(path, process=False, maintain_order=True)
+        data = io.BytesIO(path.read_bytes())
+        mesh = trimesh.load_mesh(data, file_type=path.suffix.lower()[1:], process=False, maintain_order=True)
     except Exception as error:  # the parsers raise whatever their format makes them stumble over
         raise MeshError(f"the mesh file cannot be read ({type(error).__name__}: {error})", file=path) from error
     if isinstance(mesh, trimesh.Scene):

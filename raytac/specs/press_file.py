@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from raytac.errors import SpecError
-from raytac.specs.files import find_file
+from raytac.specs.files import find_file, name_of
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion
@@ -51,7 +51,7 @@ def load_press(name_or_path: str | Path) -> PressScene:
     if free:
         rule = "a free body (affine) can only be laid on the pad by its weight: indent with force_n, and release"
         raise top.section("object").error(rule, "dynamics", target.dynamics)
-    return PressScene(path.stem, target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
+    return PressScene(name_of(path), target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
 
 
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from raytac.specs.files import find_file
+from raytac.specs.files import find_file, name_of
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.sensor import LED_SCHEMA, SENSOR_PARTS, SENSOR_SCHEMA, LedSpec, LightsSpec, SensorSpec
 from raytac.specs.sensor_check import validate_sensor
@@ -59,7 +59,7 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
         changes["lights"] = _read_lights(find_file("lights", head["lights"], base=path.parent))
     if head["marker_motion"]:
         changes["marker_motion"] = load_marker_motion(head["marker_motion"], base=path.parent)
-    changes |= {"name": path.stem, "source": path}
+    changes |= {"name": name_of(path), "source": path}
     return _valid(SensorSpec(**changes) if base is None else replace(base, **changes))
 
 

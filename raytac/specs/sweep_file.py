@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.errors import SpecError
-from raytac.specs.files import find_file
+from raytac.specs.files import find_file, name_of
 from raytac.specs.press_file import load_press
 from raytac.specs.sensor_file import load_sensor
 from raytac.specs.sweep import RANGE_SCHEMA, SWEEP_SCHEMA, PressRanges, SweepSpec
@@ -66,7 +66,7 @@ def load_sweep(name_or_path: str | Path) -> SweepSpec:
         raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", values["pad"])
     randomization, markers = _read_randomization(top)
     return SweepSpec(
-        path.stem,
+        name_of(path),
         sensors,
         objects,
         ranges=_read_ranges(top.section("press")),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from raytac.specs.files import find_file, is_file
+from raytac.specs.files import find_file, is_file, name_of
 from raytac.specs.shape_file import check_shape, resolved, unit_quaternion
 from raytac.specs.task import (
     BODY_SCHEMA,
@@ -67,7 +67,7 @@ def load_task(name_or_path: str | Path) -> TaskScene:
     tables = top.sections("body")
     bodies = tuple(_read_body(table) for table in tables)
     _check_names(tables, bodies)
-    return TaskScene(path.stem, robot, bodies, source=path, **values)
+    return TaskScene(name_of(path), robot, bodies, source=path, **values)
 
 
 def _read_robot(table: Table) -> RobotSpec:

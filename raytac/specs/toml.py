@@ -245,7 +245,7 @@ def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", fi
     for key, spec in schema.items():
         name, unit = split_unit(key)
         value = values.get(name)
-        if (value is None or value == ()) and value == spec.default:
+        if (value is None or (isinstance(value, tuple) and not value)) and spec.default == value:
             continue
         try:
             spec.check(value, unit)

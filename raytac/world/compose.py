@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.part import Part
+from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.objects import object_parts
 from raytac.physics.rotation import quaternion, rotation_of
 from raytac.robots.arm import Arm
@@ -173,8 +174,9 @@ def _robot(scene: TaskScene) -> tuple[_Robot, tuple[SensorSpec, ...]]:
 
 def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot:
     try:
+        check_mjcf_size(robot.model)
         spec = mujoco.MjSpec.from_file(robot.model)
-    except ValueError as error:
+    except (ValueError, mujoco.FatalError) as error:
         rule = f"must be one of raytac's robots or an MJCF file that MuJoCo reads ({' '.join(str(error).split())})"
         raise SpecError(rule, file=scene.source, key="robot.model", value=robot.model, choices=ROBOTS) from error
     if not robot.mounts:

@@ -87,6 +87,7 @@ def test_a_batch_with_dots_is_single(sensor: SensorSpec, dotted: tuple[GelSurfac
         dots,
         height=np.repeat(dots.height, 2, axis=0),
         contact=np.repeat(dots.contact, 2, axis=0),
+        contact_centre=np.repeat(dots.contact_centre, 2, axis=0),
         ink=np.concatenate([np.zeros_like(dots.ink), dots.ink]),
     )
     together = tracer.render(both).rgb

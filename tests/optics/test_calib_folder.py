@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 import os
 import pickle
@@ -324,12 +325,26 @@ def test_persistent_objects_are_refused() -> None:
         load_restricted(b"Pname\n.")
 
 
-def test_an_npz_that_unpacks_to_too_much_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("raytac.optics.npy_file._LARGEST", 1000)
+@pytest.mark.parametrize(
+    ("bins", "message"), [(8, "grad_b: must be at most 68608 bytes"), (4096, r"bins = '4096': .*\[2, 1024\]")]
+)
+def test_an_npz_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
+    folder: Path, bins: int, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight bins are 3 kB; the archive claims the 805 MB of 4,096."""
+    header = io.BytesIO()
+    np.save(header, np.int64(bins))
     with zipfile.ZipFile(folder / "polycalib.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("bins", "grad_r", "grad_g", "grad_b"):
-            archive.writestr(f"{name}.npy", bytes(5000))
-    with pytest.raises(CalibrationError, match="at most 1000 bytes"):
+        archive.writestr("bins.npy", header.getvalue())
+        for name in ("grad_r", "grad_g", "grad_b"):
+            archive.writestr(f"{name}.npy", bytes(10**6))
+    read = zipfile.ZipFile.read
+    monkeypatch.setattr(
+        zipfile.ZipFile,
+        "read",
+        lambda self, name: read(self, name) if name == "bins.npy" else pytest.fail(f"{name} was unpacked"),
+    )
+    with pytest.raises(CalibrationError, match=message):
         load_calibration(folder)
 
 
