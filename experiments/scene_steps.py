@@ -2,10 +2,10 @@
 
     python experiments/scene_steps.py --device cpu --out runs/scene_steps
 
-Every scene is played by its task's scripted policy. Where a body lies on a table it is also *pressed*: the pad goes down on it, stands still and
-then slides or rolls it at a constant speed. A contact is lost where a pad that pressed feels nothing at the end of the next control step; a
-body sinks by how far its lowest point is below the table. The control step stays the scene's: only the number of MuJoCo's steps in
-it changes.
+Every scene is played by its task's scripted policy. Where a body lies on a table it is also *pressed*: the pad goes down on it, stands
+still and then slides or rolls it at a constant speed. A contact is lost where a pad that pressed feels nothing at the end of the next
+control step; a body sinks by how far its lowest point is below the table. The control step stays the scene's: only the number of
+MuJoCo's steps in it changes.
 """
 
 from __future__ import annotations

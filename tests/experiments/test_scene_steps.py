@@ -25,9 +25,8 @@ def test_a_pad_that_stands_or_slides_keeps_its_contact_and_the_body_its_place(na
     assert played.tilt_deg is None or played.tilt_deg < 0.2
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "lift_cube_env" else pytest.mark.slow) for name in sorted(CASES)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(CASES))
 def test_scripted_policies_succeed_without_losing_a_contact(name: str) -> None:
     """A policy that lifts the pad by the force that it reads lets go of the cube once in a while; 10 ms lost it 9.5 times an episode."""
     played = play(name, "scripted", 4, 0)
