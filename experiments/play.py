@@ -89,7 +89,7 @@ def main(args: Args) -> dict[str, Metric]:
             result = _rate(args, recipe)
             low, high = result.interval
             found |= {
-                "episodes": result.episodes, "success": result.successes / result.episodes, "success_low": low,
+                "episodes": result.episodes, "failed": result.failures, "success": result.successes / result.episodes, "success_low": low,
                 "success_high": high, "return": result.mean_return, "length": result.mean_length,
             }  # fmt: skip
             print(
@@ -131,7 +131,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
         learner.restore(Checkpoint.load(Path(args.policy)))
         return evaluate(learner, args.episodes, first_seed=2 * 10**6)
     env, policy = KINDS[args.task](args.num_envs, tactile=None), SCRIPTED[args.task]
-    returns, lengths, successes = [], [], 0
+    returns, lengths, successes, failures = [], [], 0, 0
     while len(returns) < args.episodes:
         env.reset(seed=HELD_OUT + 2 * 10**6 + len(returns))
         running, earned, steps = np.ones(env.num_envs, bool), np.zeros(env.num_envs), 0
@@ -142,8 +142,9 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
             returns += earned[ended].tolist()
             lengths += [steps] * int(ended.sum())
             successes += int(infos["success"][ended].sum())
+            failures += int(infos["failed"][ended].sum())
             running &= ~ended
-    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
 
 
 def _film(args: Args, recipe: Recipe | None) -> Film:

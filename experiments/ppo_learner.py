@@ -101,6 +101,8 @@ class Evaluation:
     successes: int
     mean_return: float
     mean_length: float
+    failures: int
+    """Episodes that ended because the physics broke down."""
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -346,7 +348,7 @@ def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluat
     env = learner.model.get_env()
     assert env is not None
     learner.normaliser.training = False
-    returns, lengths, successes = [], [], 0
+    returns, lengths, successes, failures = [], [], 0, 0
     try:
         while len(returns) < episodes:
             env.seed(HELD_OUT + first_seed + len(returns))
@@ -357,7 +359,8 @@ def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluat
                     returns.append(infos[b]["episode"]["r"])
                     lengths.append(infos[b]["episode"]["l"])
                     successes += infos[b]["success"]
+                    failures += infos[b]["failed"]
                 running &= ~done
     finally:
         learner.normaliser.training = True
-    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
