@@ -42,6 +42,7 @@ def test_wrench_traction_and_area_mean_the_same(frames, physics):
     assert frame.wrench[0, 2] < -0.2
     assert frame.contact_area[0] == pytest.approx(frame.surface.contact.sum() * 0.2e-3**2, rel=0.01)
     assert (frame.force_law_area is None) == (physics == "ipc")
+    assert (None if frame.unconverged is None else frame.unconverged.tolist()) == ([0] if physics == "ipc" else None)
 
 
 def test_both_pads_make_about_the_same_press(frames):
