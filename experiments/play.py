@@ -52,8 +52,8 @@ class Args(CommonOptions):
     mp4: bool = False
     """Write the film as MP4 by ffmpeg instead of as GIF."""
     optics: str = "raytrace"
-    """Optical model of the sensors' images in the film: ``raytrace`` (the sensor's own colours), ``taxim`` (nearly these, by a table that is
-    baked at first use: minutes) or ``phong`` (quicker, in colours of its own). The policy is not given them; if it was trained with
+    """Optical model of the sensors' images in the film: ``raytrace`` (the sensor's own colours), ``taxim`` (nearly these, by a table
+    that is baked at first use: minutes) or ``phong`` (quicker, in colours of its own). The policy is not given them; if it was trained with
     images, the film shows those."""
 
 
