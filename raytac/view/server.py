@@ -100,7 +100,10 @@ def _refuse_others(addresses: PageAddresses, serve_files: Callable[..., Any] | N
         if reason:
             _LOG.info("refused %s: %s", _who(connection), reason)
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"raytac view: {reason}.\n")
-        return serve_files(connection, request) if serve_files is not None else None
+        response = serve_files(connection, request) if serve_files is not None else None
+        if response is not None:  # no other page may show this one in a frame and have users click on it unawares
+            response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
+        return response
 
     return process
 

@@ -9,6 +9,7 @@ import logging
 import os
 import socket
 import time
+import urllib.request
 from collections.abc import Iterator
 
 import msgspec
@@ -64,6 +65,11 @@ def test_the_pages_own_addresses_are_answered(viewer, name):
     assert answer(viewer, own) == 200
     assert answer(viewer, own, upgrade=True) == 101  # a program that is no browser sends no Origin
     assert answer(viewer, own, f"http://{own}", upgrade=True) == 101
+
+
+def test_other_pages_may_not_show_this_one_in_a_frame(viewer):
+    with urllib.request.urlopen(viewer.url) as page:
+        assert page.headers["Content-Security-Policy"] == "frame-ancestors 'self'" and b"<html" in page.read()
 
 
 @pytest.mark.parametrize(
