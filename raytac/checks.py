@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from raytac.errors import InputError
 
 __all__ = [
+    "MOST_ENVIRONMENTS",
     "Interval",
+    "check_kind",
     "check_known",
+    "check_mapping",
     "check_methods",
+    "check_names",
     "check_number",
     "check_numbers",
     "check_seed",
     "check_seeds",
+    "check_truth",
     "check_whole",
     "is_number",
     "is_whole",
 ]
+
+_T = TypeVar("_T")
+MOST_ENVIRONMENTS = 2**24
+"""Environments that one sensor, world or observer can have."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,26 @@ def check_known(name: str, value: object, choices: Sequence[str]) -> str:
     return value
 
 
+def check_names(name: str, values: object, choices: Sequence[str]) -> tuple[str, ...]:
+    """One of ``choices`` or a sequence of them."""
+    if not isinstance(values, (str, Sequence)) or isinstance(values, (bytes, bytearray)):
+        raise InputError(name, value=values, rule="must be a known name, or a sequence of them", choices=choices)
+    return tuple(check_known(name, value, choices) for value in ((values,) if isinstance(values, str) else values))
+
+
+def check_truth(name: str, value: object) -> bool:
+    """True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(name, value=value, rule="must be True or False")
+    return bool(value)
+
+
+def check_mapping(name: str, value: object) -> None:
+    """Refuse what is no mapping of names to values."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise InputError(name, value=value, rule="must be a mapping of names to values")
+
+
 def check_whole(name: str, value: object, low: int = 1, high: int | None = None) -> int:
     """A whole number of at least ``low`` and at most ``high``."""
     if not is_whole(value) or value < low or (high is not None and value > high):  # type: ignore[operator]
@@ -73,9 +103,13 @@ def check_whole(name: str, value: object, low: int = 1, high: int | None = None)
 
 def check_number(name: str, value: object, interval: str, unit: str = "") -> float:
     """A real number in an interval such as ``(0, inf)``."""
-    if not is_number(value) or value not in Interval.parse(interval):  # type: ignore[operator]
+    try:
+        number = float(value) if is_number(value) else float("nan")  # type: ignore[arg-type]
+    except OverflowError:  # an integer beyond all floats
+        number = float("nan")
+    if number not in Interval.parse(interval):
         raise InputError(name, value=value, rule=f"must be a number in {interval}{' ' + unit if unit else ''}")
-    return float(value)  # type: ignore[arg-type]
+    return number
 
 
 def check_seed(name: str, value: object) -> int:
@@ -87,10 +121,11 @@ def check_seed(name: str, value: object) -> int:
 
 def check_seeds(name: str, values: object, count: int) -> list[int]:
     """Whole numbers >= 0, one for each of ``count`` environments."""
-    if not isinstance(values, (Sequence, np.ndarray)) or isinstance(values, (str, bytes)) or len(values) != count:
-        size = len(values) if isinstance(values, (Sequence, np.ndarray)) else values
-        raise InputError(name, value=size, rule=f"must be whole numbers >= 0, one for each of {count} environments")
-    return [check_whole(f"{name}[{i}]", value, 0) for i, value in enumerate(values)]
+    given = values.tolist() if isinstance(values, np.ndarray) else values
+    if not isinstance(given, Sequence) or isinstance(given, (str, bytes)) or len(given) != count:
+        rule = f"must be whole numbers >= 0, one for each of {count} environments"
+        raise InputError(name, value=len(given) if isinstance(given, Sequence) else given, rule=rule)
+    return [check_whole(f"{name}[{i}]", value, 0) for i, value in enumerate(given)]
 
 
 def check_numbers(name: str, values: object, shape: tuple[int | None, ...], *, finite: bool = False) -> np.ndarray:
@@ -113,6 +148,13 @@ def check_numbers(name: str, values: object, shape: tuple[int | None, ...], *, f
     if finite and not np.isfinite(array).all():
         raise InputError(name, value=float(array[~np.isfinite(array)][0]), rule="must be finite everywhere")
     return array
+
+
+def check_kind(name: str, value: object, kind: type[_T]) -> _T:
+    """An instance of ``kind``."""
+    if not isinstance(value, kind):
+        raise InputError(name, value=value, rule=f"must be a {kind.__name__}, not {type(value).__name__}")
+    return value
 
 
 def check_methods(name: str, value: object, methods: Sequence[str], attributes: Sequence[str], what: str) -> None:

@@ -49,7 +49,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
         InputError: ``device`` is not one of ``DEVICES``.
         BackendError: ``"cuda"`` was asked for and does not work here.
     """
-    if device not in DEVICES:
+    if not isinstance(device, str) or device not in DEVICES:
         raise InputError("device", value=device, rule="must be a known device", choices=DEVICES)
     if device == "cpu":
         return "cpu"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.checks import check_number
+from raytac.checks import check_kind, check_number
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.specs.sensor import GelpadSpec
@@ -54,6 +54,7 @@ def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
     edges. Raises ``InputError`` if the pitch is not positive and finite, or leaves fewer than two cells along an axis or more than
     ``MOST_CELLS``.
     """
+    check_kind("gelpad", gelpad, GelpadSpec)
     check_number("pitch", pitch, "(0, inf)", "m")
     for axis, size in zip("xy", gelpad.size, strict=True):
         if not 1.5 <= size / pitch <= MOST_CELLS:

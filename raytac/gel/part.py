@@ -55,9 +55,9 @@ class Part:
 
 def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndarray | None = None) -> Part:
     """A part without arrays; raises ``InputError`` for an unknown kind or a size that is not positive and finite."""
-    if kind not in _SIZES:
+    if not isinstance(kind, str) or kind not in _SIZES:
         raise InputError("kind", value=kind, rule="must be a primitive (mesh: mesh_part, hfield: hfield_part)", choices=_SIZES)
-    given, size = size, tuple(float(s) for s in size[: _SIZES[kind]])
+    given, size = size, tuple(check_numbers("size", size, (None,))[: _SIZES[kind]].tolist())
     positive = size[:2] if kind == "cone" else size
     if (
         len(size) != _SIZES[kind]
@@ -100,6 +100,7 @@ def hfield_part(size: tuple[float, ...], elevation: np.ndarray, object_from_part
     ``size`` [m]: half widths along x and y, elevation at data value 1, depth of the base below z = 0. ``elevation``: MuJoCo's
     normalised data in [0, 1], shape (nrow, ncol), rows along y.
     """
+    size = tuple(check_numbers("size", size, (4,), finite=True).tolist())
     data = check_numbers("elevation", elevation, (None, None))
     if min(data.shape) < 2 or not np.isfinite(data).all():
         raise InputError("elevation", value=data.shape, rule="must be finite, with at least 2 rows and 2 columns")

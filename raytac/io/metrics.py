@@ -90,8 +90,10 @@ def read_metrics(path: Path) -> dict[str, Metric]:
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError("metrics file", value=path, rule=f"must be JSON ({error})") from error
+    except OSError as error:
+        raise InputError("metrics file", value=path, rule=f"cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, an integer too long, or nested too deep
+        raise InputError("metrics file", value=path, rule=f"must be JSON ({str(error)[:200]})") from error
     if not isinstance(values, dict):
         raise InputError("metrics file", value=path, rule="must hold one JSON object")
     return check_metrics(values)

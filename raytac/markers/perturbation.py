@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from raytac.checks import is_number
 from raytac.errors import InputError
 
 __all__ = ["MarkerPerturbation", "Perturber"]
@@ -31,7 +32,7 @@ class MarkerPerturbation:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not (np.isfinite(value) and value >= 0.0) or (field.name == "dropout" and value >= 1.0):
+            if not (is_number(value) and 0.0 <= value < (1.0 if field.name == "dropout" else np.inf)):
                 rule = "must be a probability in [0, 1)" if field.name == "dropout" else "must be finite and >= 0"
                 raise InputError(field.name, value=value, rule=rule)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from raytac.checks import check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_kind, check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.batch import chosen_envs, rounded_envs
@@ -66,9 +66,12 @@ class TactileObserver:
         Raises:
             InputError: markers of a sensor without, an image too large, or a number out of range.
         """
-        check_whole("num_envs", num_envs)
-        self.settings = ObservationSettings() if settings is None else settings
-        self.randomization = Randomization() if randomization is None else randomization
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
+        seed = check_whole("seed", seed, 0)
+        self.settings = ObservationSettings() if settings is None else check_kind("settings", settings, ObservationSettings)
+        self.randomization = (
+            Randomization() if randomization is None else check_kind("randomization", randomization, Randomization)
+        )
         self.sensor = randomised_sensor(sensor_spec(sensor), self.randomization, seed)
         self.num_envs, self.seed = num_envs, seed
         self.layout = image_layout(self.sensor, self.settings)

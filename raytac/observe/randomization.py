@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.specs.sensor import SensorSpec
@@ -64,12 +65,14 @@ class Randomization:
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name == "markers":
+                if not isinstance(value, MarkerPerturbation):
+                    raise InputError("markers", value=value, rule="must be a MarkerPerturbation")
                 continue
             absolute, most = item.name in _ABSOLUTE, _ABSOLUTE.get(item.name, 1.0)
             rule = "must be 0 or more, and finite" if absolute else "must be in [0, 1): a half width relative to 1"
             if absolute and np.isfinite(most):
                 rule = f"must be in [0, {most:g}) m or rad"
-            if not (np.isfinite(value) and 0.0 <= value < most):
+            if not (is_number(value) and 0.0 <= value < most):
                 raise InputError(item.name, value=value, rule=rule)
 
     @property

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from raytac.checks import check_whole
+from raytac.checks import check_known, check_mapping, check_names, check_truth, check_whole, is_number, is_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
-from raytac.sensor.options import LARGEST_SIDE, checked_resolution
+from raytac.markers import MARKER_MODELS
+from raytac.sensor.options import LARGEST_SIDE, OPTICS, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
@@ -68,10 +69,7 @@ class ObservationSettings:
     """As of ``TactileSensor``."""
 
     def __post_init__(self) -> None:
-        given = (self.modalities,) if isinstance(self.modalities, str) else tuple(self.modalities)
-        for name in given:
-            if name not in MODALITIES:
-                raise InputError("modalities", value=name, rule="must be a known modality", choices=MODALITIES)
+        given = check_names("modalities", self.modalities, MODALITIES)
         if not given or len(set(given)) != len(given):
             raise InputError("modalities", value=given, rule="must name one or more, none twice", choices=MODALITIES)
         object.__setattr__(self, "modalities", tuple(m for m in MODALITIES if m in given))
@@ -84,22 +82,25 @@ class ObservationSettings:
             raise InputError("map_shape", value=self.map_shape, rule="must be (rows, columns)")
         for count in self.map_shape:
             check_whole("map_shape", count)
-        if self.crop != "centre":
+        if not isinstance(self.crop, str) or self.crop != "centre":
             sides = self.crop
-            if (
-                isinstance(sides, str)
-                or len(sides) != 4
-                or any(not isinstance(n, int) or isinstance(n, bool) or n < 0 for n in sides)
-            ):
+            if not isinstance(sides, (tuple, list)) or len(sides) != 4 or not all(is_whole(n) and n >= 0 for n in sides):
                 rule = "must be 'centre', or pixels cut off at left, top, right and bottom, each 0 or more"
                 raise InputError("crop", value=sides, rule=rule)
+        for name in ("difference", "normalise"):
+            check_truth(name, getattr(self, name))
+        check_known("optics", self.optics, OPTICS)
+        check_known("marker_model", self.marker_model, MARKER_MODELS)
+        for name in ("scales", "optics_options"):
+            check_mapping(name, getattr(self, name))
         if self.difference and "rgb" not in self.modalities:
             raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
         for name, scale in self.scales.items():
             if name not in SCALES:
                 raise InputError("scales", value=name, rule="must be a modality that has a unit", choices=tuple(SCALES))
-            values = (scale,) if isinstance(scale, (int, float)) else tuple(scale)
-            if len(values) not in ((1, 6) if name == "wrench" else (1,)) or not all(math.isfinite(v) and v > 0.0 for v in values):
+            values = scale if isinstance(scale, (tuple, list)) else (scale,)
+            count = (1, 6) if name == "wrench" else (1,)
+            if len(values) not in count or not all(is_number(v) and 0.0 < v < math.inf for v in values):
                 raise InputError(f"scales[{name!r}]", value=scale, rule="must be positive and finite: one, or six of a wrench")
 
     def scale(self, modality: str) -> float | tuple[float, ...]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from raytac.checks import check_number, check_numbers, check_whole
 from raytac.errors import InputError
 
 __all__ = ["BakeSettings"]
@@ -40,21 +39,13 @@ class BakeSettings:
 
     def __post_init__(self) -> None:
         for name, lowest in (("images", 1), ("balls", 1), ("n_bins", 3), ("pins", 0)):
-            value = getattr(self, name)
-            if int(value) != value or value < lowest:
-                raise InputError(f"bake.{name}", value=value, rule=f"must be a whole number >= {lowest}")
+            check_whole(f"bake.{name}", getattr(self, name), lowest)
         for name in ("radius", "depth", "pin_radius"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high < np.inf:
-                raise InputError(f"bake.{name}", value=(low, high), rule="must be (low, high) with 0 < low <= high [m]")
-        for name, low, high in (
-            ("deepest_share", 0.0, 1.0),
-            ("bare_share", 0.0, 1.0),
-            ("neighbours", 0.0, 1.0),
-            ("ridge", 0.0, 1.0),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"bake.{name}", value=getattr(self, name), rule=f"must be in [{low:g}, {high:g}]")
+            low, high = check_numbers(f"bake.{name}", getattr(self, name), (2,), finite=True)
+            if not 0 < low <= high:
+                raise InputError(f"bake.{name}", value=getattr(self, name), rule="must be (low, high) with 0 < low <= high [m]")
+        for name in ("deepest_share", "bare_share", "neighbours", "ridge"):
+            check_number(f"bake.{name}", getattr(self, name), "[0, 1]")
 
     @classmethod
     def quick(cls) -> BakeSettings:

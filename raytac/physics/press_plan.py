@@ -15,10 +15,12 @@ from raytac.physics.objects import object_parts
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["CLEARANCE", "about_z", "check_trajectory", "peak_state", "per_environment", "scene_parts"]
+__all__ = ["CLEARANCE", "MOST_STEPS", "about_z", "check_trajectory", "peak_state", "per_environment", "scene_parts"]
 
 CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before the press and after a release."""
+MOST_STEPS = 1_000_000
+"""States that a stage can be asked for."""
 _State = TypeVar("_State", bound=ContactState)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from raytac.checks import check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_whole
 from raytac.errors import InputError, SpecError
 from raytac.physics.press_plan import per_environment
 from raytac.physics.rotation import rotation_of
@@ -51,7 +51,7 @@ class PressTargets:
         Raises:
             InputError: ``num_envs`` below 1, an argument of another shape, or a quaternion of zeros.
         """
-        check_whole("num_envs", num_envs)
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         self.offsets = per_environment("offsets", offsets, (num_envs, 2))
         self.depths = None if depths is None else per_environment("depths", depths, (num_envs,))
         self._shears = None if shears is None else per_environment("shears", shears, (num_envs, 2))

@@ -20,6 +20,7 @@ from raytac.physics.first_touch import first_touch
 from raytac.physics.load_law import LoadLaw
 from raytac.physics.press_plan import (
     CLEARANCE,
+    MOST_STEPS,
     about_z,
     check_trajectory,
     peak_state,
@@ -120,7 +121,7 @@ class RigidPad:
                 start over the pad or is sheared or twisted off it; names the scene's file and key.
             InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
         """
-        check_whole("steps_per_stage", steps_per_stage)
+        check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self._environments = [self._start(b) for b in range(self.num_envs)] if self.parts else []
         yield self._state(-1, "start", 1.0)
         for index, stage in enumerate(self.scene.trajectory):
@@ -136,7 +137,7 @@ class RigidPad:
             InputError: ``steps`` below 1, or a stage that presses deeper than the pad or takes the object off it.
             SpecError: a scene without object, or a stage that no pad can follow.
         """
-        check_whole("steps", steps)
+        check_whole("steps", steps, 1, MOST_STEPS)
         check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
         if not self._environments:
             self._environments = [self._start(b) for b in range(self.num_envs)]

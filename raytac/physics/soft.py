@@ -18,6 +18,7 @@ from raytac.gel.traction import CoatTraction
 from raytac.physics.contact_state import ContactState
 from raytac.physics.press_plan import (
     CLEARANCE,
+    MOST_STEPS,
     check_trajectory,
     peak_state,
     scene_parts,
@@ -132,7 +133,7 @@ class SoftPad:
         Raises:
             InputError: ``steps_per_stage`` below 1.
         """
-        check_whole("steps_per_stage", steps_per_stage)
+        check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self.reset()
         with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as bar:
             if self._drive is not None:
@@ -149,7 +150,7 @@ class SoftPad:
             InputError: ``steps`` below 1, or a stage deeper than any of the scene's: there the object's surface was left out.
             SpecError: a scene without object, or a stage that no pad can follow.
         """
-        check_whole("steps", steps)
+        check_whole("steps", steps, 1, MOST_STEPS)
         if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
             rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"
             raise InputError("stage", value=stage, rule=rule)

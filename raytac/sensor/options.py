@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from raytac.checks import check_known, check_methods, check_whole
+from raytac.checks import check_known, check_mapping, check_methods, check_names, check_whole
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
@@ -65,8 +65,8 @@ def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, op
         check_known("optics", optics, OPTICS)
     else:
         check_methods("optics", optics, ("render",), ("label", "device"), f"one of {', '.join(OPTICS)}, or an OpticalMode")
-    if options is not None and not (isinstance(options, Mapping) and all(isinstance(name, str) for name in options)):
-        raise InputError("optics_options", value=options, rule="must be a mapping of names to values")
+    if options is not None:
+        check_mapping("optics_options", options)
     check_known("integrator", integrator, INTEGRATORS)
     if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
         raise InputError(
@@ -81,11 +81,8 @@ def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, op
 
 def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> tuple[str, ...]:
     """The names in the order of ``OUTPUTS``. Raises ``InputError`` for one that is unknown or that ``optics`` does not make."""
-    if not isinstance(outputs, (str, Sequence)):
-        raise InputError("outputs", value=outputs, rule="must be a sequence of names, as in ('rgb',)", choices=OUTPUTS)
-    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    outputs = check_names("outputs", outputs, OUTPUTS)
     for name in outputs:
-        check_known("outputs", name, OUTPUTS)
         if isinstance(optics, str) and name not in sensor_outputs(optics):
             rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
             raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from raytac.checks import check_seed, check_seeds, check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
@@ -128,7 +128,7 @@ class TactileSensor:
         resolve_device(device)
         self.outputs = checked_outputs(outputs, optics)
         check_markers(markers, marker_perturbation, physics)
-        check_whole("num_envs", num_envs)
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
         self.seed = check_seed("seed", seed)

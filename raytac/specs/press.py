@@ -94,13 +94,14 @@ class ObjectSpec:
     """Of a soft object."""
 
     def __post_init__(self) -> None:
-        if self.kind not in OBJECT_SCHEMA:
+        if not isinstance(self.kind, str) or self.kind not in OBJECT_SCHEMA:
             raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_SCHEMA))
         if self.kind == "none":
             return
         check_params(self.kind, self.params, OBJECT_SCHEMA[self.kind], "object")
-        # z is not used, and a file does not give it.
-        place = self.position[:2] if isinstance(self.position, (tuple, list)) and len(self.position) == 3 else self.position
+        if not isinstance(self.position, (tuple, list)) or len(self.position) != 3:
+            raise SpecError("must be three numbers, of which the last is not used", key="object.position_mm", value=self.position)
+        place = self.position[:2]  # as a file gives it
         own = {key: rule for key, rule in POSE_SCHEMA.items() if key != "quaternion_wxyz"}
         check_fields(vars(self) | {"position": place}, own, "object")
         check_quaternion(self.quaternion, "object.quaternion_wxyz")
@@ -124,9 +125,9 @@ class StageSpec:
     """Time that the leg takes [s]."""
 
     def __post_init__(self) -> None:
-        if self.kind not in STAGE_SCHEMA:
+        if not isinstance(self.kind, str) or self.kind not in STAGE_SCHEMA:
             raise SpecError("must be a known kind of stage", key="trajectory.kind", value=self.kind, choices=tuple(STAGE_SCHEMA))
-        check_fields(vars(self), STAGE_SCHEMA[self.kind], "trajectory")
+        check_fields(vars(self), {key: rule for schema in STAGE_SCHEMA.values() for key, rule in schema.items()}, "trajectory")
         if self.kind == "indent" and (self.depth is None) == (self.force is None):
             rule = "an indent needs exactly one of depth_mm and force_n"
             raise SpecError(rule, key="trajectory", value=(self.depth, self.force))

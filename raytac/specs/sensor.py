@@ -363,5 +363,9 @@ class SensorSpec:
             value = getattr(self, name)
             if not isinstance(value, kind):
                 raise SpecError(f"must be a {kind.__name__}", file=self.source, key=name, value=value)
+        if not isinstance(self.lights, LightsSpec):
+            raise SpecError("must be a LightsSpec", file=self.source, key="lights", value=self.lights)
+        if not isinstance(self.marker_motion, (MarkerMotionSpec, type(None))):
+            raise SpecError("must be a MarkerMotionSpec or None", file=self.source, key="marker_motion", value=self.marker_motion)
         if self.marker_motion is not None:  # while one is fitted, it may leave its ranges
             self.marker_motion.check()

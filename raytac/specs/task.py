@@ -195,7 +195,7 @@ class BodySpec:
     """Linear red, green, blue in [0, 1] for pictures."""
 
     def __post_init__(self) -> None:
-        if self.kind not in SHAPE_SCHEMA:
+        if not isinstance(self.kind, str) or self.kind not in SHAPE_SCHEMA:
             raise SpecError("must be a known kind of body", key="body.kind", value=self.kind, choices=tuple(SHAPE_SCHEMA))
         check_params(self.kind, self.params, SHAPE_SCHEMA[self.kind], "body")
         check_fields(vars(self), _unturned(BODY_SCHEMA), "body")

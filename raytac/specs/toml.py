@@ -79,7 +79,10 @@ class Unit:
             return [self.shown(item) for item in value]
         if not is_number(value) or self == Unit():
             return value
-        return float(f"{float(value) * self.denominator / self.numerator:.6g}")
+        try:
+            return float(f"{float(value) * self.denominator / self.numerator:.6g}")
+        except OverflowError:  # an integer beyond all floats
+            return value
 
 
 def split_unit(key: str) -> tuple[str, Unit]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from raytac.checks import check_numbers, check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_numbers, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
@@ -100,7 +100,7 @@ class TactileWorld:
             BackendError: the solver or a renderer is not installed.
         """
         check_physics(physics, pad)
-        check_whole("num_envs", num_envs)
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         if coupling is not None and coupling not in COUPLINGS:
             raise InputError("coupling", value=coupling, rule="must be a known coupling", choices=COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
