@@ -1,4 +1,4 @@
-"""The hard cases of experiments/hard_cases.py: surfaces apart after every step, elements upright, iterations bounded, and what each says."""
+"""The hard cases of experiments/hard_cases.py: surfaces apart after every step, elements upright, bounded iterations, what each says."""
 
 from __future__ import annotations
 
