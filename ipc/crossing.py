@@ -27,7 +27,7 @@ def _whole(x: Floats) -> NDArray[np.object_]:
     """Coordinates (n, k, dim) as whole numbers, each of the n sets times a power of two of its own."""
     mantissa, exponent = np.frexp(x)
     digits = np.ldexp(mantissa, 53).astype(np.int64)
-    exponent = np.where(digits == 0, np.iinfo(np.int64).max, exponent)
+    exponent = np.where(digits == 0, np.iinfo(exponent.dtype).max, exponent)
     shift = np.where(digits == 0, 0, exponent - exponent.min(axis=(1, 2), keepdims=True))
     return np.left_shift(digits.astype(object), shift.astype(object))
 
