@@ -69,6 +69,7 @@ def main(args: Args) -> int:
         metrics |= {
             f"{name}.min_det_f": worst.min_det,
             f"{name}.max_newton": worst.max_newton,
+            f"{name}.mean_newton": worst.newton / worst.steps,
             f"{name}.unconverged": worst.unconverged,
             f"{name}.crossed": worst.crossed,
             f"{name}.steps": worst.steps,

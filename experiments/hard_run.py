@@ -33,6 +33,8 @@ class Worst:
     min_gap: float = math.inf
     min_det: float = math.inf
     max_newton: int = 0
+    newton: int = 0
+    """Newton iterations of all steps."""
     unconverged: int = 0
     jams: bool = False
     """Whether steps may end without having converged: what moves is pushed against what cannot give way."""
@@ -50,6 +52,7 @@ class Worst:
         self.min_gap = min(self.min_gap, float(report.min_gap.min()))
         self.min_det = min(self.min_det, float(report.min_det.min()))
         self.max_newton = max(self.max_newton, int(report.newton.max()))
+        self.newton += int(report.newton.max())
         self.unconverged += int((~report.converged).sum())
         self.blocked = max(self.blocked, float(report.blocked.max()))
         self.touched += bool(report.pairs.any())
@@ -65,6 +68,7 @@ class Worst:
         self.world, self.jams = other.world, other.jams
         self.min_gap, self.min_det = min(self.min_gap, other.min_gap), min(self.min_det, other.min_det)
         self.max_newton, self.blocked = max(self.max_newton, other.max_newton), max(self.blocked, other.blocked)
+        self.newton += other.newton
         self.unconverged += other.unconverged
         self.steps += other.steps
         self.touched += other.touched
