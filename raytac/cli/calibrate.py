@@ -103,7 +103,9 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split)
+        sensor, presses, shots, doubtful = read_data(
+            Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split, self.device
+        )
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
         for name in doubtful:
             print(f"the circle of press {name} is doubtful")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_resolution
 from raytac.markers import MARKER_MODELS
@@ -27,7 +28,7 @@ _OUTPUTS = ("rgb", "wrench", "traction")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewArgs:
+class ViewArgs(ShadowOptions):
     """Show a scene in the browser: 3-D view, tactile images, play, pause and step, and sliders that press or steer; needs raytac[view].
 
     Prints the address to open and serves until Ctrl-C. On another machine: ssh -L 8080:127.0.0.1:8080 HOST, then open
@@ -99,7 +100,13 @@ class ViewArgs:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
         pad = self.pad or scene.pad if physics == "ipc" else self.pad
         sensor = TactileSensor(
-            self.sensor or "gelsight_mini", physics=physics, pad=pad, outputs=_OUTPUTS, seed=self.seed, **self._settings()
+            self.sensor or "gelsight_mini",
+            physics=physics,
+            pad=pad,
+            outputs=_OUTPUTS,
+            seed=self.seed,
+            optics_options=self.chosen_shadows(self.optics),
+            **self._settings(),
         )
         return PressSession(sensor, scene)
 
@@ -112,7 +119,14 @@ class ViewArgs:
         if self.sensor is not None:
             scene = replace(scene, robot=replace(scene.robot, sensor=self.sensor))
         world = TactileWorld(
-            scene, physics=physics, pad=self.pad, coupling=self.coupling, outputs=_OUTPUTS, seed=self.seed, **self._settings()
+            scene,
+            physics=physics,
+            pad=self.pad,
+            coupling=self.coupling,
+            outputs=_OUTPUTS,
+            seed=self.seed,
+            sensor_options={"optics_options": self.chosen_shadows(self.optics)},
+            **self._settings(),
         )
         return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
 

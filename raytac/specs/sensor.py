@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
+from raytac.errors import SpecError
 from raytac.specs.marker_motion import MarkerMotionSpec
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
 __all__ = [
+    "AUTO",
     "BONDED",
     "CameraSpec",
     "CaseSpec",
@@ -25,11 +27,14 @@ __all__ = [
     "LedSpec",
     "LightsSpec",
     "MarkerSpec",
+    "OpticsSpec",
     "RefractionSpec",
     "ResponseSpec",
     "SensorSpec",
 ]
 
+AUTO: Final = "auto"
+"""In place of an exposure: that which makes the image at rest mid-grey."""
 BONDED = ("back", "back_and_sides")
 """Faces of a gelpad that the case can hold."""
 
@@ -113,8 +118,9 @@ class CameraSpec:
 class ResponseSpec:
     """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ)."""
 
-    exposure: float
-    """Common gain from radiance [W/(m² sr), relative] to full scale 1."""
+    exposure: float | Literal["auto"]
+    """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
+    (``raytac.optics.exposure``), which whoever renders finds."""
     white_balance: Vec3
     """Gain of each channel after the exposure."""
     gamma: float
@@ -130,6 +136,17 @@ class ResponseSpec:
     (n + 1)(n + 2)/2 of them for the degree n, or none for a gain of 1."""
     shading_green: tuple[float, ...] = ()
     shading_blue: tuple[float, ...] = ()
+
+    @property
+    def gain(self) -> float:
+        """The exposure as a number.
+
+        Raises:
+            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.raytrace.with_exposure``).
+        """
+        if self.exposure == AUTO:
+            raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)
+        return self.exposure
 
     @property
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
@@ -177,6 +194,14 @@ class RefractionSpec:
     """Refractive index of gel and plate (one medium)."""
     plate_thickness: float
     """Thickness of the support plate behind the gelpad [m]."""
+
+
+@dataclass(frozen=True)
+class OpticsSpec:
+    """How images are made of the sensor where its geometry leaves a choice: as its lights were fitted."""
+
+    shadows: bool = True
+    """Whether what rises casts shadows on the coat, in every optical mode that can cast them and is not told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +256,7 @@ class SensorSpec:
     markers: MarkerSpec
     refraction: RefractionSpec
     lights: LightsSpec
+    optics: OpticsSpec = OpticsSpec()
     marker_motion: MarkerMotionSpec | None = None
     """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
     source: Path | None = None

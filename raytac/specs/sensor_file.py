@@ -10,6 +10,7 @@ from typing import Any, Final
 from raytac.specs.files import find_file
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.sensor import (
+    AUTO,
     BONDED,
     CameraSpec,
     CaseSpec,
@@ -18,12 +19,13 @@ from raytac.specs.sensor import (
     LedSpec,
     LightsSpec,
     MarkerSpec,
+    OpticsSpec,
     RefractionSpec,
     ResponseSpec,
     SensorSpec,
 )
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.toml import ANY, Integer, Number, Schema, Table, Text, read_toml
+from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Table, Text, read_toml
 
 __all__ = ["LED_SCHEMA", "SENSOR_SCHEMA", "load_lights", "load_sensor", "with_lights"]
 
@@ -58,7 +60,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "principal_point_px": Number("[-8192, 16384]", length=2),
     },
     "response": {
-        "exposure": Number("(0, 1e9]"),
+        "exposure": Number("(0, 1e9]", word=AUTO),
         "white_balance": Number("(0, 100]", length=3),
         "gamma": Number("[0.5, 5]"),
         "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
@@ -80,6 +82,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "ior": Number("[1, 3]"),
         "plate_thickness_mm": Number("[0, 50]"),
     },
+    "optics": {"shadows": Flag(default=True)},
 }
 """Table (``""``: the top of the file) to its keys."""
 
@@ -91,7 +94,10 @@ _PARTS: Final = {
     "response": ResponseSpec,
     "markers": MarkerSpec,
     "refraction": RefractionSpec,
+    "optics": OpticsSpec,
 }
+_MAY_LACK: Final = ("optics",)
+"""Tables that a file without a base need not give."""
 
 LED_SCHEMA: Final[Schema] = {
     "name": _NAME,
@@ -138,7 +144,7 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
     if base is not None:
         schema["lights"] = Text(default="")
     head = top.read(schema, sections=tuple(parts))
-    given = [name for name in parts if base is None or name in top.data]
+    given = [name for name in parts if name in top.data or (base is None and name not in _MAY_LACK)]
     changes: dict[str, Any] = {name: _PARTS[name](**top.section(name).read(parts[name])) for name in given}
     if head["lights"]:
         changes["lights"] = _read_lights(find_file("lights", head["lights"], base=path.parent))
