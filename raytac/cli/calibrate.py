@@ -52,7 +52,7 @@ class CalibrateArgs(SolverOptions):
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat while it is fitted."""
+    """Whether the ray tracer casts shadows on the coat while it is fitted; sensor.toml says so, and is rendered so."""
     shadow_table: Literal["none", "raytrace"] = "none"
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     starts: int = 3
