@@ -108,7 +108,7 @@ def make_world(args: Args, physics: str) -> TactileWorld:
         resolution=parse_resolution(args.resolution),
         device=args.device,
         seed=args.seed,
-        sensor_options={"pitch": PITCH, **({"optics_options": {"shadow": False}} if optics == "taxim" else {})},
+        sensor_options={"pitch": PITCH, **({"optics_options": {"shadows": False}} if optics == "taxim" else {})},
     )
 
 

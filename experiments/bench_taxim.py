@@ -63,7 +63,7 @@ def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, t
 
     if family == "phong":
         return PhongMode(spec, resolution=size, device=device)
-    return TaximMode(spec, calibration=table, shadow=family == "taxim_shadow", resolution=size, device=device)
+    return TaximMode(spec, calibration=table, shadows=family == "taxim_shadow", resolution=size, device=device)
 
 
 def speed(

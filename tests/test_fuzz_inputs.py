@@ -168,14 +168,14 @@ def test_mutated_meshes(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")  # a reader that opened it would wait for ever
     ball = trimesh.creation.icosphere(subdivisions=1, radius=4.0)
     good: dict[str, bytes] = {}
-    for name, options in {
-        "a.stl": {},
-        "b.obj": {},
-        "c.ply": {},
-        "d.ply": {"encoding": "ascii"},
-        "e.stl": {"file_type": "stl_ascii"},
-    }.items():
-        content = ball.export(file_type=options.pop("file_type", name[-3:]), **options)
+    for name, kind, options in (
+        ("a.stl", "stl", {}),
+        ("b.obj", "obj", {}),
+        ("c.ply", "ply", {}),
+        ("d.ply", "ply", {"encoding": "ascii"}),
+        ("e.stl", "stl_ascii", {}),
+    ):
+        content: Any = ball.export(file_type=kind, **options)
         good[name] = content if isinstance(content, bytes) else content.encode()
         (tmp_path / name).write_bytes(good[name])
         assert len(load_mesh(tmp_path / name, 1e-3)[1]) == len(ball.faces)

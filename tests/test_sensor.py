@@ -180,7 +180,7 @@ def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
 
 
 def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> None:
-    settings: tuple[dict[str, Any], ...] = ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadow": True}})
+    settings: tuple[dict[str, Any], ...] = ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadows": True}})
     for setting in settings:
         with pytest.raises(InputError, match="it has its own"):
             TactileSensor(sensor_spec, optics=Shader(sensor_spec), **setting)

@@ -111,7 +111,7 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
     """Full scales that a coat at ``REFERENCE_DISTANCE`` shows of an LED of 1 W/sr by its diffuse lobe, by channel (3,)."""
     coat, response = sensor.coat, sensor.response
     diffuse = (1 - coat.specular) * np.array(coat.reflectance) / np.pi
-    return response.exposure * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
+    return response.gain * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:

@@ -79,7 +79,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, opti
     height, width = problem.shape
     tracer = RayTracer(lit, resolution=(width, height), outputs=("layers",), layers="led", device=device, **options)
     # A light file gives power by channel, and the coat's albedo with it: at power 1 a layer shows full scales.
-    scale = sensor.response.exposure * np.array(sensor.response.white_balance)
+    scale = sensor.response.gain * np.array(sensor.response.white_balance)
 
     def layers(surface: GelSurface) -> np.ndarray:
         return scale * np.stack(list(tracer.render_layers(surface).values())).astype(float)
@@ -105,7 +105,7 @@ def extra_light(
     inter-reflection, which changes slowly.
     """
     found: dict[int, Light] = {}
-    if slopes and options.get("shadows", True):
+    if slopes and options.get("shadows", problem.sensor.optics.shadows):
         direct = {**options, "bounce": False}
         for k, step in STEPS.items():
             ends = [state.p.leds.copy(), state.p.leds.copy()]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from raytac.cli.shadow_options import ShadowOptions
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.bake import run_bake
 from raytac.specs import load_sensor
@@ -17,7 +18,7 @@ __all__ = ["BakeArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BakeArgs(CommonOptions):
+class BakeArgs(ShadowOptions, CommonOptions):
     """Calibrate a Taxim table on the ray tracer of a sensor: virtual presses of balls and pins, fitted by slope.
 
     Writes the table as a calibration folder that the package taxim reads too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz,
@@ -40,7 +41,9 @@ class BakeArgs(CommonOptions):
 
         start = time.perf_counter()
         resolution = None if self.resolution is None else parse_resolution(self.resolution)
+        chosen = self.chosen_shadows()
         sensor = load_sensor(self.sensor)
+        sensor = replace(sensor, optics=replace(sensor.optics, **chosen))
         paths = run_bake(
             sensor,
             self.out if self.out is not None else Path("runs") / "bake" / (sensor.name + ("-quick" if self.quick else "")),

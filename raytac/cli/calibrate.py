@@ -52,7 +52,7 @@ class CalibrateArgs(SolverOptions):
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat while it is fitted."""
+    """Whether the ray tracer casts shadows on the coat while it is fitted; sensor.toml says so, and is rendered so."""
     shadow_table: Literal["none", "raytrace"] = "none"
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     starts: int = 3
@@ -103,7 +103,9 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        sensor, presses, shots, doubtful = read_data(Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split)
+        sensor, presses, shots, doubtful = read_data(
+            Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split, self.device
+        )
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
         for name in doubtful:
             print(f"the circle of press {name} is doubtful")

@@ -57,7 +57,9 @@ class CompareRealArgs(CommonOptions):
         began = time.perf_counter()
         from raytac.report.real import RealSettings, check_folds, compare_real
 
-        sensor, presses, shots, doubtful = read_data(self.data, self.sensor, self.ball_diameter_mm, self.sides, self.split)
+        sensor, presses, shots, doubtful = read_data(
+            self.data, self.sensor, self.ball_diameter_mm, self.sides, self.split, self.device
+        )
         check_folds(presses, self.folds)
         settings = RealSettings(
             folds=self.folds,

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from raytac.cli.shadow_options import ShadowOptions
 from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
@@ -23,7 +24,7 @@ __all__ = ["PressArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PressArgs(SolverOptions):
+class PressArgs(ShadowOptions, SolverOptions):
     """Press an object into the gel and write image, layers, height and a preview to a folder.
 
     Writes rgb.png, frame.exr (linear light, one layer a light, normals, positions, depth), height.npy, traction.npy, markers.npz,
@@ -46,8 +47,6 @@ class PressArgs(SolverOptions):
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given. mlp: folder of
     raytac calibrate DATASET --model mlp."""
-    shadow: bool | None = None
-    """taxim: cast shadows; where the table has them if not given."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
     """How the sensor's markers move: fots, surface (needs physics ipc), superposition or force_field; the sensor must have markers, as
     gelsight_mini_7x9 has. Writes markers.npz, and images show the dots. None if not given."""
@@ -99,10 +98,10 @@ class PressArgs(SolverOptions):
         )
 
     def _optics_options(self) -> dict[str, Any]:
-        table = {name: value for name, value in (("calibration", self.calibration), ("shadow", self.shadow)) if value is not None}
-        known = {"taxim": ("calibration", "shadow"), "mlp": ("calibration",)}.get(self.optics, ())
-        for name, value in table.items():
-            if name not in known:
-                owners = "optics='taxim' and 'mlp'" if name == "calibration" else "optics='taxim'"
-                raise InputError(name, value=value, rule=f"is a setting of {owners}, not of {self.optics!r}")
-        return {"progress": self.integrator != "fast"} if self.optics == "raytrace" else table
+        options: dict[str, Any] = self.chosen_shadows(self.optics)
+        if self.calibration is not None:
+            if self.optics not in ("taxim", "mlp"):
+                rule = f"is a setting of optics='taxim' and 'mlp', not of {self.optics!r}"
+                raise InputError("calibration", value=self.calibration, rule=rule)
+            options["calibration"] = self.calibration
+        return {**options, "progress": self.integrator != "fast"} if self.optics == "raytrace" else options

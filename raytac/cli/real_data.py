@@ -11,6 +11,7 @@ from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import INNER, STRENGTHS
 from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
+from raytac.specs.sensor import AUTO
 
 __all__ = ["FROM_SCRATCH", "INNER", "OWN_LEDS", "prior_of", "read_data"]
 
@@ -32,16 +33,21 @@ def prior_of(name: str) -> str | None:
 
 
 def read_data(
-    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str, split: int = 1
+    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str, split: int = 1, device: str = "auto"
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
     """The sensor, its fully visible presses as read and as floats, and the names of those whose circles were found but are doubtful.
 
-    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many.
+    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of
+    ``AUTO`` is found, under the sensor's own lights.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.
     """
     sensor = load_sensor(sensor_name)
+    if sensor.response.exposure == AUTO:
+        from raytac.optics.raytrace import with_exposure
+
+        sensor = with_exposure(sensor, device)
     if sides != OWN_LEDS:
         if split != 1:
             raise InputError("split", value=split, rule=f"is for --sides {OWN_LEDS}: name the numbers of LEDs themselves")

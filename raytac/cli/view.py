@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from raytac.checks import check_whole
+from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
@@ -31,7 +32,7 @@ _LONGEST = 320
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewArgs:
+class ViewArgs(ShadowOptions):
     """Show a scene in the browser: 3-D view, tactile images, play, pause and step, and sliders that press or steer; needs raytac[view].
 
     Prints the address to open and serves until Ctrl-C. On another machine: ssh -L 8080:127.0.0.1:8080 HOST, then open
@@ -107,7 +108,15 @@ class ViewArgs:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
         pad = self.pad or scene.pad if physics == "ipc" else self.pad
         spec = sensor_spec(self.sensor or "gelsight_mini")
-        sensor = TactileSensor(spec, physics=physics, pad=pad, outputs=_OUTPUTS, seed=self.seed, **self._settings(spec))
+        sensor = TactileSensor(
+            spec,
+            physics=physics,
+            pad=pad,
+            outputs=_OUTPUTS,
+            seed=self.seed,
+            optics_options=self.chosen_shadows(self.optics),
+            **self._settings(spec),
+        )
         return PressSession(sensor, scene)
 
     def _task(self, scene: TaskScene, physics: str) -> Session:
@@ -125,6 +134,7 @@ class ViewArgs:
             coupling=self.coupling,
             outputs=_OUTPUTS,
             seed=self.seed,
+            sensor_options={"optics_options": self.chosen_shadows(self.optics)},
             **self._settings(sensor_spec(scene.robot.sensor)),
         )
         return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))

@@ -127,7 +127,8 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
 
     settings = BakeSettings() if settings is None else settings
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
-    images = settings.images + 6 * settings.pins
+    pins = settings.pins if sensor.optics.shadows else 0
+    images = settings.images + 6 * pins
     with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
         touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
@@ -137,7 +138,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
         fit, surround, together = (
             sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in (touched, around, touched.plus(around))
         )
-        shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if settings.pins else None
+        shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if pins else None
     width, height = camera.resolution
     table = PolyTable(
         gradients=fit.gradients,
@@ -154,6 +155,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
             "source": "baked from the ray tracer",
             "sensor": sensor.name,
             "mode": at.tracer.label,
+            "exposure": f"{at.tracer.sensor.response.gain:g}",
             "settings": repr(settings),
             "seed": str(seed),
             "resolution": f"{width}x{height}",

@@ -54,7 +54,7 @@ class Calibration:
         self.tracer = RayTracer(sensor, seed=seed, **options)
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
         options["bounce"] = False
-        self._direct = [RayTracer(sensor, shadows=shadows, **options) for shadows in (True, False)]
+        self._direct = [RayTracer(self.tracer.sensor, shadows=shadows, **options) for shadows in (True, False)]
         self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
         self.grid: PadGrid = make_grid(sensor.gelpad, grid_pitch(self.pitch))

@@ -7,9 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.specs.sensor import SensorSpec
 
-__all__ = ["INTEGRATORS", "OPTICAL_OUTPUTS", "OpticalMode", "OpticsImages"]
+__all__ = ["INTEGRATORS", "OPTICAL_OUTPUTS", "OpticalMode", "OpticsImages", "chosen_shadows"]
 
 INTEGRATORS = ("fast", "reference", "path")
 """Integrators of the ray tracer."""
@@ -42,3 +44,17 @@ class OpticalMode(Protocol):
     def render(self, surface: GelSurface) -> OpticsImages:
         """Render every environment of ``surface``."""
         ...
+
+
+def chosen_shadows(sensor: SensorSpec, shadows: bool | None, integrator: str = "fast") -> bool:
+    """Whether shadows are cast: as asked for, else as the sensor says.
+
+    Raises:
+        InputError: neither a truth value nor None, or False for an integrator that follows light as it goes.
+    """
+    if shadows is not None and not isinstance(shadows, bool):
+        raise InputError("shadows", value=shadows, rule="must be True, False or None", choices=(True, False, None))
+    if shadows is False and integrator != "fast":
+        rule = f"is for the integrator 'fast': {integrator!r} follows light as it goes, shadows and all"
+        raise InputError("shadows", value=shadows, rule=rule, choices=(True, None))
+    return sensor.optics.shadows if shadows is None else shadows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,13 +10,15 @@ import drjit as dr
 import numpy as np
 
 from raytac.device import total_memory
-from raytac.errors import InputError
+from raytac.errors import InputError, SpecError
+from raytac.gel.pad import grid_pitch, make_grid
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS, OpticsImages
+from raytac.optics.base import INTEGRATORS, OPTICAL_OUTPUTS, OpticsImages, chosen_shadows
 from raytac.optics.bounce import BounceField, CaseLight
 from raytac.optics.camera import Pinhole
 from raytac.optics.coat import CoatField, CoatLayout
 from raytac.optics.denoise import make_denoiser
+from raytac.optics.exposure import SATURATED, mid_grey_exposure, saturated_share
 from raytac.optics.fast import PixelSample, direct_light, see
 from raytac.optics.ink import checked_ink, ink_at, inked_albedo
 from raytac.optics.lamp import Lamp
@@ -27,9 +30,9 @@ from raytac.optics.response import Response
 from raytac.optics.scene import UNIT, SensorScene
 from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, device_envs, safe_heights
 from raytac.optics.variant import load_mitsuba
-from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor import AUTO, SensorSpec
 
-__all__ = ["RayTracer"]
+__all__ = ["RayTracer", "with_exposure"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,28 @@ def image_seed(seed: int, env: int) -> int:
     return (seed + env * 0x9E3779B1) & 0xFFFFFFFF
 
 
+_GLANCE = 16
+"""Samples a pixel that tell how bright an image is."""
+
+
+def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
+    """``sensor`` with a number in place of an exposure of ``AUTO``: ``mid_grey_exposure`` of its image at rest by ``fast``.
+
+    That image has the sensor's own resolution and one ray a pixel, whatever else is rendered, so that every mode finds the same number.
+
+    Raises:
+        SpecError: no exposure makes that image mid-grey.
+        BackendError: Mitsuba cannot run on ``device``.
+    """
+    if sensor.response.exposure != AUTO:
+        return sensor
+    plain = replace(sensor, response=replace(sensor.response, exposure=1.0))
+    tracer = RayTracer(plain, outputs=("layers",), device=device)
+    rest = GelSurface.at_rest(make_grid(sensor.gelpad, grid_pitch(sensor.camera.pitch_at(sensor.camera.resolution))))
+    exposure = mid_grey_exposure(sensor, total(tracer.render_layers(rest))[0] * tracer.response.scale)
+    return replace(sensor, response=replace(sensor.response, exposure=exposure))
+
+
 class RayTracer:
     """Ray tracing with Mitsuba 3 and Dr.Jit; fulfils ``raytac.optics.base.OpticalMode``."""
 
@@ -70,7 +95,7 @@ class RayTracer:
         layers: str = "colour",
         bounce: bool = True,
         led_points: int = 1,
-        shadows: bool = True,
+        shadows: bool | None = None,
         max_depth: int = -1,
         flat_field: np.ndarray | None = None,
         denoise: bool = False,
@@ -90,7 +115,7 @@ class RayTracer:
             layers: one layer per ``colour`` group of the light file or per ``led``.
             bounce: inter-reflection in ``fast``.
             led_points: ``fast`` integrates each LED with this number of points squared.
-            shadows: cast shadows in ``fast``.
+            shadows: cast shadows in ``fast``; None is as the sensor says. The sampled integrators always cast them.
             max_depth: sampled integrators: number of reflections, 1 is direct light only, −1 has no limit.
             flat_field: real image of the untouched sensor, (H, W, 3) uint8 at ``resolution``: the image is then
                 flat_field × rendered / rendered at rest, in linear light.
@@ -124,13 +149,19 @@ class RayTracer:
             )
         if integrator == "fast" and denoise:
             raise InputError("denoise", value=denoise, rule="the fast integrator has no noise", choices=(False,))
+        casts = chosen_shadows(sensor, shadows, integrator)
+        if integrator != "fast" and not casts:
+            told = f"optics.shadows = false of sensor {sensor.name!r} is for 'fast': {integrator!r} casts shadows as light does"
+            warnings.warn(told, stacklevel=2)
         self.mi, self.device = load_mitsuba(device)
+        if sensor.response.exposure == AUTO and {"rgb", "layers"} & set(outputs):
+            sensor = with_exposure(sensor, self.device)
         self.sensor, self.integrator, self.outputs, self.seed = sensor, integrator, tuple(outputs), seed
         self.label = f"raytrace-{integrator}" + ("-denoised" if denoise else "")
         self.slab = Slab.from_spec(sensor)
         self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
         self.spp = spp or 256
-        self.bounce, self.led_points, self.shadows = bounce, led_points, shadows
+        self.bounce, self.led_points, self.shadows = bounce, led_points, casts
         self.max_depth, self.progress = max_depth, progress
         self._denoiser = make_denoiser(self.mi, self.device, self.camera.resolution) if denoise else None
         leds = sensor.lights.leds
@@ -138,7 +169,9 @@ class RayTracer:
         self.groups = [self.layer_names.index(led.layer if layers == "colour" else led.name) for led in leds]
         self.lamps = [Lamp.from_spec(self.mi, led) for led in leds]
         self._scene_lamps = [Lamp.from_spec(self.mi, led, UNIT) for led in leds]
-        self.response = Response(sensor.response, self.camera)
+        # Of a mode without images, nobody asks how bright they are.
+        unlit = replace(sensor.response, exposure=1.0)
+        self.response = Response(unlit if sensor.response.exposure == AUTO else sensor.response, self.camera)
         self._flat_field = None if flat_field is None else self._check_flat_field(flat_field)
         self._memory = total_memory(self.device)
         self._grid: PadGrid | None = None
@@ -179,6 +212,39 @@ class RayTracer:
             self.response.set_flat_field(self._flat_field, total(self._layers(rest))[0])
         self._inputs = FastInputs(self._rest, self.lamps, self._bounce, self.response.device_scale(mi))
         self._grid = grid
+        if "rgb" in self.outputs and self._flat_field is None:
+            self._warn_if_saturated(grid)
+
+    def _warn_if_saturated(self, grid: PadGrid) -> None:
+        """Tell of an image at rest that is white over a large part, and of the exposure that would make it mid-grey."""
+        heights = grid.rest[None].astype(np.float32)
+        if self.integrator == "fast":
+            rgb = np.array(self.render_device(self._upload(heights))["rgb"]).reshape(-1, 3)
+        else:
+            rgb = self.response.encode_numpy(self._glance(heights[0]))
+        share = saturated_share(rgb)
+        if share <= SATURATED:
+            return
+        response, advice = self.sensor.response, "the light is too uneven for any exposure"
+        linear = total(self._layers(heights))[0] if self.integrator == "fast" else self._glance(heights[0])
+        try:
+            grey = mid_grey_exposure(self.sensor, linear * self.response.scale / response.gain)
+        except SpecError:
+            grey = response.gain
+        if abs(grey - response.gain) > 0.1 * grey:
+            advice = f'exposure = {grey:g} makes it mid-grey on average, and exposure = "auto" finds that by itself'
+        warnings.warn(
+            f"sensor {self.sensor.name!r}: {100 * share:.0f} % of the pixels are at 255 at rest with "
+            f"exposure = {response.gain:g}; {advice}",
+            stacklevel=2,
+        )
+
+    def _glance(self, height: np.ndarray) -> np.ndarray:
+        """Linear image (H, W, 3) of one surface by a few samples a pixel of a sampled integrator: enough to tell how bright it is."""
+        assert self.scene is not None
+        self.scene.set_surface(height, None)
+        images = type(self._sampled)(self.scene, self.camera, max_depth=self.max_depth, progress=False)
+        return np.asarray(images.render(self._scene_lamps, self.groups, _GLANCE, self.seed).sum(axis=0))
 
     # ---------------------------------------------------------------- memory
 

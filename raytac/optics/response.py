@@ -25,7 +25,7 @@ class Response:
         r2 = (u**2 + v**2) / ((width**2 + height**2) / 4)
         a1, a2, a3 = spec.vignetting
         vignette = 1 + r2 * (a1 + r2 * (a2 + r2 * a3))
-        even = spec.exposure * vignette[..., None] * np.asarray(spec.white_balance)
+        even = spec.gain * vignette[..., None] * np.asarray(spec.white_balance)
         self.scale = (even * shading_gain(spec.shading, camera.resolution)).astype(np.float32)
         """Linear gain per pixel and channel, (H, W, 3); a flat field multiplies it."""
         self.black = np.asarray(spec.black_level, dtype=np.float32)

@@ -6,7 +6,7 @@ as it is, oddities included, and what differs). Deformation is not in here: the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,11 @@ import drjit as dr
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import chosen_shadows
+from raytac.optics.exposure import SATURATED, saturated_share
 from raytac.optics.image_mode import ImageHeights, ImageMode
+from raytac.optics.raytrace import RayTracer
 from raytac.optics.table import PolyTable
 from raytac.optics.table_shadow import ShadowArrays, ShadowCaster
 from raytac.specs.sensor import SensorSpec
@@ -51,7 +54,7 @@ class TableShader:
         arrays = None
         if shadow:
             if table.shadow is None:
-                raise InputError("shadow", value=True, rule="this table has no shadows", choices=(False,))
+                raise InputError("shadows", value=True, rule="this table has no shadows", choices=(False,))
             self._caster = ShadowCaster(mi, table.shadow, table.constants, resolution, self.scale, pitch)
             arrays = self._caster.arrays()
             background = self._caster.blur_background(background)
@@ -111,7 +114,7 @@ class TaximMode(ImageMode):
         sensor: SensorSpec,
         *,
         calibration: str | Path | PolyTable | None = None,
-        shadow: bool | None = None,
+        shadows: bool | None = None,
         resolution: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("rgb",),
         device: str = "auto",
@@ -122,7 +125,7 @@ class TaximMode(ImageMode):
             sensor: camera and pad; its lights matter only where ``calibration`` is None.
             calibration: a table, a calibration folder (``raytac.optics.calib_folder``), or None for the table baked from this sensor's
                 own ray tracer, which is baked now unless that was done before. The table's image is laid over the whole image.
-            shadow: cast shadows; None is yes where the table has them.
+            shadows: cast shadows; None is as the sensor says, where the table has them.
             resolution: (width, height) [px]; None is the sensor's own.
             outputs: any of ``rgb``, ``normals``, ``depth``.
             device: ``auto``, ``cpu`` or ``cuda``.
@@ -133,20 +136,21 @@ class TaximMode(ImageMode):
             BackendError: Dr.Jit cannot run on ``device``.
         """
         self.label = "taxim"
-        if shadow not in (None, True, False):
-            raise InputError("shadow", value=shadow, rule="must be True, False or None", choices=(True, False, None))
+        casts = chosen_shadows(sensor, shadows)
         super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
-        self.table = _table(calibration, sensor, self.device)
-        self.shadow = self.table.shadow is not None if shadow is None else bool(shadow)
-        self.label = "taxim-shadow" if self.shadow else "taxim"
+        # Without being asked, a table without shadows casts none; one that is asked to is baked with them, whatever the sensor says.
+        baked_of = replace(sensor, optics=replace(sensor.optics, shadows=sensor.optics.shadows or casts))
+        self.table, self._is_own = _table(calibration, baked_of, self.device), calibration is None
+        self.shadows = casts and (shadows is not None or self.table.shadow is not None)
+        self.label = "taxim-shadow" if self.shadows else "taxim"
         width, height = self.camera.resolution
         columns, rows = self.table.resolution
         ratio = (columns / rows) / (width / height)
         if abs(ratio - 1) > _ASPECT_TOLERANCE:
             rule = f"must have the aspect ratio of the table's image, {columns}x{rows}, within {100 * _ASPECT_TOLERANCE:.0f} %"
             raise InputError("resolution", value=f"{width}x{height}", rule=rule)
-        self.needs_contact = self.shadow or self.table.covered is not None or self.table.surround is not None
-        self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadow)
+        self.needs_contact = self.shadows or self.table.covered is not None or self.table.surround is not None
+        self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadows)
 
     @property
     def view_ratio(self) -> tuple[float, float]:
@@ -156,6 +160,8 @@ class TaximMode(ImageMode):
         return x, y
 
     def _build(self, grid: PadGrid) -> TableArrays:
+        if self._is_own and saturated_share(self.table.background.round().clip(0, 255)) > SATURATED:
+            RayTracer(self.sensor, device=self.device).render(GelSurface.at_rest(grid))  # which warns of it
         return self._shader.inputs
 
     def _levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
@@ -163,7 +169,7 @@ class TaximMode(ImageMode):
 
     def _floats_per_pixel(self) -> float:
         # With shadows: least values (3), the packed image before and after each of four blurs (20), the contact grown by rows (1/4).
-        return 23.25 if self.shadow else 0
+        return 23.25 if self.shadows else 0
 
     def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
         if self.table.covered is None:

@@ -94,8 +94,8 @@ def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False
         chosen = spp if not (quick and family == "reference_denoised") else spp[-1:]
         modes += [_sampled(family, n) for n in chosen]
     others = [
-        _named("taxim", "taxim", {"shadow": False}),
-        _named("taxim_shadow", "taxim", {"shadow": True}),
+        _named("taxim", "taxim", {"shadows": False}),
+        _named("taxim_shadow", "taxim", {"shadows": True}),
         _named("phong", "phong", {}),
         _peer("peer", shadow=False),
         _peer("peer_shadow", shadow=True),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import sys
 import time
@@ -25,17 +26,17 @@ from raytac.optics.taxim import TaximMode
 from raytac.report.real_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.report.real_score import press_scores, summary
 from raytac.specs import SensorSpec
-from raytac.specs.files import available, find_file
 from raytac.specs.lights_text import lights_text
-from raytac.specs.response_text import response_text
+from raytac.specs.sensor import OpticsSpec
+from raytac.specs.sensor_text import sensor_files
 
-__all__ = ["OUTLIER", "run_calibrate_optics", "sensor_text"]
+__all__ = ["OUTLIER", "run_calibrate_optics"]
 
 FITTED = ("raytrace", "taxim", "mlp")
 """Models that photographs are fitted by; Phong's has nothing to fit."""
 OUTLIER = 2.0
 """A press whose contact error is so many times the median is reported as an outlier."""
-FILES = (*CALIBRATION_FILES, "mlp.npz", "lights.toml", "sensor.toml", "circles.csv", "metrics.json")
+FILES = (*CALIBRATION_FILES, "mlp.npz", "lights.toml", "sensor.toml", "marker_motion.toml", "circles.csv", "metrics.json")
 
 
 def run_calibrate_optics(
@@ -142,7 +143,9 @@ def run_calibrate_optics(
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
             alone = models.modes[ALONE]
             assert isinstance(alone, RayTracer)
-            (folder / "sensor.toml").write_text(sensor_text(sensor, alone.sensor), "utf-8")
+            written = dataclasses.replace(alone.sensor, optics=OpticsSpec(shadows=shadows))
+            for name, text in sensor_files(written).items():
+                (folder / name).write_text(text, "utf-8")
         elif isinstance(mode, TaximMode):
             save_calibration(mode.table, folder)
         elif isinstance(mode, MlpMode):
@@ -153,13 +156,3 @@ def run_calibrate_optics(
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         written = sorted(path.name for path in folder.iterdir())
     return [out / name for name in written]
-
-
-def _is_shipped(file: Path) -> bool:
-    return file.stem in available("sensor") and file.resolve() == find_file("sensor", file.stem).resolve()
-
-
-def sensor_text(sensor: SensorSpec, fitted: SensorSpec) -> str:
-    """A sensor file on the base of ``sensor`` with the response of ``fitted`` and lights.toml beside it."""
-    base = sensor.name if sensor.source is None or _is_shipped(sensor.source) else str(sensor.source.resolve())
-    return f'base = "{base}"\nlights = "lights.toml"\n\n{response_text(fitted.response)}'

@@ -158,7 +158,7 @@ def fit_models(
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
                 table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
-            built[name] = TaximMode(sensor, calibration=table, device=device)
+            built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
         elif name == "mlp":
             built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
         else:

@@ -78,7 +78,7 @@ def table_errors(
     for family, shadow in (("taxim", False), ("taxim_shadow", True)):
         if shadow and table.shadow is None:
             continue
-        mode = TaximMode(sensor, calibration=table, shadow=shadow, **setting)
+        mode = TaximMode(sensor, calibration=table, shadows=shadow, **setting)
         errors[family] = {}
         for name, surface in surfaces.items():
             image, (truth, contact) = mode.render(surface), traced[name]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from raytac.errors import InputError
+from raytac.optics.base import chosen_shadows
 from raytac.specs import SensorSpec
 
 if TYPE_CHECKING:
@@ -28,8 +29,11 @@ class Imaging:
             settings: ``resolution``, ``outputs`` and ``device`` of the mode, ``integrator``, ``spp`` and ``seed`` of the ray tracer.
 
         Raises:
-            SpecError: a calibration folder that cannot be used: told now, before anything is written.
+            InputError: ``shadows`` that the mode cannot have. SpecError: a calibration folder that cannot be used. Both are told now,
+                before anything is written.
         """
+        if optics in ("raytrace", "taxim"):
+            chosen_shadows(spec, options.get("shadows"), settings["integrator"] if optics == "raytrace" else "fast")
         self._spec, self._options, self._settings = spec, dict(options), settings
         if optics == "taxim" and isinstance(self._options.get("calibration"), (str, Path)):
             from raytac.optics.calib_folder import load_calibration
@@ -45,13 +49,14 @@ class Imaging:
         return f"raytrace-{self._settings['integrator']}" if self._optics == "raytrace" else self._optics
 
     @property
-    def sampling(self) -> dict[str, int | str]:
-        """``integrator`` and ``spp`` of the mode; empty if it has neither."""
+    def sampling(self) -> dict[str, int | float | str]:
+        """``integrator``, ``spp`` and ``exposure`` of a mode that traces rays, the last as a number; empty if it does not."""
         integrator = getattr(self.mode, "integrator", None)
         if integrator is None:
             return {}
         spp = getattr(self.mode, "rays", 1) ** 2 if integrator == "fast" else getattr(self.mode, "spp", None)
-        return {"integrator": integrator} | ({} if spp is None else {"spp": spp})
+        exposure = getattr(getattr(self.mode, "sensor", self._spec), "response", self._spec.response).exposure
+        return {"integrator": integrator} | ({} if spp is None else {"spp": spp}) | {"exposure": exposure}
 
     @property
     def mode(self) -> OpticalMode:

@@ -112,8 +112,8 @@ class TactileSensor:
             markers: how the sensor's markers move, one of ``MARKER_MODELS``; frames then hold them, and images show the dots. None leaves
                 them out, and images show a plain coat.
             marker_perturbation: noise, losses and shifts of the markers; None is none.
-            optics_options: further keyword arguments of the optical mode, such as ``calibration`` and ``shadow`` of ``taxim``;
-                their values are checked when it is built.
+            optics_options: further keyword arguments of the optical mode, such as ``calibration`` of ``taxim``, or ``shadows``, which the
+                sensor else decides; their values are checked when it is built.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -194,8 +194,8 @@ class TactileSensor:
         return self._level if isinstance(self._level, str) else "own"
 
     @property
-    def sampling(self) -> dict[str, int | str]:
-        """``integrator`` and ``spp`` of the optical mode, for headers and reports; empty without images, or if it has neither."""
+    def sampling(self) -> dict[str, int | float | str]:
+        """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports; empty without images or rays."""
         return self._imaging.sampling if self._optical_outputs else {}
 
     @property

@@ -17,7 +17,7 @@ def response_text(response: ResponseSpec) -> str:
 
     lines = [
         "[response]",
-        f"exposure = {response.exposure:.6g}",
+        f"exposure = {response.gain:.6g}",
         f"white_balance = {row(response.white_balance)}",
         f"gamma = {response.gamma:.6g}",
         f"black_level = {row(response.black_level)}",

@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from raytac.errors import SpecError
 from raytac.specs.marker_motion import MarkerMotionSpec
-from raytac.specs.toml import ANY, Integer, Number, Schema, Text, check_fields
+from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fields
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
 __all__ = [
+    "AUTO",
     "BONDED",
     "LED_SCHEMA",
     "SENSOR_PARTS",
@@ -30,11 +31,14 @@ __all__ = [
     "LedSpec",
     "LightsSpec",
     "MarkerSpec",
+    "OpticsSpec",
     "RefractionSpec",
     "ResponseSpec",
     "SensorSpec",
 ]
 
+AUTO: Final = "auto"
+"""In place of an exposure: that which makes the image at rest mid-grey."""
 BONDED = ("back", "back_and_sides")
 """Faces of a gelpad that the case can hold."""
 
@@ -70,7 +74,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "principal_point_px": Number("[-8192, 16384]", length=2),
     },
     "response": {
-        "exposure": Number("(0, 1e9]"),
+        "exposure": Number("(0, 1e9]", word=AUTO),
         "white_balance": Number("(0, 100]", length=3),
         "gamma": Number("[0.5, 5]"),
         "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
@@ -92,6 +96,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "ior": Number("[1, 3]"),
         "plate_thickness_mm": Number("[0, 50]"),
     },
+    "optics": {"shadows": Flag(default=True)},
 }
 """Table (``""``: the top of the file) to its keys."""
 
@@ -199,8 +204,9 @@ class CameraSpec:
 class ResponseSpec:
     """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ)."""
 
-    exposure: float
-    """Common gain from radiance [W/(m² sr), relative] to full scale 1."""
+    exposure: float | Literal["auto"]
+    """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
+    (``raytac.optics.exposure``), which whoever renders finds."""
     white_balance: Vec3
     """Gain of each channel after the exposure."""
     gamma: float
@@ -219,6 +225,17 @@ class ResponseSpec:
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["response"], "response")
+
+    @property
+    def gain(self) -> float:
+        """The exposure as a number.
+
+        Raises:
+            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.raytrace.with_exposure``).
+        """
+        if self.exposure == AUTO:
+            raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)
+        return self.exposure
 
     @property
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
@@ -272,6 +289,17 @@ class RefractionSpec:
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["refraction"], "refraction")
+
+
+@dataclass(frozen=True)
+class OpticsSpec:
+    """How images are made of the sensor where its geometry leaves a choice: as its lights were fitted."""
+
+    shadows: bool = True
+    """Whether what rises casts shadows on the coat, in every optical mode that can cast them and is not told otherwise."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["optics"], "optics")
 
 
 @dataclass(frozen=True)
@@ -333,6 +361,7 @@ SENSOR_PARTS: Final = {
     "response": ResponseSpec,
     "markers": MarkerSpec,
     "refraction": RefractionSpec,
+    "optics": OpticsSpec,
 }
 """Table of a sensor file to the dataclass that holds it."""
 
@@ -353,6 +382,7 @@ class SensorSpec:
     markers: MarkerSpec
     refraction: RefractionSpec
     lights: LightsSpec
+    optics: OpticsSpec = OpticsSpec()
     marker_motion: MarkerMotionSpec | None = None
     """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
     source: Path | None = None

@@ -17,6 +17,8 @@ __all__ = ["load_lights", "load_sensor", "with_lights"]
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
+_MAY_LACK = ("optics",)
+"""Tables that a file without a base need not give."""
 
 
 def load_sensor(name_or_path: str | Path) -> SensorSpec:
@@ -53,7 +55,7 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
     if base is not None:
         schema["lights"] = Text(default="")
     head = top.read(schema, sections=tuple(parts))
-    given = [name for name in parts if base is None or name in top.data]
+    given = [name for name in parts if name in top.data or (base is None and name not in _MAY_LACK)]
     changes: dict[str, Any] = {name: SENSOR_PARTS[name](**top.section(name).read(parts[name])) for name in given}
     if head["lights"]:
         changes["lights"] = _read_lights(find_file("lights", head["lights"], base=path.parent))

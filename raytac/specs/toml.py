@@ -21,6 +21,7 @@ from raytac.errors import SpecError
 __all__ = [
     "ANY",
     "REQUIRED",
+    "Flag",
     "Integer",
     "Number",
     "Schema",
@@ -104,11 +105,12 @@ class _Refused(Exception):
 
 @dataclass(frozen=True)
 class Number:
-    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval`` (in the unit of the file)."""
+    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval`` (in the unit of the file), or ``word`` in its place."""
 
     interval: str
     length: int = 0
     default: Any = REQUIRED
+    word: str = ""
     _range: Interval = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -117,9 +119,12 @@ class Number:
     def rule(self, unit: Unit) -> str:
         many = "a list of numbers, each" if self.length == ANY else f"{self.length} numbers, each"
         number = many if self.length else "a number"
-        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
+        word = f', or "{self.word}"' if self.word else ""
+        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
 
-    def parse(self, value: object, unit: Unit) -> float | tuple[float, ...]:
+    def parse(self, value: object, unit: Unit) -> float | str | tuple[float, ...]:
+        if self.word and value == self.word:
+            return self.word
         if not self.length:
             return self._one(value, unit)
         if not isinstance(value, list) or len(value) != (max(len(value), 1) if self.length == ANY else self.length):
@@ -140,6 +145,8 @@ class Number:
 
     def check(self, value: object, unit: Unit) -> None:
         """Refuse a value in SI that no file could give."""
+        if self.word and value == self.word:
+            return
         interval = _in_si(self._range, unit)
         for item in _items(value, self.length, self.rule(unit)):
             if not is_number(item) or item not in interval:
@@ -234,7 +241,26 @@ def _items(value: object, length: int, rule: str) -> Sequence[Any]:
     return value
 
 
-Schema = Mapping[str, Number | Integer | Text]
+@dataclass(frozen=True)
+class Flag:
+    """``true`` or ``false``."""
+
+    default: Any = REQUIRED
+
+    def rule(self, unit: Unit) -> str:
+        return "must be true or false"
+
+    def parse(self, value: object, unit: Unit) -> bool:
+        if not isinstance(value, bool):
+            raise _Refused(self.rule(unit))
+        return value
+
+    def check(self, value: object, unit: Unit) -> None:
+        """Refuse a value that no file could give."""
+        self.parse(value, unit)
+
+
+Schema = Mapping[str, Number | Integer | Text | Flag]
 
 
 def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
@@ -270,7 +296,7 @@ class Table:
         """An error about ``key`` of this table (about the whole table if empty)."""
         return SpecError(rule, file=self.file, key=self._dotted(key), value=value, choices=choices)
 
-    def read_one(self, key: str, spec: Number | Integer | Text) -> Any:
+    def read_one(self, key: str, spec: Number | Integer | Text | Flag) -> Any:
         """One field in SI, checked; the other keys of the table are left alone.
 
         Raises:

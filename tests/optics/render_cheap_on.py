@@ -25,7 +25,7 @@ def main(device: str, mode: str, out: str) -> None:
         images = PhongMode(spec, background=background, resolution=RESOLUTION, device=device).render(surfaces)
     else:
         shadow = mode == "taxim-shadow"
-        images = TaximMode(spec, calibration=make_table(spec), shadow=shadow, resolution=RESOLUTION, device=device).render(
+        images = TaximMode(spec, calibration=make_table(spec), shadows=shadow, resolution=RESOLUTION, device=device).render(
             surfaces
         )
     assert images.rgb is not None

@@ -49,7 +49,7 @@ def errors(baked: Baked, surfaces: dict[str, GelSurface]) -> dict[str, dict[str,
 
 @pytest.mark.parametrize("shadow", [False, True])
 def test_at_rest_it_is_the_ray_tracers_image(baked: Baked, calibration: Calibration, shadow: bool) -> None:
-    mode = TaximMode(MINI, calibration=baked.table, shadow=shadow, resolution=SIZE, device="cpu")
+    mode = TaximMode(MINI, calibration=baked.table, shadows=shadow, resolution=SIZE, device="cpu")
     image = mode.render(at_rest(calibration.grid)).rgb
     assert image is not None and calibration.rest_image.max() > 60
     assert np.array_equal(image[0], calibration.rest_image)

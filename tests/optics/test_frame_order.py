@@ -50,7 +50,7 @@ def table_mode(
     assert table.shadow is not None
     table = replace(table, shadow=replace(table.shadow, depth_of=depth_of))
     table = replace(table, surround=-0.5 * table.gradients) if sheets == 2 else table
-    return TaximMode(SPEC, calibration=table, shadow=shadow, resolution=RESOLUTION, device=device)
+    return TaximMode(SPEC, calibration=table, shadows=shadow, resolution=RESOLUTION, device=device)
 
 
 def phong(device: str) -> PhongMode:

@@ -36,7 +36,7 @@ def test_the_formula(tracer: Build) -> None:
         r = np.hypot(column + 0.5 - 35.0, row + 0.5 - 33.0) / (0.5 * np.hypot(80, 60))
         vignette = 1 - 0.3 * r**2 + 0.1 * r**4 - 0.05 * r**6
         for c in range(3):
-            value = CURVE.white_balance[c] * CURVE.exposure * vignette * image[row, column, c] + CURVE.black_level[c]
+            value = CURVE.white_balance[c] * CURVE.gain * vignette * image[row, column, c] + CURVE.black_level[c]
             expected = 255 * min(max(value, 0), 1) ** (1 / 1.8)
             assert abs(float(encoded[row, column, c]) - expected) <= 0.51, (row, column, c)
     assert (encoded == 255).any()  # clipped, not wrapped around

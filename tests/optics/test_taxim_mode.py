@@ -64,7 +64,7 @@ def test_at_rest_it_is_the_background_also_on_a_dome(spec: SensorSpec, grid: Pad
     table = make_table(spec)
     if shadow:  # the last blur reaches the background too (upstream); a flat one shows what else may change
         table = replace(table, background=np.full_like(table.background, 100))
-    mode = TaximMode(spec, calibration=table, shadow=shadow, resolution=RESOLUTION, device="cpu")
+    mode = TaximMode(spec, calibration=table, shadows=shadow, resolution=RESOLUTION, device="cpu")
     assert np.abs(grid.rest).max() > 1e-4
     images = mode.render(at_rest(grid))
     assert images.rgb is not None
@@ -80,7 +80,7 @@ def test_upstreams_tables_shade_the_dome_itself(spec: SensorSpec, grid: PadGrid)
 
 @pytest.mark.parametrize("shadow", [False, True])
 def test_a_batch_is_its_single_images(spec: SensorSpec, grid: PadGrid, shadow: bool) -> None:
-    mode = TaximMode(spec, calibration=make_table(spec), shadow=shadow, resolution=RESOLUTION, device="cpu")
+    mode = TaximMode(spec, calibration=make_table(spec), shadows=shadow, resolution=RESOLUTION, device="cpu")
     height, contact = ball(grid)
     moved, touched = ball(grid, depth=0.4e-3, centre=(-2e-3, 1e-3))
     heights = np.stack([height, grid.rest, relief(grid), moved, height]).astype(np.float32)
@@ -185,7 +185,7 @@ def test_what_it_cannot_do_is_refused(spec: SensorSpec, grid: PadGrid) -> None:
     with pytest.raises(InputError, match=r"layers.*choose from: rgb, normals, depth"):
         TaximMode(spec, calibration=table, outputs=("rgb", "layers"), **common)
     with pytest.raises(InputError, match="has no shadows"):
-        TaximMode(spec, calibration=table, shadow=True, **common)
+        TaximMode(spec, calibration=table, shadows=True, **common)
     with pytest.raises(InputError, match="aspect ratio of the table's image, 80x60"):
         TaximMode(spec, calibration=table, resolution=(80, 70), device="cpu")
     with pytest.raises(InputError, match="PolyTable, a calibration folder or None"):
@@ -213,7 +213,7 @@ def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadG
     mode = (
         PhongMode(spec, background=np.zeros((120, 160, 3), np.uint8), resolution=size, device=device)
         if kind == "phong"
-        else TaximMode(spec, calibration=make_table(spec), shadow=kind == "shadow", resolution=size, device=device)
+        else TaximMode(spec, calibration=make_table(spec), shadows=kind == "shadow", resolution=size, device=device)
     )
     height, contact = ball(grid)
     for envs, inked in ((1, False), (3, False), (7, False), (7, True)):  # powers of two suit some batches better than others

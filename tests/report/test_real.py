@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from raytac.report.real_calibration import run_calibrate_optics
 from raytac.report.real_figure import table_text
 from raytac.report.real_models import MODES, fit_models
 from raytac.report.real_score import noise_floor, press_scores, summary
+from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
 
 CIRCLES = np.array([[120.0, 100.0, 30.0], [200.0, 140.0, 28.0]])
@@ -141,15 +143,31 @@ ONE_ROUND = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tie
 
 
 def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    """What is written renders held-out presses, and the pad at rest, to about a level."""
-    (data, background), out = of_itself, tmp_path / "out"
-    assert main(["calibrate", str(data), *ONE_ROUND, "--holdout", "3", "--out", str(out)]) == 0
+    """What is written renders held-out presses, and the pad at rest, to about a level, wherever the folder is copied."""
+    (data, background), made = of_itself, tmp_path / "made"
+    mine = tmp_path / "mine" / "own.toml"
+    mine.parent.mkdir()
+    mine.write_text('base = "gelsight_mini"\n[markers]\nrows = 1\ncolumns = 1\nradius_mm = 0.2\n', "utf-8")
+    assert main(["calibrate", str(data), *ONE_ROUND, "--sensor", str(mine), "--holdout", "3", "--out", str(made)]) == 0
+    out = shutil.copytree(made, tmp_path / "copied" / "elsewhere")
+    assert not any(str(tmp_path) in path.read_text("utf-8") for path in out.glob("*.toml"))
+    shutil.rmtree(made)
+    shutil.rmtree(mine.parent)
     metrics = json.loads((out / "metrics.json").read_text("utf-8"))
     assert (metrics["presses.fitted"], metrics["presses.held_out"]) == (6, 3)
     for key in ("fitted", "fitted.alone", "held_out", "held_out.alone"):
         assert metrics[f"{key}.contact_mae"] < 1.5 and metrics[f"{key}.ring_mae"] < 1.0, (key, metrics)
     written = load_sensor(out / "sensor.toml")
     assert all(len(found) == 28 for found in written.response.shading)
+    assert (written.markers.rows, written.gelpad, written.marker_motion) == (1, SENSOR.gelpad, SENSOR.marker_motion)
+    # Fitted without cast shadows, and so rendered, though the sensor that the fit began from casts them.
+    assert SENSOR.optics.shadows and not written.optics.shadows
+    images = [
+        np.array(TactileSensor(written, device="cpu", optics_options=options).press("pins").rgb, int)
+        for options in ({}, {"shadows": False}, {"shadows": True})
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert (np.abs(images[0] - images[2]) > 8).mean() > 0.01
     rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
     assert rest is not None
     off = np.abs(rest[0].astype(int) - background)

@@ -12,7 +12,7 @@ from raytac.assets import asset_root
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
 from raytac.specs.sensor import LED_SCHEMA, SENSOR_SCHEMA
 from raytac.specs.shape_file import OBJECT_SCHEMA
-from raytac.specs.toml import ANY, Integer, Number, Schema, Text
+from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text
 
 README = asset_root("scenes") / "README.md"
 
@@ -25,9 +25,12 @@ def section(title: str) -> str:
 def ranged(schema: Schema) -> Iterator[tuple[str, str]]:
     """Keys of a schema with their range as the tables write it."""
     for key, field in schema.items():
-        if not isinstance(field, Text):
+        if isinstance(field, Flag):
+            yield key, "`true` or `false`"
+        elif not isinstance(field, Text):
             many = "× " if field.length == ANY else f"{field.length} × " if field.length else ""
-            yield key, f"{many}`{field.interval}`"
+            word = f' or `"{field.word}"`' if isinstance(field, Number) and field.word else ""
+            yield key, f"{many}`{field.interval}`{word}"
 
 
 def row(text: str, key: str) -> str:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from raytac.assets import asset_root
 from raytac.errors import SpecError
 from raytac.specs import LedSpec, available, load_lights, load_sensor, validate_sensor, with_lights
 from raytac.specs.sensor_check import led_corners
@@ -363,3 +364,15 @@ def test_bases_that_go_round_are_refused(tmp_path: Path, ring: tuple[str, ...]) 
         load_sensor(tmp_path / f"{ring[0]}.toml")
     with pytest.raises(SpecError, match="not built on this one"):
         load_sensor(_on(tmp_path, "outside", f"{ring[-1]}.toml"))
+
+
+def test_shadows_are_cast_unless_a_file_or_its_base_says_otherwise(tmp_path: Path) -> None:
+    assert load_sensor("gelsight_mini").optics.shadows and not load_sensor("gelsight_mini_calibrated").optics.shadows
+    first = _on(tmp_path, "first", "gelsight_mini", "[optics]\nshadows = false\n")
+    assert not load_sensor(first).optics.shadows and not load_sensor(_on(tmp_path, "second", "first.toml")).optics.shadows
+    text = (asset_root("scenes") / "sensors" / "gelsight_dome.toml").read_text("utf-8")
+    (tmp_path / "plain.toml").write_text(text.split("[optics]")[0], "utf-8")
+    assert load_sensor(tmp_path / "plain.toml").optics.shadows
+    for value in ("0", '"no"', "[true]"):
+        with pytest.raises(SpecError, match=r"bad\.toml: optics\.shadows = .*: must be true or false"):
+            load_sensor(_on(tmp_path, "bad", "gelsight_mini", f"[optics]\nshadows = {value}\n"))
