@@ -308,7 +308,9 @@ class Learner:
         other = {name: tuple(tensor.shape) for name, tensor in saved.policy.items()}
         if own != other:
             differ = sorted(name for name in {*own, *other} if own.get(name) != other.get(name))
-            rule = f"must be of this task and these observations: {differ[0]} is {other.get(differ[0])}, here {own.get(differ[0])}"
+            rule = (
+                f"must be of this task and these observations: {differ[0]} is {other.get(differ[0])}, here {own.get(differ[0])}"
+            )
             raise InputError("checkpoint", value=saved.recipe, rule=rule)
         try:
             self.model.policy.load_state_dict(saved.policy)
