@@ -56,6 +56,8 @@ class Record:
     markers: list[float]
     """Longest displacement of a marker [m]."""
     pictures: list[np.ndarray]
+    pictured: list[int]
+    """Control step of each picture."""
     seconds: list[float]
     """Wall time of a control step with image and markers."""
     part: list[tuple[float, float, float]]
@@ -78,7 +80,8 @@ def main(args: Args) -> None:
             found = summary(world, controller, record, args)
             metrics |= {f"ball_rolling.{name}.{key}": value for key, value in found.items()}
             draw(record, world, args, folder / f"{name}.png")
-            film(record, folder / f"{name}.gif", folder / f"{name}_strip.png")
+            film(record, args, folder / f"{name}.gif")
+            strip(record, world, folder / f"{name}_strip.png")
             print(
                 f"{name}: {found['goals_reached']} of {len(args.goals_mm)} goals, {found['goal_error_mm']:.2f} mm from the last, "
                 f"{found['steps_per_s']:.1f} steps/s"
@@ -115,7 +118,7 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
     state = world.reset()
     goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
     controller = RollingController(world, 0, goals, STROKES[world.physics])
-    record = Record([], [], [], [], [], [], [], [], [], [])
+    record = Record([], [], [], [], [], [], [], [], [], [], [])
     frame = world.observe()[name]  # kernels are compiled here
     next_picture = 0.0
     for _ in range(args.steps):
@@ -140,6 +143,7 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
             record.resolved.append((float(state.report["min_gap"][0]), float(state.report["min_det"][0])))
         if record.time[-1] >= next_picture:
             record.pictures.append(picture(frame))
+            record.pictured.append(len(record.time) - 1)
             next_picture += args.picture_every
         if state.failed[0]:
             raise RaytacError(f"the physics broke down at {state.time[0]:.3f} s")
@@ -148,16 +152,24 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
     return controller, record
 
 
+LEAST_WIDTH = 320
+"""Pictures are enlarged by a whole factor to at least this width [px]."""
+ARROW_SCALE = 10.0
+"""Length of a drawn line over the marker's displacement."""
+
+
 def picture(frame: TactileFrame) -> np.ndarray:
-    """The image with the markers' displacements, ten times as long (H, W, 3) uint8."""
+    """The image, enlarged, with the markers' displacements over it, ``ARROW_SCALE`` times as long; (H, W, 3) uint8."""
     from PIL import Image, ImageDraw
 
     assert frame.rgb is not None and frame.markers is not None
-    image = Image.fromarray(frame.rgb[0])
+    height, width = frame.rgb.shape[1:3]
+    factor = -(-LEAST_WIDTH // width)
+    image = Image.fromarray(frame.rgb[0]).resize((factor * width, factor * height), Image.Resampling.BILINEAR)
     pen = ImageDraw.Draw(image)
-    for at, by in zip(frame.markers.rest_px[0], frame.markers.displacement_px[0], strict=True):
-        if np.isfinite(by).all() and np.hypot(*by) > 0.05:
-            pen.line([*at, *(at + 10.0 * by)], fill=(255, 255, 0), width=1)
+    for at, by in zip(factor * frame.markers.rest_px[0], factor * frame.markers.displacement_px[0], strict=True):
+        if np.isfinite(by).all() and np.hypot(*by) > 0.05 * factor:
+            pen.line([*at, *(at + ARROW_SCALE * by)], fill=(255, 255, 0), width=2)
     return np.asarray(image)
 
 
@@ -209,8 +221,8 @@ def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
     above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics} pad, from above")
     above.legend(loc="best", fontsize="small")
     rows = (
-        ("force [N]", (wrench[:, :3], ("x", "y", "z"))),
-        ("torque [N mm]", (1e3 * wrench[:, 3:], ("x", "y", "z"))),
+        ("force on\nthe pad [N]", (wrench[:, :3], ("x", "y", "z"))),
+        ("torque on\nthe pad [N mm]", (1e3 * wrench[:, 3:], ("x", "y", "z"))),
         ("longest marker\ndisplacement [mm]", (1e3 * np.array(record.markers)[:, None], ("",))),
     )
     first = None
@@ -220,23 +232,53 @@ def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
         for column, name in zip(values.T, names, strict=True):
             axes.plot(record.time, column, lw=0.9, label=name or None)
         axes.set_ylabel(label, fontsize="small")
-        if len(names) > 1:
-            axes.legend(ncols=3, fontsize="x-small", loc="best")
+        axes.tick_params(labelbottom=row == len(rows) - 1)
     assert first is not None
+    first.legend(
+        title="pad frame", ncols=4, fontsize="small", title_fontsize="small", loc="lower right", bbox_to_anchor=(1.0, 1.0)
+    )
     figure.axes[-1].set_xlabel("time [s]")
     figure.savefig(path, dpi=120)
 
 
-def film(record: Record, path: Path, strip: Path) -> None:
-    """All pictures as an animation, and eight of them in a row."""
+def film(record: Record, args: Args, path: Path) -> None:
+    """All pictures as an animation, at the speed of life."""
     from PIL import Image
 
-    if not record.pictures:
+    if record.pictures:
+        images = [Image.fromarray(p) for p in record.pictures]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=round(1e3 * args.picture_every), loop=0)
+
+
+def strip(record: Record, world: TactileWorld, path: Path, count: int = 8) -> None:
+    """Pictures in which the ball is felt, as far apart as can be, with a scale, the time, the phase and the force."""
+    from matplotlib.figure import Figure
+
+    touching = [k for k, step in enumerate(record.pictured) if record.wrench[step][2] < 0.0] or list(range(len(record.pictures)))
+    if not touching:
         return
-    images = [Image.fromarray(p) for p in record.pictures]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
-    chosen = np.linspace(0, len(images) - 1, min(8, len(images))).round().astype(int)
-    Image.fromarray(np.concatenate([record.pictures[i] for i in chosen], axis=1)).save(strip)
+    chosen = [touching[i] for i in np.unique(np.linspace(0, len(touching) - 1, count).round().astype(int))]
+    columns = min(4, len(chosen))
+    rows = -(-len(chosen) // columns)
+    camera = world.sensors[world.sensor_names[0]].spec.camera
+    sides = [np.array([0.0, pixels]) - middle for pixels, middle in zip(camera.resolution, camera.principal_point, strict=True)]
+    (left, right), (top, bottom) = (
+        1e3 * (pitch * side + origin) for pitch, side, origin in zip(camera.pixel_pitch, sides, camera.position[:2], strict=True)
+    )
+    figure = Figure(figsize=(3.4 * columns + 0.3, 2.7 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for place in axes.ravel()[len(chosen) :]:
+        place.set_axis_off()
+    for n, (place, k) in enumerate(zip(axes.ravel(), chosen, strict=False)):
+        step = record.pictured[k]
+        place.imshow(record.pictures[k], extent=(left, right, bottom, top))
+        place.set_title(
+            f"{record.time[step]:.2f} s, {PHASES[record.phase[step]]}, $F_z$ = {record.wrench[step][2]:.2f} N", fontsize=10
+        )
+        place.set_xlabel("x [mm]" if n + columns >= len(chosen) else "")
+        place.set_ylabel("y [mm]" if n % columns == 0 else "")
+    figure.suptitle(f"{world.physics} pad: tactile image, displacements of the markers × {ARROW_SCALE:g}", fontsize=11)
+    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ VIEWS: dict[str, tuple[float, float]] = {
 }
 """Elevation and azimuth [deg] where the usual ones show little."""
 USUAL_VIEW = (20, -62)
-SEE_THROUGH = ("spike_in_hole", "spike_in_crack", "wedge_in_crack", "squeeze_and_release", "blocked_drive")
+SEE_THROUGH = ("spike_in_hole", "spike_in_crack", "wedge_in_crack", "slotted_tetrahedron", "squeeze_and_release", "blocked_drive")
 INSETS = {"mass_ratio_1e4": "lower", "crush": "lower"}
 """Bodies that are too small to be seen beside the others of their case; they are drawn once more."""
 PIECES = 20

@@ -22,15 +22,32 @@ def pyramid(up: bool, size: float = SIZE) -> ipc.TetMesh:
     return ipc.TetMesh(v, t)
 
 
-def wedge(up: bool, size: float = SIZE) -> ipc.TetMesh:
-    """Three tetrahedra: a square base and, as far above or below it, an edge along x; the middle of the edge is at the origin."""
-    h = size / 2
-    z = -size if up else size
-    v = np.array([[-h, -h, z], [h, -h, z], [h, h, z], [-h, h, z], [-h, 0.0, 0.0], [h, 0.0, 0.0]])
+def wedge(up: bool, size: float = SIZE, width: float | None = None, height: float | None = None) -> ipc.TetMesh:
+    """Three tetrahedra: a base of ``size`` along x and ``width`` and, ``height`` above or below it, an edge along x.
+
+    The middle of the edge is at the origin; width and height are ``size`` unless given.
+    """
+    h, w = size / 2, (width or size) / 2
+    z = -(height or size) if up else (height or size)
+    v = np.array([[-h, -w, z], [h, -w, z], [h, w, z], [-h, w, z], [-h, 0.0, 0.0], [h, 0.0, 0.0]])
     t = np.array([[0, 1, 3, 4], [1, 2, 3, 5], [1, 3, 4, 5]])
     negative = np.linalg.det(v[t][:, 1:] - v[t][:, :1]) < 0
     t[negative] = t[negative][:, [0, 2, 1, 3]]
     return ipc.TetMesh(v, t)
+
+
+def notched_block(length: float, width: float) -> ipc.TriMesh:
+    """A block along x with a groove of walls at 45°, ``width`` wide and half as deep, whose lowest line is z = 0; closed.
+
+    The block is twice as wide as the groove and as high as it is wide.
+    """
+    d = width / 2
+    profile = np.array([(-width, -d), (0, -d), (width, -d), (width, d), (d, d), (0, 0), (-d, d), (-width, d)])
+    n = len(profile)
+    v = np.concatenate([np.column_stack([np.full(n, x), profile]) for x in (-length / 2, length / 2)])
+    side = [(k, (k + 1) % n, n + (k + 1) % n) for k in range(n)] + [(k, n + (k + 1) % n, n + k) for k in range(n)]
+    end = np.array([(0, 1, 5), (0, 5, 6), (0, 6, 7), (1, 2, 5), (2, 4, 5), (2, 3, 4)])
+    return ipc.TriMesh(v, np.concatenate([np.array(side), end[:, ::-1], end + n]))
 
 
 def as_surface(mesh: ipc.TetMesh) -> ipc.TriMesh:

@@ -1,6 +1,6 @@
 """Watch a policy and count how often it succeeds: a film of the scene with what the sensors see beside it, and a success rate.
 
-    python experiments/play.py experiments/policies/balance_pole.pt
+    python experiments/play.py experiments/policies/balance_pole_wrench.pt
     python experiments/play.py scripted --task LiftCube --episodes 20
 
 Writes ``film.gif`` (``film.mp4`` with ``--mp4``, where the program ffmpeg is installed), ``strip.png`` and ``metrics.json``. The film
@@ -29,6 +29,7 @@ from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 from raytac.observe import MODALITIES, ObservationSettings
 from raytac.report.machine import machine
+from raytac.sensor import OPTICS
 
 if TYPE_CHECKING:
     from experiments.ppo_learner import Evaluation, Recipe
@@ -43,15 +44,17 @@ class Args(CommonOptions):
     task: str = "LiftCube"
     """Task of the scripted policy; a file knows its own."""
     episodes: int = 100
-    """Episodes that the success rate is counted from; 0: the film alone."""
+    """Episodes that are played for the success rate; 0: the film alone."""
     num_envs: int = 16
-    """Environments that they run in."""
+    """Most of them that run at a time."""
     film: bool = True
     """Draw an episode."""
     mp4: bool = False
     """Write the film as MP4 by ffmpeg instead of as GIF."""
-    optics: str = "phong"
-    """Optical model of the sensors' images in the film; the policy is not shown them unless it was trained with them."""
+    optics: str = "raytrace"
+    """Optical model of the sensors' images in the film: ``raytrace`` (the sensor's own colours), ``taxim`` (nearly these, by a table
+    that is baked at first use: minutes) or ``phong`` (quicker, in colours of its own). The policy is not given them; if it was trained with
+    images, the film shows those."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,11 @@ class Film:
 def main(args: Args) -> dict[str, Metric]:
     """Play, and write all."""
     start = time.perf_counter()
+    if args.episodes < 0 or args.num_envs < 1:
+        name, least = ("episodes", 0) if args.episodes < 0 else ("num_envs", 1)
+        raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
+    if args.optics not in OPTICS:
+        raise InputError("optics", value=args.optics, rule="must be a known optical model", choices=OPTICS)
     if args.mp4 and shutil.which("ffmpeg") is None:
         raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
     recipe = _recipe(args)
@@ -89,7 +97,7 @@ def main(args: Args) -> dict[str, Metric]:
             result = _rate(args, recipe)
             low, high = result.interval
             found |= {
-                "episodes": result.episodes, "success": result.successes / result.episodes, "success_low": low,
+                "episodes": result.episodes, "failed": result.failures, "success": result.successes / result.episodes, "success_low": low,
                 "success_high": high, "return": result.mean_return, "length": result.mean_length,
             }  # fmt: skip
             print(
@@ -115,10 +123,16 @@ def _recipe(args: Args) -> Recipe | None:
         from experiments.ppo_learner import Checkpoint
 
         saved = Checkpoint.load(Path(args.policy)).recipe
-        return replace(saved, processes=1, num_envs=args.num_envs, device="cpu" if args.device == "auto" else args.device)
+        return replace(saved, processes=1, num_envs=_together(args), device="cpu" if args.device == "auto" else args.device)
     if args.task not in SCRIPTED:
         raise InputError("task", value=args.task, rule="must be a known task", choices=tuple(SCRIPTED))
     return None
+
+
+def _together(args: Args) -> int:
+    """How many environments play ``episodes`` in as few rounds as ``num_envs`` allow, all about equally often."""
+    rounds = max(1, -(-args.episodes // args.num_envs))
+    return max(1, -(-args.episodes // rounds))
 
 
 def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
@@ -130,11 +144,11 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
         learner = Learner(recipe)
         learner.restore(Checkpoint.load(Path(args.policy)))
         return evaluate(learner, args.episodes, first_seed=2 * 10**6)
-    env, policy = KINDS[args.task](args.num_envs, tactile=None), SCRIPTED[args.task]
-    returns, lengths, successes = [], [], 0
+    env, policy = KINDS[args.task](_together(args), tactile=None), SCRIPTED[args.task]
+    returns, lengths, successes, failures = [], [], 0, 0
     while len(returns) < args.episodes:
         env.reset(seed=HELD_OUT + 2 * 10**6 + len(returns))
-        running, earned, steps = np.ones(env.num_envs, bool), np.zeros(env.num_envs), 0
+        running, earned, steps = np.arange(env.num_envs) < args.episodes - len(returns), np.zeros(env.num_envs), 0
         while running.any():
             _, reward, terminated, truncated, infos = env.step(np.clip(policy(env.batch), -1.0, 1.0))
             earned, steps = earned + reward * running, steps + 1
@@ -142,8 +156,9 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
             returns += earned[ended].tolist()
             lengths += [steps] * int(ended.sum())
             successes += int(infos["success"][ended].sum())
+            failures += int(infos["failed"][ended].sum())
             running &= ~ended
-    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
 
 
 def _film(args: Args, recipe: Recipe | None) -> Film:

@@ -101,6 +101,8 @@ class Evaluation:
     successes: int
     mean_return: float
     mean_length: float
+    failures: int
+    """Episodes that ended because the physics broke down."""
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -350,22 +352,23 @@ def _checked_moments(name: str, rms: RunningMeanStd, saved: object) -> tuple[np.
 
 
 def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluation:
-    """The first episode of each environment from held-out seeds ``first_seed``, …, in rounds; at least ``episodes`` of them."""
+    """``episodes`` episodes from held-out seeds ``first_seed``, …, one a seed, as many at a time as there are environments."""
     env = learner.model.get_env()
     assert env is not None
     learner.normaliser.training = False
-    returns, lengths, successes = [], [], 0
+    returns, lengths, successes, failures = [], [], 0, 0
     try:
         while len(returns) < episodes:
             env.seed(HELD_OUT + first_seed + len(returns))
-            observation, running = env.reset(), np.ones(env.num_envs, bool)
+            observation, running = env.reset(), np.arange(env.num_envs) < episodes - len(returns)
             while running.any():
                 observation, _, done, infos = env.step(learner.predict(observation))  # type: ignore[arg-type]
                 for b in np.flatnonzero(running & done):
                     returns.append(infos[b]["episode"]["r"])
                     lengths.append(infos[b]["episode"]["l"])
                     successes += infos[b]["success"]
+                    failures += infos[b]["failed"]
                 running &= ~done
     finally:
         learner.normaliser.training = True
-    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)

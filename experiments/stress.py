@@ -45,7 +45,9 @@ SENSORS = ("gelsight_mini", "gelsight_dome")
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh", "soft_ball")
 """Shipped scenes whose objects are pressed; a soft one on the simulated pad alone."""
 SHALLOW = 0.6
-"""Of the thickness: what a pad should hold anywhere."""
+"""Share of the thickness that a pad should hold anywhere."""
+DEEP = {"rigid": 0.5, "ipc": 0.2}
+"""Share of the presses that go deeper."""
 BALANCE = 1e-3
 Row = dict[str, object]
 
@@ -63,7 +65,7 @@ class Args(CommonOptions):
     pad: str = PADS[0]
     """How finely the simulated pad is cut."""
     deepest: float = 0.999
-    """Depth of the deepest press as a share of the pad's thickness; one in three goes beyond 0.6 where this allows it."""
+    """Depth of the deepest press as a share of the pad's thickness; beyond 0.6 go one in two rigid presses and one in five others."""
 
 
 def main(args: Args) -> dict[str, Metric]:
@@ -121,7 +123,7 @@ def random_press(physics: str, seed: int, number: int, deepest: float) -> tuple[
         thing = replace(thing, quaternion=tuple((turn / np.linalg.norm(turn)).tolist()))
     half = 0.5 * np.asarray(gelpad.size)
     place = rng.uniform(-0.98, 0.98, 2) * half
-    deep = rng.random() < 1.0 / 3.0 and deepest > SHALLOW
+    deep = rng.random() < DEEP[physics] and deepest > SHALLOW
     share = float(rng.uniform(SHALLOW, deepest) if deep else rng.uniform(0.02, min(SHALLOW, deepest)))
     stages = [StageSpec("indent", depth=share * gelpad.thickness)]
     if rng.random() < 0.15:

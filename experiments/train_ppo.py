@@ -176,7 +176,7 @@ def _train(job: _Job) -> None:
         result = evaluate(training.learner, args.final_evaluation, first_seed=10**6)
         low, high = result.interval
         found: dict[str, Metric] = {
-            "steps": training.steps, "training_wall_s": training.wall_s, "episodes": result.episodes,
+            "steps": training.steps, "training_wall_s": training.wall_s, "episodes": result.episodes, "failed": result.failures,
             "success": result.successes / result.episodes, "success_low": low, "success_high": high,
             "return": result.mean_return, "length": result.mean_length, "device": device, "wall_s": time.time() - job.start,
         }  # fmt: skip

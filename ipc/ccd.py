@@ -3,6 +3,10 @@
 Li, Kaufman, Jiang 2021, "Codimensional Incremental Potential Contact", algorithm 1. After the mean displacement is taken out, no
 distance can shrink faster than l = max‖δ_A‖ + max‖δ_B‖ per unit of t, so t may always advance by d/l times a safety factor. The
 advance stops when the distance has fallen to ``slack`` of the one at the start.
+
+Distances are known to a few units in the last place of the coordinates (:mod:`ipc.distance`), and positions are rounded once more when a
+step is taken. A step therefore never ends with a distance below ``RESOLUTION`` of the largest coordinate, where rounding could put surfaces
+through each other; a pair that is closer already may not come closer.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -22,6 +26,8 @@ wp.set_module_options({"enable_backward": False})
 
 SAFETY = wp.constant(wp.float64(0.9))
 MAX_ADVANCES = wp.constant(500)
+RESOLUTION = wp.constant(wp.float64(1.0e-13))
+"""Least distance that a step may leave, over the largest coordinate; some hundred times what rounding moves a point."""
 
 
 @wp.func
@@ -44,11 +50,13 @@ def additive_ccd(
     d3: wp.vec3d,
     slack: wp.float64,
     floor: wp.float64,
+    least: wp.float64,
     t_max: wp.float64,
 ) -> wp.float64:
     """The t in [0, t_max] to which the pair may go; t_max if its distance stays above ``slack`` of the one at t = 0.
 
-    Nor may it fall below ``floor`` [m]; a pair that is already there may hardly come closer.
+    Nor may it fall below ``floor`` [m]; a pair that is already there may hardly come closer. At t it is not below ``least`` [m]; a pair
+    that is already there is no closer than it was.
     """
     zero = wp.float64(0.0)
     mean = wp.float64(0.25) * (d0 + d1 + d2 + d3)
@@ -59,23 +67,28 @@ def additive_ccd(
     if speed == zero:
         return t_max
     start = pair_distance(ee, x0, x1, x2, x3)
-    gap = wp.max(slack * start, wp.min(floor, wp.float64(0.999) * start))
-    if start - gap > speed * t_max:
+    most = wp.float64(0.999)
+    gap = wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
+    end = wp.max(gap, wp.min(least, start))
+    if start - end > speed * t_max:
         return t_max
-    t = zero
-    d = start
+    t, kept, d = zero, zero, start
     for _ in range(MAX_ADVANCES):
         # The next time at which the distance could have fallen to the gap; the safety factor covers rounding.
         t_next = t + SAFETY * (d - gap) / speed + wp.float64(1.0e-15)
         if t_next >= t_max:
-            return t_max
+            if end == gap:
+                return t_max
+            t_next = t_max
+        before = d
         d = pair_distance(ee, x0 + t_next * d0, x1 + t_next * d1, x2 + t_next * d2, x3 + t_next * d3)
-        if d <= gap * wp.float64(1.001) or t_next - t < wp.float64(1.0e-6):
-            if d > gap:
-                return t_next
-            return t
+        if d > gap and d >= end:
+            kept = t_next
+        # A pair that parts goes on however small its advances are: they grow with the distance.
+        if t_next == t_max or d <= gap * wp.float64(1.001) or (t_next - t < wp.float64(1.0e-6) and d <= before):
+            return kept
         t = t_next
-    return t
+    return kept
 
 
 @wp.kernel
@@ -86,6 +99,7 @@ def ccd_pt(
     candidates: Candidates,
     slack: wp.array(dtype=wp.float64),
     floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -110,6 +124,7 @@ def ccd_pt(
         dx[env, f2],
         slack[env],
         floor[env],
+        RESOLUTION * reach[env],
         bound,
     )
     if t < bound:
@@ -124,6 +139,7 @@ def ccd_ee(
     candidates: Candidates,
     slack: wp.array(dtype=wp.float64),
     floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -148,6 +164,7 @@ def ccd_ee(
         dx[env, b1],
         slack[env],
         floor[env],
+        RESOLUTION * reach[env],
         bound,
     )
     if t < bound:
@@ -165,6 +182,7 @@ def ccd_plane(
     t1: wp.array2d(dtype=wp.vec3d),
     slack: wp.array(dtype=wp.float64),
     floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     # outputs
     alpha: wp.array(dtype=wp.float64),
@@ -178,5 +196,6 @@ def ccd_plane(
     d0 = wp.dot(wp.vec3d(A[0, 2], A[1, 2], A[2, 2]), x[env, v] - t0[env, body])
     d1 = wp.dot(wp.vec3d(B[0, 2], B[1, 2], B[2, 2]), x[env, v] + dx[env, v] - t1[env, body])
     gap = wp.max(slack[env] * d0, wp.min(floor[env], wp.float64(0.999) * d0))
+    gap = wp.max(gap, wp.min(RESOLUTION * reach[env], d0))
     if d1 < gap:
         wp.atomic_min(alpha, env, (d0 - gap) / (d0 - d1))

@@ -307,16 +307,20 @@ class Collision:
         frames1: tuple[wp.array, wp.array],
         slack: wp.array,
         floor: wp.array,
+        reach: wp.array,
         active: wp.array,
         alpha: wp.array,
     ) -> None:
-        """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m]."""
+        """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m].
+
+        ``reach`` (B,) is the largest coordinate [m]: no step ends with distances that rounding could close.
+        """
         if self._meshes:
             for kernel, items in ((ccd.ccd_pt, self.candidates.pt), (ccd.ccd_ee, self.candidates.ee)):
-                inputs = [x, dx, self.surface, self.candidates, slack, floor, active]
+                inputs = [x, dx, self.surface, self.candidates, slack, floor, reach, active]
                 wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
         if self.planes:
-            inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, active]
+            inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, reach, active]
             wp.launch(ccd.ccd_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[alpha], device=self.device)
 
     # --- friction --------------------------------------------------------------------------------------------------------------

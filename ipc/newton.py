@@ -239,7 +239,7 @@ class Newton:
         pot.launch(dynamics.difference, pot.x.shape, [pot.x1, pot.x], [pot.dx])
         pot.collision.refresh(pot.x, pot.dx, d.shorten)
         d.alpha.fill_(1.0)
-        pot.collision.limit_step(pot.x, pot.dx, (pot.R, pot.t), (pot.R1, pot.t1), d.slack, d.floor, d.shorten, d.alpha)
+        pot.collision.limit_step(pot.x, pot.dx, (pot.R, pot.t), (pot.R1, pot.t1), d.slack, d.floor, pot.reach, d.shorten, d.alpha)
         pot.elastic_change(d.shorten, d.trial_det)
         ctl.flags.shorten.zero_()
         ctl.launch(control.judge_travel)
@@ -254,7 +254,7 @@ class Newton:
         with self._stage("ccd"):
             ctl.launch(control.start_limit, control.CCD_SLACK)
             frames = (pot.R, pot.t)
-            pot.collision.limit_step(pot.x, pot.dx, frames, frames, d.slack, d.floor, d.plain, d.alpha)
+            pot.collision.limit_step(pot.x, pot.dx, frames, frames, d.slack, d.floor, pot.reach, d.plain, d.alpha)
         with self._stage("line_search"):
             pot.slope(d.plain, d.slope, d.noise)
             ctl.launch(control.start_search, pot.reach)

@@ -13,6 +13,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.traction import cell_areas
+from raytac.report.press import press_metrics
 from raytac.sensor import TactileSensor
 from raytac.sensor.contact_width import NarrowContactWarning
 from raytac.specs import load_press
@@ -42,6 +43,14 @@ def test_wrench_traction_and_area_mean_the_same(frames, physics):
     assert frame.wrench[0, 2] < -0.2
     assert frame.contact_area[0] == pytest.approx(frame.surface.contact.sum() * 0.2e-3**2, rel=0.01)
     assert (frame.force_law_area is None) == (physics == "ipc")
+    assert (None if frame.unconverged is None else frame.unconverged.tolist()) == ([0] if physics == "ipc" else None)
+
+
+def test_metrics_count_the_steps_that_did_not_converge(frames):
+    sensor, frame = frames["ipc"]
+    found = press_metrics(sensor, SCENE, replace(frame, unconverged=np.array([3])), sensor.rest())
+    assert found["contact.unconverged_steps"] == 3
+    assert "contact.unconverged_steps" not in press_metrics(frames["rigid"][0], SCENE, frames["rigid"][1], sensor.rest())
 
 
 def test_both_pads_make_about_the_same_press(frames):

@@ -6,7 +6,7 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class PressDataset:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, i: int) -> dict[str, np.ndarray]:
+    def __getitem__(self, i: SupportsIndex) -> dict[str, np.ndarray]:
         """Press ``i`` of those in ``manifest``, counted from the end if it is negative.
 
         Raises:
@@ -97,12 +97,12 @@ class PressDataset:
         found = {name: np.array(self._shard(shard)[name][row]) for name in self._arrays}
         return found | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
-    def shared(self, i: int) -> dict[str, np.ndarray]:
+    def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
         """What the presses of press ``i``'s shard have in common: grid, height and image at rest. Errors as for ``data[i]``."""
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
 
-    def _place(self, i: int) -> int:
+    def _place(self, i: SupportsIndex) -> int:
         try:
             place = operator.index(i)
         except TypeError as error:
@@ -161,7 +161,7 @@ def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[s
 
 def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:
     """Kinds of the arrays of a shard as ``dataset.json`` has them, with its sensor's shapes; and the sizes that are known."""
-    own: dict[str, list[int | str]] = description["sensors"][file.sensor]["arrays"]
+    own: dict[str, Any] = description["sensors"][file.sensor]["arrays"]
     declared = {**description["arrays"], **description["arrays_of_a_shard"]}
     kinds = {name: ArrayKind(item["dtype"], tuple(own.get(name, item["shape"])), "", "") for name, item in declared.items()}
     sizes = {"N": file.count}

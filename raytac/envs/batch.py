@@ -21,6 +21,7 @@ from raytac.observe import ArraySpec, ObservationSettings, Randomization, Tactil
 from raytac.physics.rotation import inverse
 from raytac.robots.pose import pose_error
 from raytac.specs.press import chosen_physics
+from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld
 
@@ -71,7 +72,7 @@ class TaskBatch:
         max_episode_steps: int | None = None,
         device: str = "auto",
         seed: int = 0,
-        scene: str | Path | None = None,
+        scene: str | Path | TaskScene | None = None,
         pitch: float | None = None,
     ) -> None:
         """Compose the world; episodes begin with ``reset``.
@@ -87,7 +88,7 @@ class TaskBatch:
             randomization: of sensors, cameras, bodies and mounts; None is none.
             max_episode_steps: after which an episode is truncated; None is as the task has it.
             seed: of what is drawn once a world, and of streams that no ``reset`` has seeded.
-            scene: another task scene with the same names in it, name or path.
+            scene: another task scene with the same names in it: name, path or the scene itself.
             pitch: spacing of the grid that the gel's surface is computed on [m]; None is 0.4 mm, or that of the
                 images if they are finer.
 
@@ -99,7 +100,7 @@ class TaskBatch:
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
-        loaded = load_task(task.scene if scene is None else scene)
+        loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the sensor needs no markers: the force alone is asked of the probe.
         asked = ObservationSettings(("wrench",)) if settings is None else settings
@@ -208,15 +209,17 @@ class TaskBatch:
             {name: np.nan_to_num(w) for name, w in state.wrench.items()},
             np.where(sound, self.steering.joint_speed(), 0.0), actions, last,
         )  # fmt: skip
+        judged = time.perf_counter()
+        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
+        failed = self.world.failed  # also what only the surface shows
+        self.time_s["observation"] += time.perf_counter() - judged
+        judged = time.perf_counter()
         verdict = self.task.judge(now)
         terms = {name: np.where(failed, 0.0, np.asarray(term, float)) for name, term in verdict.terms.items()}
         reward = np.sum(list(terms.values()), axis=0)
         terminated = verdict.terminated & ~failed
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
-        judged = time.perf_counter()
-        self.time_s["reward"] += judged - done
-        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
-        self.time_s["observation"] += time.perf_counter() - judged
+        self.time_s["reward"] += time.perf_counter() - judged
         return Outcome(observation, reward, terminated, truncated, terms, verdict.success & ~failed, failed)
 
     # --- observations ----------------------------------------------------------------------------------------------------------

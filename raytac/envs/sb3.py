@@ -74,8 +74,9 @@ class _DictVecEnv(VecEnv):
 class TactileVecEnv(_DictVecEnv):
     """A ``TactileVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
 
-    ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. ``seed(s)``
-    before ``reset`` seeds environment b with s + b.
+    ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. One that
+    ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not count on what would have come after.
+    ``seed(s)`` before ``reset`` seeds environment b with s + b.
     """
 
     def __init__(self, env: TactileVectorEnv) -> None:
@@ -198,7 +199,7 @@ def _answer(
 ) -> Answer:
     """A vector's step as a ``VecEnv`` tells it."""
     infos: list[dict[str, Any]] = [
-        {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut)}
+        {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut and not failed)}
         for success, failed, cut in zip(told["success"], told["failed"], truncated, strict=True)
     ]
     for b in np.flatnonzero(terminated | truncated):

@@ -19,9 +19,9 @@ _DEFAULT_PORTS = (80, 443)
 class PageAddresses:
     """Names and ports under which browsers may reach the page.
 
-    Any web page that a user opens may send requests to this machine. A browser tells in the header ``Origin`` which page a request comes
-    from, and in ``Host`` which name was asked for. A page of another origin is told by the first; a name that its owner has let point to
-    this machine (DNS rebinding) by the second.
+    Any web page that a user opens may send requests to this machine. In the header ``Origin`` a browser names the page that a request
+    comes from, in ``Host`` the name that it asked for. The first shows another page; the second shows a foreign name whose owner has let
+    it point to this machine (DNS rebinding).
     """
 
     def __init__(self, host: str, allow_hosts: Sequence[str] = ()) -> None:
@@ -35,6 +35,11 @@ class PageAddresses:
         Raises:
             InputError: one that is no host name or address.
         """
+        for name, value in (("host", host), *(("allow_host", value) for value in allow_hosts)):
+            if not isinstance(value, str):
+                raise InputError(name, value=value, rule="must be text")
+        if isinstance(allow_hosts, str):
+            raise InputError("allow_hosts", value=allow_hosts, rule="must be a list of names")
         self._pairs: set[tuple[str, int | None]] = {(name, None) for name in (*_LOCAL, _bracketed(host.lower()))}
         """Name and port; None is the port that is listened at."""
         self._pairs |= {_split(text) for text in allow_hosts}

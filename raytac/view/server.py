@@ -66,12 +66,13 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
             __init__ = _copied(viser.ViserServer.__init__, infra=_overlaid(infra, WebsockServer=Sockets))  # type: ignore[assignment]
 
         server = Server(host, port, verbose=False)
-        elements = server.gui._gui_input_handle_from_uuid
     except AttributeError as error:
         raise BackendError(f"{_CHANGED} ({error})") from error
-    if not guarded:
+    known = getattr(server.gui, "_gui_input_handle_from_uuid", None)
+    if not guarded or known is None:
         server.stop()
         raise BackendError(_CHANGED)
+    elements = known
     return server
 
 
@@ -100,7 +101,10 @@ def _refuse_others(addresses: PageAddresses, serve_files: Callable[..., Any] | N
         if reason:
             _LOG.info("refused %s: %s", _who(connection), reason)
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"raytac view: {reason}.\n")
-        return serve_files(connection, request) if serve_files is not None else None
+        response = serve_files(connection, request) if serve_files is not None else None
+        if response is not None:  # no other page may show this one in a frame and have users click on it unawares
+            response.headers["Content-Security-Policy"] = "frame-ancestors 'self'"
+        return response
 
     return process
 
@@ -131,7 +135,7 @@ def _who(connection: ServerConnection) -> str:
 
 
 class _OneLine(logging.Filter):
-    """Faults of the other end are told in one line, without a traceback; a request that is no HTTP, or never comes, not at all.
+    """Logs faults of a connection in one line, without a traceback; a request that is no HTTP, or never comes, not at all.
 
     Browsers open connections ahead that they then do not use.
     """

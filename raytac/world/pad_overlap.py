@@ -138,6 +138,7 @@ class _Nodes:
         self.pitch, self.cell = pitch, grid.pitch[0] * grid.pitch[1]
         self.near = near
         self.highest = float(grid.rest.max())
+        self._bond, self._thinnest = -gelpad.thickness, gelpad.thickness + float(grid.rest.min())
         # The rest surface is a sum of a function of x and one of y (``GelpadSpec.sag``), and so are its slopes.
         rest_x, rest_y = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)
         self._rest, self._rest_x, self._rest_y = grid.rest, rest_x, rest_y
@@ -153,11 +154,15 @@ class _Nodes:
         return [(np.flatnonzero(size == one), one) for one in sorted(set(size.tolist()))]
 
     def gaps(self, parts: Sequence[Part], ball: _Ball, size: int) -> _Gaps:
-        """Gaps of the body that each ball holds, on windows about them; what is ``near`` above the highest gel may read inf."""
+        """Gaps of the body that each ball holds, on windows about them; what is ``near`` above the highest gel may read inf.
+
+        Lines on which the body reaches below the bonded face read inf: it lies behind the pad there, or went through it (``BondedFace``).
+        """
         below, pad_from_body = self.highest + self.near, ball.pad_from_body
         nodes = int(_WINDOWS[size]) if size < len(_WINDOWS) else max(len(self.x), len(self.y))
         columns, rows = (_window(line, pad_from_body[:, k, 3], nodes) for k, line in enumerate((self.x, self.y)))
-        if columns.shape[1] == len(self.x) and rows.shape[1] == len(self.y):
+        whole = columns.shape[1] == len(self.x) and rows.shape[1] == len(self.y)
+        if whole:
             values = object_height(parts, pad_from_body, self.x, self.y, below=below)
             values -= self._rest
         else:
@@ -167,7 +172,14 @@ class _Nodes:
             values = object_height(parts, pad_from_body, x, y, below=below)
             values -= self._rest_x[columns][:, None, :]
             values -= self._rest_y[rows][:, :, None]
-        return _Gaps(values, columns, rows, values.min(axis=(1, 2)))
+        least = values.min(axis=(1, 2))
+        deep = np.flatnonzero(least < -self._thinnest)
+        if len(deep):
+            at = (columns, rows) if len(columns) == 1 else (columns[deep], rows[deep])
+            rest = self._rest if whole else self._rest_x[at[0]][:, None, :] + self._rest_y[at[1]][:, :, None]
+            values[deep] = np.where(values[deep] + rest < self._bond, np.inf, values[deep])
+            least[deep] = values[deep].min(axis=(1, 2))
+        return _Gaps(values, columns, rows, least)
 
     def measure(self, gaps: _Gaps, env: np.ndarray, chosen: np.ndarray) -> Touches:
         """Depth, centroid and normal of the overlaps that a mask chooses; ``env`` is what the environments are called."""

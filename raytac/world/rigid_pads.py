@@ -29,8 +29,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from raytac.errors import OverlapError
 from raytac.gel.elastic import ElasticSurround
 from raytac.gel.object_height import object_height, object_radius
+from raytac.gel.pierced import without_pierced
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.load_law import LoadLaw
@@ -38,6 +40,7 @@ from raytac.physics.pad_reading import PadReading
 from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import body_poses, site_poses
 from raytac.specs.sensor import SensorSpec
+from raytac.world.bonded_face import BondedFace
 from raytac.world.compose import ComposedScene
 from raytac.world.pad_overlap import PadOverlap, Touches
 from raytac.world.state import Drive, lost
@@ -64,9 +67,13 @@ class _Pad:
         self.mounted, self.spec = mounted, spec
         self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
         self.gel = int(model.geom(mounted.gel).id)
-        self.overlap = PadOverlap(spec.gelpad)
+        self.overlap, self.face = PadOverlap(spec.gelpad), BondedFace(spec.gelpad)
         self.highest = self.overlap.highest
         self.reach = 0.5 * np.asarray(spec.gelpad.size)
+
+
+_PadPoses = tuple[str, _Pad, np.ndarray, np.ndarray]
+"""A pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4)."""
 
 
 @dataclass(frozen=True)
@@ -103,15 +110,29 @@ class RigidPads:
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
-        """Forget what environments went through; where bodies start, MuJoCo knows."""
+        """Forget what environments went through; where bodies start, MuJoCo knows.
+
+        Raises:
+            OverlapError: a body starts beyond a pad's bonded face.
+        """
+        for b in envs:
+            for sensor, body, depth in self.overlap(datas[b]):
+                if np.isinf(depth):
+                    raise OverlapError(
+                        f"environment {b}: {body!r} starts beyond the face that the gel of {sensor!r} is bonded to"
+                    )
         for b in envs:
             self._laws[b] = {}
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
                 wrench[b], pressed[b] = 0.0, -1
 
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
-        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
+        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
+
+        So are those in which a body goes through a pad: its contact, a spring, gives way to what is too fast or too heavy for it.
+        """
         scene, models = self.composed.scene, self._models
+        before = {name: np.full((len(datas), len(self.bodies), 4, 4), np.nan) for name in self.pads}
         sound, touching = np.flatnonzero(~failed), []
         for b in sound.tolist():
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
@@ -120,7 +141,9 @@ class RigidPads:
                 break
             for b in sound.tolist():
                 mujoco.mj_step1(models[b], datas[b])
-            touching = self._add_contacts(datas, sound, failed)
+            poses = list(self._poses([datas[b] for b in sound.tolist()]))
+            self._mark_pierced(poses, sound, before, failed)
+            touching = self._add_contacts(poses, datas, sound, failed)
             sound = sound[~failed[sound]]
             if not len(sound):
                 break
@@ -138,17 +161,22 @@ class RigidPads:
         self._read_forces(datas, sound, [contact for contact in touching if not failed[contact.env]])
         for b in sound.tolist():
             mujoco.mj_kinematics(models[b], datas[b])  # so that poses are those of the end of the step
+        if len(sound):
+            self._mark_pierced(list(self._poses([datas[b] for b in sound.tolist()])), sound, before, failed)
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
         return self._wrench[name].copy()
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
-        """Sensor, body and depth [m] of every overlap at the present poses."""
+        """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
         found = []
         for name, pad, _, pad_from_body in self._poses([data]):
             near = self._near(pad, pad_from_body)
             for i in np.flatnonzero(near[0]).tolist():
+                if pad.face.pierced(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))[0]:
+                    found.append((name, self.bodies[i].spec.name, np.inf))
+                    continue
                 touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
                 found += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
         return found
@@ -170,6 +198,12 @@ class RigidPads:
         for i in np.flatnonzero(near.any(axis=0)).tolist():
             rows_near = np.flatnonzero(near[:, i])
             under = object_height(self.bodies[i].parts, pad_from_body[rows_near, i], grid.x, grid.y, below=highest)
+            behind = under < -pad.spec.gelpad.thickness
+            if behind.any():
+                deep = np.flatnonzero(behind.any(axis=(1, 2)))
+                deep = deep[pad.face.pierced(self.bodies[i].parts, pad_from_body[rows_near[deep], i], float(self._radius[i]))]
+                under[behind] = np.inf
+                under[deep] = np.nan
             depth = (grid.rest - under).max(axis=(1, 2))
             deeper = depth > deepest[rows_near]
             at = rows_near[deeper]
@@ -183,11 +217,12 @@ class RigidPads:
         before = self._pressed[name][rows]
         poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
         self._pressed[name][rows] = np.where(failed, before, pressed)
-        surface = self._shown[name][1].surface(height, poses)
+        surface = without_pierced(self._shown[name][1].surface(height, poses), pad.spec.gelpad)
+        failed = np.isnan(surface.height[:, 0, 0])
         wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
         return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
 
-    def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[tuple[str, _Pad, np.ndarray, np.ndarray]]:
+    def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
         """Every pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
         world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
         for k, (name, pad) in enumerate(self.pads.items()):
@@ -204,14 +239,35 @@ class RigidPads:
             near[:, self._planes] = lowest < np.vecdot(normal, at)
         return near
 
-    def _add_contacts(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> list[_Contact]:
+    def _mark_pierced(
+        self, poses: Sequence[_PadPoses], envs: np.ndarray, before: dict[str, np.ndarray], failed: np.ndarray
+    ) -> None:
+        """Mark environments in which a body is beyond a pad's bonded face, or was on the way from ``before``, which is renewed."""
+        for name, pad, _, pad_from_body in poses:
+            was, near = before[name][envs], self._near(pad, pad_from_body)
+            before[name][envs] = pad_from_body
+            for i, body in enumerate(self.bodies):
+                radius, now = float(self._radius[i]), pad_from_body[:, i]
+                pierced, rows = np.zeros(len(envs), bool), np.flatnonzero(near[:, i])
+                if len(rows):
+                    pierced[rows] = pad.face.pierced(body.parts, now[rows], radius)
+                pieces = pad.face.pieces(was[:, i], now, radius)
+                for row in np.flatnonzero(pieces > 1).tolist():
+                    way = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
+                    way = way[self._near(pad, np.repeat(way[:, None], len(self.bodies), axis=1))[:, i]]
+                    pierced[row] |= pad.face.pierced(body.parts, way, radius).any()
+                failed[envs[pierced]] = True
+
+    def _add_contacts(
+        self, poses: Sequence[_PadPoses], datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray
+    ) -> list[_Contact]:
         """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
         found, models = [], self._models
-        some = [datas[b] for b in envs.tolist()]
         weight = models.inverse_weight[envs]
-        for sensor, (name, pad, world_from_pad, pad_from_body) in enumerate(self._poses(some)):
+        for sensor, (name, pad, world_from_pad, pad_from_body) in enumerate(poses):
             compliance = weight[:, pad.body, None] + weight[:, self._body_index]
-            near = self._near(pad, pad_from_body) & (compliance > 0.0)  # where that is 0 neither moves
+            # Where the compliance is 0 neither moves.
+            near = self._near(pad, pad_from_body) & (compliance > 0.0) & ~failed[envs][:, None]
             for i in np.flatnonzero(near.any(axis=0)).tolist():
                 rows = np.flatnonzero(near[:, i])
                 touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[rows, i], float(self._radius[i]))

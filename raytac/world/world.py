@@ -183,8 +183,8 @@ class TactileWorld:
         Raises:
             InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid, joints out of
                 their range, or a variation that cannot be (see ``EnvironmentModels.check``).
-            OverlapError: bodies overlap at a start that is given, with simulated pads. After an error nothing has changed. With the rigid
-                pad a start may be one in contact, as it was recorded, so overlap is not looked for.
+            OverlapError: bodies overlap at a start that is given, with simulated pads. With the rigid pad a start may be one in contact, as
+                it was recorded, but no body may lie beyond a gel's bonded face. After an error nothing has changed.
         """
         chosen = chosen_envs(envs, self.num_envs)
         places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
@@ -275,6 +275,11 @@ class TactileWorld:
         self._pads.advance(self.data, self._drive(self.hold if control is None else control), self._failed)
         return self.state()
 
+    @property
+    def failed(self) -> np.ndarray:
+        """Environments whose physics broke down, (B,), bool."""
+        return self._failed.copy()
+
     def hold(self, data: mujoco.MjData, time: float) -> None:
         """The controller that keeps the robot where it starts."""
         data.ctrl[:] = self.composed.ctrl
@@ -317,7 +322,9 @@ class TactileWorld:
         frames = {}
         for name in chosen:
             sensor = self.sensors[name]
-            frames[name] = sensor.update(self._pads.reading(name, sensor.grid, self.data, self._failed, rows), rows)
+            reading = self._pads.reading(name, sensor.grid, self.data, self._failed, rows)
+            self._failed[slice(None) if rows is None else rows] |= reading.failed
+            frames[name] = sensor.update(reading, rows)
         return frames
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from experiments.ball_rolling import Args, main
 from raytac.io.metrics import read_metrics
@@ -22,6 +23,8 @@ def test_a_short_stroke_with_the_rigid_pad(tmp_path: Path) -> None:
     # Between two parallel planes a ball that slips on neither goes exactly half as far; the dent adds a little: R / (2 R − δ) of the way.
     assert value("ball_over_pad_way") == pytest.approx(0.5, abs=0.03)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"metrics.json", "rigid.png", "rigid.gif", "rigid_strip.png"}
+    with Image.open(tmp_path / "run" / "rigid_strip.png") as strip, Image.open(tmp_path / "run" / "rigid.gif") as film:
+        assert strip.width > 1000 and strip.height > 300 and film.width >= 320, "too small to see anything on"
 
 
 @pytest.mark.slow

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +19,7 @@ from raytac.io.metrics import read_metrics
 pytest.importorskip("stable_baselines3")
 
 from experiments import training_curves
-from experiments.play import Args, Film, main, moments
+from experiments.play import Args, Film, _together, main, moments
 from experiments.ppo_learner import Checkpoint, Learner, Recipe
 from experiments.training_curves import draw_curves
 
@@ -30,6 +32,31 @@ def test_the_rate_of_a_scripted_policy_and_of_a_checkpoint(tmp_path: Path) -> No
     found = main(Args(policy=str(tmp_path / "policy.pt"), episodes=2, num_envs=2, film=False, out=tmp_path / "trained"))
     assert found["task"] == "RollBall" and 0.0 <= found["success"] <= 1.0  # type: ignore[operator]
     assert read_metrics(tmp_path / "trained" / "metrics.json")["episodes"] == 2
+
+
+def test_as_many_episodes_are_played_as_are_asked_for(tmp_path: Path) -> None:
+    """Of the same held-out seeds, however many environments there are."""
+    found = {}
+    for episodes, num_envs in ((1, 16), (3, 16), (3, 2)):
+        args = Args(policy="scripted", task="RollBall", episodes=episodes, num_envs=num_envs, film=False, out=tmp_path / "run")
+        found[episodes, num_envs] = main(args)
+        assert found[episodes, num_envs]["episodes"] == episodes
+    assert found[3, 2]["return"] == pytest.approx(found[3, 16]["return"], rel=1e-5)
+    assert [_together(Args(episodes=n)) for n in (0, 1, 16, 17, 20, 100)] == [1, 1, 16, 9, 10, 15]
+
+
+def test_a_film_has_the_colours_of_a_sensor_and_its_help_names_policies_that_are_there() -> None:
+    assert Args().optics == "raytrace"
+    root = Path(__file__).parents[2]
+    named = {
+        (path.name, name)
+        for path in sorted((root / "experiments").glob("*.py"))
+        for name in re.findall(
+            r"\b(?:experiments|scenes|lights|docs)/[\w/]+\.\w+", ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+        )
+    }
+    assert ("play.py", "experiments/policies/balance_pole_wrench.pt") in named and len(named) > 20
+    assert {(script, name) for script, name in named if not (root / name).is_file()} == set()
 
 
 def test_policies_that_are_shipped_fit_their_environments() -> None:
@@ -72,9 +99,11 @@ def test_a_strip_shows_moments_that_differ() -> None:
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    for wrong in (Args(policy="nothing.pt", out=tmp_path), Args(task="Juggle", out=tmp_path)):
-        with pytest.raises(InputError):
-            main(wrong)
+    out = tmp_path / "out"
+    for wrong in ({"policy": "nothing.pt"}, {"task": "Juggle"}, {"episodes": -1}, {"num_envs": 0}, {"optics": "fong"}):
+        with pytest.raises(InputError, match=f"{next(iter(wrong))} = |checkpoint = "):
+            main(Args(out=out, **wrong))  # type: ignore[arg-type]
+    assert not out.exists()
     with pytest.raises(InputError, match="must hold trainings"):
         draw_curves(tmp_path)
     with pytest.raises(InputError, match="of this task and these observations"):

@@ -229,7 +229,7 @@ def test_a_contact_at_the_pads_border_is_exchanged_too(contact, grip, corner, mo
     shape = SimpleNamespace(pressure=1e5 * np.sqrt(np.maximum(square, 0.0)).astype(np.float32))
     touching = np.hypot(*(REST[:, :2] - at).T) < 3.5e-3
     assert (REST[touching, 0] > edge[0] - 1e-9).any()
-    moved = np.tile([0.0, -1e-4], (len(REST), 1))
+    moved = np.tile([-5e-5, -1e-4], (len(REST), 1))
     shown = grip.exchange(shape, moved, touching, np.where(touching, 1.0, 0.0), 0.6)
     assert np.isfinite(shown).all() and 1e-6 < np.abs(shown[:, 1]).max() < 1e-4
 

@@ -31,19 +31,20 @@ def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
 
 def test_a_press_at_the_border_is_sound_and_leaves_the_others_as_they_are():
     """It once ended in an IndexError, and took the whole batch with it."""
-    scene, offsets = press(indent(0.3e-3)), np.array([[0.0, 0.0], [11e-3, 0.0]])
+    scene, offsets = press(indent(0.15e-3)), np.array([[0.0, 0.0], [12e-3, 0.0]])
     many = soft(scene, num_envs=2, offsets=offsets)
     state = many.peak(many.run())
     surface = many.surface(state)
-    assert not state.failed.any() and (state.unconverged == 0).all()
-    assert surface.indentation[1].max() == pytest.approx(0.3e-3, rel=0.05) and np.isfinite(surface.coat.positions).all()
+    assert not state.failed.any() and unconverged(state) == [0, 0]
+    assert surface.coat is not None and np.isfinite(surface.coat.positions).all()
+    assert surface.indentation[1].max() == pytest.approx(0.15e-3, rel=0.05)
     one = soft(scene)
     alone = one.peak(one.run())
     assert np.abs(one.surface(alone).height[0] - surface.height[0]).max() < 1e-6
 
 
 def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
-    scene, offsets = press(indent(0.2e-3)), np.array([[0.0, 0.0], [2e-3, 0.0]])
+    scene, offsets = press(indent(0.1e-3)), np.array([[0.0, 0.0], [2e-3, 0.0]])
     seen = SoftContact.seen
 
     def spoilt(contact, poses):
@@ -56,13 +57,18 @@ def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
         many = soft(scene, num_envs=2, offsets=offsets)
         state = many.peak(many.run())
         surface, wrench = many.surface(state), many.wrench(state)
-    assert state.failed.tolist() == [True, False]
+    assert state.failed.tolist() == [True, False] and surface.coat is not None
     for values in (surface.height, surface.coat.positions, wrench, many.traction(state), state.normal_force, state.depth):
         assert np.isnan(values[0]).all() and np.isfinite(values[1]).all()
     assert not surface.contact[0].any() and surface.contact[1].any()
     one = soft(scene, offsets=offsets[1:])
     alone = one.peak(one.run())
     assert np.abs(one.surface(alone).height[0] - surface.height[1]).max() < 1e-6
+
+
+def unconverged(state):
+    assert state.unconverged is not None
+    return state.unconverged.tolist()
 
 
 class Converging:
@@ -84,40 +90,40 @@ class Converging:
 
 
 def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_followed_by_still_ones(monkeypatch):
-    scene = press(indent(0.2e-3))
+    scene = press(indent(0.05e-3))
     with monkeypatch.context() as patch:
         steps = Converging(patch)
         pad = soft(scene)
-        assert pad.peak(pad.run()).unconverged.tolist() == [0]
+        assert unconverged(pad.peak(pad.run())) == [0]
         usual = steps.calls
     with monkeypatch.context() as patch:
         steps = Converging(patch, 2, usual)
         many = soft(scene, num_envs=2)
         state = many.peak(many.run())
-        assert steps.calls > usual and state.unconverged.tolist() == [2, 0] and not state.failed.any()
+        assert steps.calls > usual and unconverged(state) == [2, 0] and not state.failed.any()
     with monkeypatch.context() as patch:
         Converging(patch, *range(usual, usual + 50))
         many = soft(scene, num_envs=2)
         state = many.peak(many.run())
-        assert state.failed.tolist() == [True, False] and state.unconverged[0] > 1 and state.unconverged[1] == 0
+        assert state.failed.tolist() == [True, False] and unconverged(state)[0] > 1 and unconverged(state)[1] == 0
         many.reset()
-        assert next(iter(many.run())).unconverged.tolist() == [0, 0]
+        assert unconverged(next(iter(many.run()))) == [0, 0]
 
 
 def test_a_solver_that_never_converges_fails_the_press(monkeypatch):
     monkeypatch.setattr("raytac.physics.soft_contact._CLOSE", 1e-40)
     pad = soft(press(indent(0.02e-3)))
     state = pad.peak(pad.run())
-    assert state.failed.all() and state.unconverged[0] >= 2
+    assert state.failed.all() and unconverged(state)[0] >= 2
 
 
 def test_what_has_failed_is_not_stepped(monkeypatch):
     steps = Converging(monkeypatch)
-    pad = soft(press(indent(0.2e-3)), offsets=np.full((1, 2), np.nan))
+    pad = soft(press(indent(0.05e-3)), offsets=np.full((1, 2), np.nan))
     assert pad.peak(pad.run()).failed.all() and steps.calls == 0
-    many = soft(press(indent(0.2e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    many = soft(press(indent(0.05e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [np.nan, 0.0]]))
     assert many.peak(many.run()).failed.tolist() == [False, True] and steps.calls > 0
-    assert many.solver.scene.failed.tolist() == [False, True]
+    assert many.solver is not None and many.solver.scene.failed.tolist() == [False, True]
     many.reset()
     assert not many.solver.scene.failed.any()
 

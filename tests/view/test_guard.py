@@ -9,6 +9,7 @@ import logging
 import os
 import socket
 import time
+import urllib.request
 from collections.abc import Iterator
 
 import msgspec
@@ -64,6 +65,11 @@ def test_the_pages_own_addresses_are_answered(viewer, name):
     assert answer(viewer, own) == 200
     assert answer(viewer, own, upgrade=True) == 101  # a program that is no browser sends no Origin
     assert answer(viewer, own, f"http://{own}", upgrade=True) == 101
+
+
+def test_other_pages_may_not_show_this_one_in_a_frame(viewer):
+    with urllib.request.urlopen(viewer.url) as page:
+        assert page.headers["Content-Security-Policy"] == "frame-ancestors 'self'" and b"<html" in page.read()
 
 
 @pytest.mark.parametrize(
@@ -123,6 +129,9 @@ def test_the_address_that_was_reached_is_the_pages_own_and_a_name_is_not():
 def test_a_name_that_cannot_be_allowed_is_said(name):
     with pytest.raises(InputError, match="allow_host = "):
         PageAddresses("127.0.0.1", (name,))
+    for host, allowed in ((5, ()), ("127.0.0.1", "a.example"), ("127.0.0.1", (5,))):
+        with pytest.raises(InputError, match="host"):
+            PageAddresses(host, allowed)  # type: ignore[arg-type]
     PageAddresses("127.0.0.1", ("::1", "[::1]:9000", "a-b.example:9000", "192.0.2.1"))
 
 
@@ -157,11 +166,11 @@ def encoded(**message: object) -> bytes:
 
 
 def camera(**changes: object) -> bytes:
-    told: dict[str, object] = dict(
+    fields: dict[str, object] = dict(
         type="ViewerCameraMessage", wxyz=(1, 0, 0, 0), position=(1, 1, 1), fov=0.7, near=0.01, far=100, image_height=300,
         image_width=400, look_at=(0, 0, 0), up_direction=(0, 0, 1),
     )  # fmt: skip
-    return encoded(**{**told, **changes})
+    return encoded(**{**fields, **changes})
 
 
 GARBAGE = {
@@ -227,19 +236,19 @@ def witness(viewer: Viewer) -> Iterator[PageClient]:
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What a terminal has been told."""
+    """What a terminal shows."""
     gc.collect()  # asyncio tells of a task's exception when the task goes
-    told = [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert not [record for record in told if record.exc_info]
-    return [record.getMessage() for record in told]
+    logged = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not [record for record in logged if record.exc_info]
+    return [record.getMessage() for record in logged]
 
 
 def test_garbage_ends_its_own_connection_in_one_line(viewer, witness, caplog, capfd):
     for what, message in GARBAGE.items():
         assert Stranger(viewer).ends(message) == (1009 if what == "too long" else 1007), what
-    told = lines(caplog)
-    assert len(told) == len(GARBAGE) and all(
-        "hung up on 127.0.0.1 port" in line and line.isprintable() and len(line) < 250 for line in told
+    logged = lines(caplog)
+    assert len(logged) == len(GARBAGE) and all(
+        "hung up on 127.0.0.1 port" in line and line.isprintable() and len(line) < 250 for line in logged
     )
     assert "Traceback" not in "".join(capfd.readouterr())
 

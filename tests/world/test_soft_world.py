@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from raytac.errors import InputError, OverlapError, SpecError
+from raytac.physics.soft_scene import SceneReport, SoftScene
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
@@ -108,6 +110,53 @@ def test_reset_restores_links_bodies_gels_and_the_coupling() -> None:
         np.testing.assert_allclose(other.world_from_body["cube"][1], one.world_from_body["cube"][1], atol=1e-9)
         for name in world.sensor_names:
             np.testing.assert_allclose(other.wrench[name][1], one.wrench[name][1], atol=1e-6)
+
+
+def test_an_environment_whose_last_step_did_not_converge_has_failed_and_earlier_ones_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    falling = replace(BALL, position=(0.0, 0.0, 0.03))
+    world = TactileWorld(replace(UP, bodies=(falling,), timestep=0.005, soft_timestep=0.005), outputs=("wrench",), num_envs=2)
+    calls, unsolved, step = [], {1, 4}, SoftScene.step
+
+    def told(scene: SoftScene, *args: Any) -> SceneReport:
+        report = step(scene, *args)
+        calls.append(report)
+        bad = (np.arange(2) == 0) & (len(calls) in unsolved)
+        count, ends = report.unconverged + bad, report.last_converged & ~bad
+        return replace(report, converged=report.converged & ~bad, unconverged=count, last_converged=ends)
+
+    monkeypatch.setattr(SoftScene, "step", told)
+    state = world.step()  # the first of two steps
+    frame = world.observe()["sensor"]
+    assert len(calls) == 2 and not state.failed.any() and not state.report["converged"][0]
+    assert (
+        state.report["unconverged"].tolist() == [1, 0] and frame.unconverged is not None and frame.unconverged.tolist() == [1, 0]
+    )
+    state = world.step()  # the last of two
+    frame = world.observe(envs=[1, 0])["sensor"]
+    assert state.failed.tolist() == [True, False] and frame.failed is not None and frame.failed.tolist() == [False, True]
+    assert frame.unconverged is not None and frame.unconverged.tolist() == [0, 2] and np.isfinite(state.wrench["sensor"][1]).all()
+    state = world.step()
+    assert state.failed.tolist() == [True, False] and state.report["newton"][0] == 0 < state.report["newton"][1]
+    assert world.reset([0]).report["unconverged"].tolist() == [0, 0]
+    state, frame = world.step(), world.observe()["sensor"]
+    assert not state.failed.any() and frame.unconverged is not None and frame.unconverged.tolist() == [0, 0]
+
+
+def test_forces_that_are_not_finite_fail_their_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    gripper = RobotSpec("floating_gripper", opening=0.0102)
+    cube = BodySpec("cube", "box", {"length": 0.01, "width": 0.01, "height": 0.01}, mass=0.02)
+    scene = TaskScene("grip", gripper, (cube,), physics="ipc", gravity=(0.0, 0.0, 0.0), coupling="two_way")
+    world, wrench = TactileWorld(scene, outputs=("wrench",), num_envs=2), SoftScene.wrench
+
+    def spoilt(soft: SoftScene, name: str) -> np.ndarray:
+        found = wrench(soft, name)
+        found[0] = np.nan
+        return found
+
+    monkeypatch.setattr(SoftScene, "wrench", spoilt)
+    assert world.step().failed.tolist() == [True, False]
 
 
 def test_a_start_that_overlaps_is_refused() -> None:
