@@ -306,6 +306,14 @@ class Learner:
         for name, rms in self.normaliser.obs_rms.items():
             moments[f"observation.{name}"] = rms, observed.get(name) if isinstance(observed, dict) else None
         checked = [(rms, _checked_moments(name, rms, values)) for name, (rms, values) in moments.items()]
+        own = {name: tuple(tensor.shape) for name, tensor in self.model.policy.state_dict().items()}
+        other = {name: tuple(tensor.shape) for name, tensor in saved.policy.items()}
+        if own != other:
+            differ = sorted(name for name in {*own, *other} if own.get(name) != other.get(name))
+            rule = (
+                f"must be of this task and these observations: {differ[0]} is {other.get(differ[0])}, here {own.get(differ[0])}"
+            )
+            raise InputError("checkpoint", value=saved.recipe, rule=rule)
         try:
             self.model.policy.load_state_dict(saved.policy)
             if saved.optimizer:

@@ -76,7 +76,7 @@ def check_known(name: str, value: object, choices: Sequence[str]) -> str:
 def check_names(name: str, values: object, choices: Sequence[str]) -> tuple[str, ...]:
     """One of ``choices`` or a sequence of them."""
     if not isinstance(values, (str, Sequence)) or isinstance(values, (bytes, bytearray)):
-        raise InputError(name, value=values, rule="must be a known name, or a sequence of them", choices=choices)
+        raise InputError(name, value=values, rule="must be a known name, or a sequence of names", choices=choices)
     return tuple(check_known(name, value, choices) for value in ((values,) if isinstance(values, str) else values))
 
 

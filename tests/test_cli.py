@@ -37,6 +37,7 @@ def run(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     [
         (["coin", "--outputs", "rgb,hight"], ["outputs = 'hight'", "did you mean 'height'", "normals"]),
         (["coin", "--resolution", "320*240"], ["resolution", "WIDTHxHEIGHT"]),
+        (["coin", "--resolution", "9" * 5000 + "x1"], ["resolution = '9999", "…", "WIDTHxHEIGHT"]),
         (["coin", "--physics", "soft"], ["physics = 'soft'", "rigid"]),
         (["coin", "--optics", "phng"], ["optics = 'phng'", "did you mean 'phong'"]),
         (["coin", "--optics", "taxim", "--integrator", "reference"], ["reference", "ray tracer"]),
@@ -148,3 +149,57 @@ def test_the_same_seed_gives_the_same_height(tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert main(["press", "sphere", "--outputs", "height", "--seed", "3", "--out", str(tmp_path / name)]) == 0
     assert (tmp_path / "a" / "height.npy").read_bytes() == (tmp_path / "b" / "height.npy").read_bytes()
+
+
+def shell(command: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[bytes]:
+    """A quick press to ``command``'s output, in a shell; ``{press}`` in it is the press."""
+    press = f"{sys.executable} -m raytac press sphere --resolution 16x12 --outputs height --out"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | env
+    return subprocess.run(
+        ["bash", "-c", command.replace("{press}", press)], cwd=cwd, env=environment, capture_output=True, check=False
+    )
+
+
+def test_output_that_nobody_reads_ends_quietly(tmp_path: Path) -> None:
+    ended = shell("{press} out | true; echo ${PIPESTATUS[0]}", tmp_path)
+    assert ended.stdout == b"141\n" and ended.stderr == b""
+    assert (tmp_path / "out" / "metrics.json").is_file()
+
+
+def test_output_to_a_full_device_is_one_line(tmp_path: Path) -> None:
+    ended = shell("{press} out > /dev/full", tmp_path)
+    assert ended.returncode == 2 and ended.stderr.count(b"\n") == 1 and b"No space left" in ended.stderr
+
+
+def test_a_disk_that_takes_no_more_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    ended = shell("ulimit -f 20; {press} out", tmp_path)
+    assert ended.returncode == 2 and ended.stderr.count(b"\n") == 1 and b"cannot be written" in ended.stderr, ended.stderr
+    assert not list(tmp_path.iterdir())
+
+
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii:strict"}
+
+
+@pytest.mark.parametrize("locale", [ASCII, pytest.param({}, marks=pytest.mark.slow)], ids=["ascii", "utf-8"])
+def test_paths_that_are_not_utf_8_are_written(tmp_path: Path, locale: dict[str, str]) -> None:
+    scene = os.fsencode(tmp_path) + b"/sc\xe8ne.toml"
+    Path(os.fsdecode(scene)).write_text(TOUCH)
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe"))
+    args = [
+        sys.executable,
+        "-m",
+        "raytac",
+        "press",
+        scene,
+        "--resolution",
+        "16x12",
+        "--outputs",
+        "rgb,depth,height",
+        "--out",
+        os.fsencode(folder),
+    ]
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | locale
+    ended = subprocess.run(args, env=env, capture_output=True, check=False)
+    assert ended.returncode == 0 and ended.stderr == b"", ended.stderr
+    assert {path.name for path in folder.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
+    assert read_metrics(folder / "metrics.json")["scene"] == "sc\\udce8ne"

@@ -51,7 +51,9 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
     import OpenEXR
 
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    attributes |= {HEADER_PREFIX + key: value.encode("utf-8", "backslashreplace").decode() for key, value in (header or {}).items()}
+    attributes |= {
+        HEADER_PREFIX + key: value.encode("utf-8", "backslashreplace").decode() for key, value in (header or {}).items()
+    }
     images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
     # By another file, since the library takes no path that is not UTF-8.
     with tempfile.TemporaryDirectory() as folder, OpenEXR.File(attributes, images) as file:

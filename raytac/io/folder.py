@@ -48,7 +48,8 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
             out.mkdir(exist_ok=True)
             _move(work, old, out, owned)
         except OSError as error:
-            ours = error.filename is None or str(base) in os.fsdecode(error.filename)
+            place = None if error.filename is None else Path(os.fsdecode(error.filename))
+            ours = place is None or place.is_relative_to(base) or place.is_relative_to(out)
             if not ours or isinstance(error, ConnectionError):  # a reader that went away is no matter of the folder
                 raise
             reason = error.strerror or f"{error}: the disk may be full"

@@ -157,4 +157,3 @@ def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
         rule = f"with crop and downscale the rendered image is {rendered[0]}x{rendered[1]}; at most {LARGEST_SIDE} px a side"
         raise InputError("resolution", value=observed, rule=rule)
     return Layout(observed, rendered, left, top, settings.downscale)
-

@@ -92,7 +92,9 @@ def _check_element(path: Path, name: str, values: dict[str, str], copies: list[i
     if "nrow" in values and "ncol" in values:
         nodes = _whole(path, values["nrow"]) * _whole(path, values["ncol"])
         if nodes > MOST_NODES:
-            raise InputError("MJCF file", value=path, rule=f"a height field must have at most {MOST_NODES} nodes, not {nodes:.3g}")
+            raise InputError(
+                "MJCF file", value=path, rule=f"a height field must have at most {MOST_NODES} nodes, not {nodes:.3g}"
+            )
 
 
 def _count(path: Path, words: str) -> int:

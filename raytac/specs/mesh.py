@@ -14,6 +14,8 @@ from raytac.specs.files import is_file
 __all__ = ["MESH_SUFFIXES", "SIZE_RANGE", "load_mesh"]
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
+_FARTHEST = 1e9
+"""Farthest that a vertex may be [file units]: beyond it vertices cannot be told apart."""
 SIZE_RANGE = (1e-4, 0.5)
 """Largest extent that an object may have [m]; outside it, the scale is almost surely wrong."""
 
@@ -44,12 +46,18 @@ def load_mesh(path: str | Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if not len(vertices) or not len(faces):
         raise MeshError(f"the mesh is empty: {len(vertices)} vertices, {len(faces)} faces", file=path)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise MeshError("vertices must have three coordinates and faces three corners", file=path, value=vertices.shape)
+    bad = np.flatnonzero(~(np.abs(vertices) < _FARTHEST).all(axis=1))
     if len(bad):
-        raise MeshError("every vertex must be finite", file=path, key=f"vertex {bad[0]}", value=vertices[bad[0]].tolist())
+        rule = f"every vertex must be finite and within {_FARTHEST:g} file units"
+        raise MeshError(rule, file=path, key=f"vertex {bad[0]}", value=vertices[bad[0]].tolist())
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"faces must index vertices 0 to {len(vertices) - 1}", file=path, value=int(faces.max()))
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)  # without normals and texture coordinates, which may be anything
+    mesh.merge_vertices()
     _require_solid(mesh, path)
     extent = float(np.ptp(mesh.vertices, axis=0).max()) * scale
     if not SIZE_RANGE[0] <= extent <= SIZE_RANGE[1]:

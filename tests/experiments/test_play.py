@@ -112,6 +112,47 @@ def test_bad_input(tmp_path: Path) -> None:
         )
 
 
+def test_a_checkpoint_of_another_shape_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    import torch
+
+    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4))
+    sound = learner.checkpoint()
+    sound.save(tmp_path / "sound.pt")
+    values = torch.load(tmp_path / "sound.pt", weights_only=True)
+    policy, normaliser = values["policy"], values["normaliser"]
+    weight, seen = next(iter(policy)), next(iter(normaliser["observation"]))
+    moments = normaliser["observation"][seen]
+    for changed in (
+        {"policy": [1]},
+        {"policy": policy | {weight: "x"}},
+        {"policy": policy | {weight: policy[weight] * float("nan")}},
+        {"normaliser": 5},
+        {"steps": -5},
+        {"steps": "x"},
+        {"recipe": values["recipe"] | {"hidden": 10**9}},
+        {"recipe": values["recipe"] | {"gamma": "x"}},
+        {"recipe": values["recipe"] | {"learning_rate": float("nan")}},
+    ):
+        torch.save(values | changed, tmp_path / "bad.pt")
+        with pytest.raises(InputError, match="must be a checkpoint of train_ppo"):
+            Checkpoint.load(tmp_path / "bad.pt")
+    before = {name: tensor.clone() for name, tensor in learner.model.policy.state_dict().items()}
+    for observation in (
+        {},
+        5,
+        {seen: {"mean": torch.zeros(1), "var": torch.zeros(1), "count": 1.0}},
+        {seen: moments | {"var": -moments["var"] - 1}},
+        {seen: moments | {"mean": moments["mean"] * float("nan")}},
+        {seen: moments | {"count": "x"}},
+    ):
+        other = observation if observation in ({}, 5) else normaliser["observation"] | observation
+        with pytest.raises(InputError, match="normaliser"):
+            learner.restore(replace(sound, normaliser=normaliser | {"observation": other}))
+    with pytest.raises(InputError, match="of this task and these observations"):
+        learner.restore(replace(sound, policy={name: 2 * one for name, one in policy.items()} | {weight: torch.zeros(3, 3)}))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in learner.model.policy.state_dict().items())
+
+
 def test_curves_are_drawn_from_runs_that_differ_in_length(tmp_path: Path) -> None:
     for kind in ("task", "none"):
         for seed, steps in enumerate(([10, 20, 30], [10, 20])):

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.render_dataset import Args, main
 from raytac.dataset import PressDataset
-from raytac.errors import InputError
+from raytac.errors import InputError, SpecError
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 
@@ -56,6 +56,6 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
 )
 def test_bad_options_are_told(options: dict[str, Any], message: str, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SWEEP)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises((InputError, SpecError), match=message):
         main(Args(sweep=str(tmp_path / "small.toml"), out=tmp_path / "data", **options))
     assert not (tmp_path / "data").exists()

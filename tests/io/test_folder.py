@@ -59,3 +59,81 @@ def test_what_an_earlier_run_wrote_and_this_one_does_not_is_removed(tmp_path: Pa
     with pytest.raises(RuntimeError), result_folder(tmp_path / "out", owned):
         raise RuntimeError
     assert (tmp_path / "out" / "height.npy").exists()
+
+
+def fill(out: Path) -> dict[str, str]:
+    """An earlier result."""
+    out.mkdir()
+    for name in ("rgb.png", "height.npy", "metrics.json"):
+        (out / name).write_text(f"old {name}")
+    return {path.name: path.read_text() for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_folder_where_a_file_is_to_be_written_is_named_and_nothing_changes(tmp_path: Path, known: bool) -> None:
+    """Of files that the command says it writes, before any work; else before any of them is put there."""
+    out = tmp_path / "out"
+    fill(out)
+    (out / "rgb.png").unlink()
+    (out / "rgb.png").mkdir()
+    ran = False
+    with (
+        pytest.raises(InputError, match=r"holds a folder 'rgb\.png'"),
+        result_folder(out, ("rgb.png",) if known else ()) as folder,
+    ):
+        ran = True
+        for name in ("rgb.png", "height.npy", "metrics.json"):
+            (folder / name).write_text("new")
+    assert ran is not known
+    assert {path.name for path in out.iterdir()} == {"rgb.png", "height.npy", "metrics.json"}
+    assert (out / "height.npy").read_text() == "old height.npy" and (out / "metrics.json").read_text() == "old metrics.json"
+
+
+def test_a_link_to_nothing_is_named_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"is a link to .*nowhere, which does not exist"), result_folder(tmp_path / "out"):
+        pytest.fail("the work began")
+
+
+def test_a_link_to_a_folder_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "real")
+    with result_folder(tmp_path / "out") as folder:
+        (folder / "a.txt").write_text("new")
+    assert (tmp_path / "out").is_symlink() and (tmp_path / "real" / "a.txt").read_text() == "new"
+
+
+def test_a_full_disk_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
+    before = fill(tmp_path / "out")
+    with (
+        pytest.raises(InputError, match=r"No space left on device.*nothing in it has changed"),
+        result_folder(tmp_path / "out") as folder,
+    ):
+        (folder / "height.npy").write_text("new")
+        with open("/dev/full", "w") as full:
+            full.write("x")
+    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == before
+
+
+@pytest.mark.parametrize("fails_at", range(1, 6))
+def test_a_move_that_fails_puts_back_what_was_there(tmp_path: Path, fails_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = fill(tmp_path / "out")
+    real, calls = os.replace, 0
+
+    def replace(a: Path, b: Path) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == fails_at:
+            raise OSError(28, "No space left on device", str(a))
+        real(a, b)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(InputError, match="No space left"), result_folder(tmp_path / "out", ("rgb.png",)) as folder:
+        for name in ("height.npy", "metrics.json"):
+            (folder / name).write_text("new")
+    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == before
+
+
+def test_an_error_that_is_not_of_the_folder_stays_what_it_is(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="elsewhere"), result_folder(tmp_path / "out"):
+        (tmp_path / "elsewhere").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import struct
 from pathlib import Path
@@ -156,3 +157,24 @@ def test_the_teeth_are_as_thick_on_the_pitch_circle_as_the_gaps() -> None:
     assert np.ptp(angle[on_pitch]) * 6.0 == pytest.approx(np.pi / 2, rel=1e-12)
     assert radius.max() == pytest.approx(7.0) and radius.min() == pytest.approx(4.75)
     assert (np.diff(np.unwrap(angle)) > 0).all()  # seen from the axis, every point of the outline is in sight
+
+
+@pytest.mark.parametrize("first", ["mtllib pipe\nusemtl x\n", "mtllib a.mtl\nusemtl x\n", ""])
+def test_files_that_a_mesh_names_are_not_opened(first: str, tmp_path: Path) -> None:
+    """Who opened the pipe would wait for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a.mtl").write_text("newmtl x\nmap_Kd pipe\n")
+    box = trimesh.creation.box((4.0, 4.0, 4.0))
+    (tmp_path / "a.obj").write_text(first + str(box.export(file_type="obj")))
+    vertices, faces = load_mesh(tmp_path / "a.obj", 1e-3)
+    assert len(vertices) == 8 and len(faces) == 12
+    (tmp_path / "pipe.obj").symlink_to("pipe")
+    with pytest.raises(MeshError, match="does not exist"):
+        load_mesh(tmp_path / "pipe.obj", 1e-3)
+
+
+def test_vertices_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
+    box = trimesh.creation.box((4e38, 4.0, 4.0))
+    box.export(tmp_path / "a.ply")
+    with pytest.raises(MeshError, match="within 1e"):
+        load_mesh(tmp_path / "a.ply", 1e-3)

@@ -376,3 +376,47 @@ def test_shadows_are_cast_unless_a_file_or_its_base_says_otherwise(tmp_path: Pat
     for value in ("0", '"no"', "[true]"):
         with pytest.raises(SpecError, match=r"bad\.toml: optics\.shadows = .*: must be true or false"):
             load_sensor(_on(tmp_path, "bad", "gelsight_mini", f"[optics]\nshadows = {value}\n"))
+
+
+DIGITS = "9" * 5000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"[gelpad]\nthickness_mm = {DIGITS}",
+        f"lights = 0x{'F' * 5000}",
+        f"[gelpad]\nsize_mm = [{DIGITS}, 1]",
+        "lights." + ".".join(["a"] * 5000) + " = 1",
+        "gelpad.size_mm." + ".".join(["a"] * 5000) + " = 1",
+        "lights = " + "[" * 5000 + "]" * 5000,
+        "lights = " + "{a=" * 500 + "1" + "}" * 500,
+        "x" * 10**5 + " = 1",
+        "lights = '" + "y" * 10**6 + "'",
+        "# " + "x" * 2**22,
+        "lights = 2020-13-45",
+    ],
+    ids=lambda text: text[:30],
+)
+def test_numbers_tables_and_texts_without_measure_are_refused_in_a_sentence(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(f'base = "gelsight_mini"\n{text}\n')
+    with pytest.raises(SpecError, match=r"s\.toml: |lights = 'y") as caught:
+        load_sensor(path)
+    assert len(str(caught.value)) < 2500
+
+
+def test_a_long_chain_of_bases_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    for i in range(3000):
+        (tmp_path / f"c{i}.toml").write_text(f'base = "c{i + 1}.toml"\n')
+    (tmp_path / "c3000.toml").write_text('base = "gelsight_mini"\n')
+    with pytest.raises(SpecError, match=r"base = 'c\d+\.toml': a sensor must be built on at most 32 others") as caught:
+        load_sensor(tmp_path / "c0.toml")
+    assert len(str(caught.value)) < 500
+    assert load_sensor(tmp_path / "c2980.toml").gelpad == load_sensor("gelsight_mini").gelpad
+
+
+@pytest.mark.parametrize("name", [5, None, b"gelsight_mini", ["gelsight_mini"]])
+def test_what_is_neither_name_nor_path_is_refused(name: Any) -> None:
+    with pytest.raises(SpecError, match="must be a name or a path"):
+        load_sensor(name)
