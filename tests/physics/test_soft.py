@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import ipctk
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -13,6 +14,8 @@ from raytac.gel.traction import cell_areas
 from raytac.physics.rigid import RigidPad
 from raytac.physics.soft import SoftPad
 from raytac.physics.soft_reading import UNSOLVED, UnsolvedContactWarning
+from raytac.physics.soft_scene import SoftScene
+from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft
 
@@ -297,3 +300,23 @@ def test_a_stage_deeper_than_the_surface_that_was_made_is_refused():
         next(pad.follow(indent(0.4e-3)))
     with pytest.raises(InputError, match="deepest"):
         next(pad.follow(indent(force=1.0)))
+
+
+@pytest.mark.slow
+def test_gel_that_is_crushed_folds_and_does_not_pass_through_itself(monkeypatch):
+    """A ring pressed with 72 N near the corner of a domed pad: the side of the gel was once driven through itself, step after step."""
+    crossed, advance = [], SoftScene.advance
+
+    def checked(scene, *args, **settings):
+        report = advance(scene, *args, **settings)
+        vertices, faces = scene.mesh("pad")
+        edges = ipctk.edges(faces)
+        crossed.append(ipctk.has_intersections(ipctk.CollisionMesh(vertices[0], edges, faces), vertices[0]))
+        return report
+
+    monkeypatch.setattr(SoftScene, "advance", checked)
+    turn = -0.33007611, -0.86478793, 0.36885866, 0.08446829
+    ring = ObjectSpec("torus", {"major_radius": 2.9491e-3, "minor_radius": 1.3064e-3}, (-7.9095e-3, 7.9068e-3, 0.0), turn, 0.05)
+    pad = soft(PressScene("ring", ring, (indent(force=71.75607),)), load_sensor("gelsight_dome"))
+    pad.peak(pad.run())
+    assert len(crossed) > 30 and not any(crossed)
