@@ -20,7 +20,7 @@ from raytac.specs.press import PressScene, StageSpec
 
 def small_press(physics: str, seed: int, number: int, deepest: float) -> tuple[str, str, PressScene]:
     """A light press of a ball, a millimetre to the right for each number; the second is refused, as it begins off the pad."""
-    place = (1.0 if number == 1 else 1e-3 * number, 0.0, 0.0)
+    place = (0.09 if number == 1 else 1e-3 * number, 0.0, 0.0)
     thing = replace(load_press("sphere").object, position=place)
     return "gelsight_mini", "sphere", PressScene("sphere", thing, (StageSpec("indent", depth=0.1e-3),))
 
@@ -117,15 +117,12 @@ def test_states_of_the_simulated_pad_that_are_not_sound_are_seen() -> None:
         "unconverged": False,
     }
     pad.solver.converged[0] = False
-    world = pad.solver.world
-    save = world.save
-
-    def crossed() -> Any:
-        state = save()
-        state.frame_position[0, world.layout.names.index("object"), 2] -= 1e-3
-        return state
-
-    world.save = crossed  # type: ignore[method-assign]
+    # The object 1 mm deeper than the solver left it.
+    state, body = pad.solver.world._potential, pad.solver.world.layout.names.index("object")
+    position = state.t.numpy()
+    position[0, body, 2] -= 1e-3
+    state.t.assign(position)
+    state.place_vertices(state.y, state.R, state.t, state.x)
     assert frame.wrench is not None
     frame.wrench[0, 0] = np.inf
     row = stress.soft_faults(pad, frame) | {"share": 0.1}
