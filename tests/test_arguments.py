@@ -206,7 +206,7 @@ def test_what_a_copy_would_lose_is_said() -> None:
     class Mode:
         label, device = "mine", "cpu"
 
-        def render(self, surface: GelSurface) -> None: ...
+        def render(self, surface: GelSurface) -> Any: ...
 
     with pytest.raises(InputError, match=r"optics = .*cannot be copied or pickled"):
         copy.deepcopy(TactileSensor(optics=Mode()))

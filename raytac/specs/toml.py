@@ -123,7 +123,7 @@ class Number:
         return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
 
     def parse(self, value: object, unit: Unit) -> float | str | tuple[float, ...]:
-        if self.word and value == self.word:
+        if self.word and isinstance(value, str) and value == self.word:
             return self.word
         if not self.length:
             return self._one(value, unit)
@@ -145,7 +145,7 @@ class Number:
 
     def check(self, value: object, unit: Unit) -> None:
         """Refuse a value in SI that no file could give."""
-        if self.word and value == self.word:
+        if self.word and isinstance(value, str) and value == self.word:
             return
         interval = _in_si(self._range, unit)
         for item in _items(value, self.length, self.rule(unit)):
