@@ -60,11 +60,15 @@ def resumed(path: Path, settings: Mapping[str, object]) -> list[dict[str, Any]]:
     """Rows that an earlier run stored; empty if there is none.
 
     Raises:
-        InputError: it is of a run with other settings.
+        InputError: it is of a run with other settings, or damaged.
     """
     if not path.exists():
         return []
-    record = json.loads(path.read_text("utf-8"))
-    if record["settings"] != settings:
-        raise InputError("out", value=path, rule=f"holds a run with other settings, {record['settings']}: choose another")
-    return record["rows"]
+    try:
+        record = json.loads(path.read_text("utf-8"))
+        kept, rows = record["settings"], list(record["rows"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("out", value=path, rule=f"is no record of such a run ({error}): move it away") from error
+    if kept != settings:
+        raise InputError("out", value=path, rule=f"holds a run with other settings, {kept}: choose another")
+    return rows

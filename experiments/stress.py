@@ -31,6 +31,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
 from raytac.gel.traction import cell_areas
+from raytac.io.lock import FolderLock
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.physics.soft import SoftPad
@@ -82,25 +83,25 @@ def main(args: Args) -> dict[str, Metric]:
     device = resolve_device(args.device, ray_tracing=False)
     out = args.out or Path("runs/stress")
     settings = {"seed": args.seed, "deepest": args.deepest, "pad": args.pad, "device": device}
-    kept = {name: resumed(out / f"{name}.json", settings) for name in names}
-    out.mkdir(parents=True, exist_ok=True)
     if "ipc" in names:
         hush_solver()
-    found: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}
-    for name in names:
-        rows = kept[name][: counts[name]]
-        sensors = {sensor: make_sensor(sensor, name, args, device) for sensor in SENSORS}
-        for number in range(len(rows), counts[name]):
-            rows.append(pressed(name, number, args, sensors))
-            store(out / f"{name}.json", settings, rows)
-            print(f"{name} {number + 1} of {counts[name]}: {line(rows[-1])}", flush=True)
-        found |= {f"stress.{name}.{key}": value for key, value in summary(name, rows).items()}
-    write_metrics(out / "metrics.json", found | {"wall_s": time.perf_counter() - start, **versions()})
-    for key, value in found.items():
+    with FolderLock(out):
+        kept = {name: resumed(out / f"{name}.json", settings) for name in names}
+        metrics: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}
+        for name in names:
+            rows = kept[name][: counts[name]]
+            sensors = {sensor: make_sensor(sensor, name, args, device) for sensor in SENSORS}
+            for number in range(len(rows), counts[name]):
+                rows.append(pressed(name, number, args, sensors))
+                store(out / f"{name}.json", settings, rows)
+                print(f"{name} {number + 1} of {counts[name]}: {line(rows[-1])}", flush=True)
+            metrics |= {f"stress.{name}.{key}": value for key, value in summary(name, rows).items()}
+        write_metrics(out / "metrics.json", metrics | {"wall_s": time.perf_counter() - start, **versions()})
+    for key, value in metrics.items():
         if key.startswith("stress."):
             print(f"{key} = {value}")
     print(f"written: {out}")
-    return found
+    return metrics
 
 
 def make_sensor(name: str, physics: str, args: Args, device: str) -> TactileSensor:
@@ -206,22 +207,22 @@ def summary(physics: str, rows: list[Row]) -> dict[str, Metric]:
         return sum(bool(row.get(key)) for row in among)
 
     shallow = [row for row in rows if isinstance(row["share"], float) and row["share"] <= SHALLOW]
-    found: dict[str, Metric] = {"presses": len(rows), "exceptions": count("exception"), "refused": count("refused")}
-    found |= {"failed": count("failed"), "shallow": len(shallow), "failed_shallow": count("failed", shallow)}
+    metrics: dict[str, Metric] = {"presses": len(rows), "exceptions": count("exception"), "refused": count("refused")}
+    metrics |= {"failed": count("failed"), "shallow": len(shallow), "failed_shallow": count("failed", shallow)}
     if physics == "rigid":
-        return found | {key: count(key) for key in ("below_bond", "unbalanced", "nonfinite")}
+        return metrics | {key: count(key) for key in ("below_bond", "unbalanced", "nonfinite")}
     causes = ("nonfinite", "penetrating", "unconverged")
-    found["unmarked"] = sum(any(row.get(key) for key in causes) for row in rows)
+    metrics["unmarked"] = sum(any(row.get(key) for key in causes) for row in rows)
     steps = [row.get("unconverged_steps", 0) for row in rows]
-    return found | {key: count(key) for key in causes} | {"unconverged_steps": sum(n for n in steps if isinstance(n, int))}
+    return metrics | {key: count(key) for key in causes} | {"unconverged_steps": sum(n for n in steps if isinstance(n, int))}
 
 
 def line(row: Row) -> str:
     """A press in one line."""
     share = "to a force" if row["share"] is None else f"to {row['share']:.2f} of the thickness"
     faults = [key for key in ("failed", "below_bond", "unbalanced", "nonfinite", "penetrating", "unconverged") if row.get(key)]
-    told = [str(row[key]).splitlines()[0] for key in ("refused", "exception") if key in row]
-    return f"{row['object']} on {row['sensor']} {share}, {row['seconds']:.1f} s: {', '.join(faults + told) or 'sound'}"
+    reasons = [str(row[key]).splitlines()[0] for key in ("refused", "exception") if key in row]
+    return f"{row['object']} on {row['sensor']} {share}, {row['seconds']:.1f} s: {', '.join(faults + reasons) or 'sound'}"
 
 
 if __name__ == "__main__":

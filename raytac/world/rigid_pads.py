@@ -115,12 +115,13 @@ class RigidPads:
         Raises:
             OverlapError: a body starts beyond a pad's bonded face.
         """
-        for b in envs:
-            for sensor, body, depth in self.overlap(datas[b]):
-                if np.isinf(depth):
-                    raise OverlapError(
-                        f"environment {b}: {body!r} starts beyond the face that the gel of {sensor!r} is bonded to"
-                    )
+        for sensor, pad, _, pad_from_body in self._poses([datas[b] for b in envs]):
+            near = self._near(pad, pad_from_body)
+            for i, body in enumerate(self.bodies):
+                rows = np.flatnonzero(near[:, i])
+                if len(rows) and (pierced := pad.face.pierced(body.parts, pad_from_body[rows, i], float(self._radius[i]))).any():
+                    rule = f"{body.spec.name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
+                    raise OverlapError(f"environment {envs[int(rows[pierced][0])]}: {rule}")
         for b in envs:
             self._laws[b] = {}
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
@@ -242,7 +243,7 @@ class RigidPads:
     def _mark_pierced(
         self, poses: Sequence[_PadPoses], envs: np.ndarray, before: dict[str, np.ndarray], failed: np.ndarray
     ) -> None:
-        """Mark environments in which a body is beyond a pad's bonded face, or was on the way from ``before``, which is renewed."""
+        """Mark environments in which a body is beyond a pad's bonded face, or was on the path from ``before``, which is renewed."""
         for name, pad, _, pad_from_body in poses:
             was, near = before[name][envs], self._near(pad, pad_from_body)
             before[name][envs] = pad_from_body
@@ -253,9 +254,9 @@ class RigidPads:
                     pierced[rows] = pad.face.pierced(body.parts, now[rows], radius)
                 pieces = pad.face.pieces(was[:, i], now, radius)
                 for row in np.flatnonzero(pieces > 1).tolist():
-                    way = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
-                    way = way[self._near(pad, np.repeat(way[:, None], len(self.bodies), axis=1))[:, i]]
-                    pierced[row] |= pad.face.pierced(body.parts, way, radius).any()
+                    path = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
+                    path = path[self._near(pad, np.repeat(path[:, None], len(self.bodies), axis=1))[:, i]]
+                    pierced[row] |= pad.face.pierced(body.parts, path, radius).any()
                 failed[envs[pierced]] = True
 
     def _add_contacts(
