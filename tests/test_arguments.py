@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +17,14 @@ from raytac.checks import check_numbers, check_seeds
 from raytac.envs import PushCubeEnv, PushCubeVectorEnv
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.surface import GelSurface
-from raytac.specs import load_press, load_sensor
+from raytac.specs import load_press, load_sensor, load_sweep
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.task_file import load_task
+from raytac.world.world import TactileWorld
 
 MINI, BALL = load_sensor("gelsight_mini"), load_press("sphere")
+TASK, SWEEP = load_task("roll_ball"), load_sweep("demo")
 
 
 def quick(**options: Any) -> TactileSensor:
@@ -158,6 +161,50 @@ def test_a_body_changed_in_code_obeys_the_rules_of_a_file(name: str, value: Any)
         replace(scene.bodies[1], **{name: value})
     with pytest.raises(SpecError, match=r"control_timestep_s = 0\.0031: must be a whole multiple"):
         replace(scene, control_timestep=0.0031)
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes", "message"),
+    [
+        (TASK, {"name": 5}, "name = 5: must be a text"),
+        (TASK, {"robot": None}, "robot: must be a RobotSpec"),
+        (TASK, {"bodies": ("x",)}, "body = ('x',): must be a tuple of BodySpec"),
+        (TASK, {"bodies": list(TASK.bodies)}, "must be a tuple of BodySpec"),
+        (TASK.robot, {"sensor": 3}, "robot.sensor = 3: must be a name, a path or a SensorSpec"),
+        (TASK.robot, {"mounts": ("x",)}, "robot.mount = ('x',): must be a tuple of MountSpec"),
+        (TASK.robot, {"arm_joints": (1,)}, "robot.arm_joints = (1,): must be a tuple of names"),
+        (SWEEP, {"name": None}, "name: must be a text"),
+        (SWEEP, {"ranges": None}, "ranges: must be a PressRanges"),
+        (SWEEP, {"sensors": ("a",)}, "sensors = ('a',): must be a tuple of one or more SensorSpec"),
+        (SWEEP, {"sensors": ()}, "sensors = (): must be a tuple of one or more SensorSpec"),
+        (SWEEP, {"sensors": (MINI, MINI)}, "must have names of their own"),
+        (SWEEP, {"objects": ("a",)}, "objects = ('a',): must be a tuple of one or more PressScene"),
+        (SWEEP, {"objects": (load_press("none"),)}, "objects = 'none': must be press scenes with an object"),
+        (SWEEP, {"pad": "fine", "physics": "rigid"}, 'physics must be "ipc"'),
+        (SWEEP, {"count": 0}, "count = 0: must be a whole number in [1, 1000000000]"),
+        (SWEEP, {"shard_size": True}, "shard_size = True: must be a whole number"),
+        (SWEEP, {"seed": 2**32}, "seed = 4294967296: must be a whole number"),
+        (SWEEP, {"randomization": 5}, "randomization = 5: must be a mapping"),
+        (SWEEP, {"randomization": {"foo": 1}}, "randomization = 'foo': must have known names"),
+        (SWEEP, {"randomization": {"body_mass": 0.1}}, "randomization = 'body_mass': must have known names"),
+        (SWEEP, {"randomization": {"gamma": None}}, "randomization.gamma = 'None': must be a number in [0, 1)"),
+        (SWEEP, {"marker_perturbation": {"noise": 1.0}}, "randomization.markers = 'noise': must have known names"),
+        (SWEEP, {"marker_perturbation": {"shift": 1.0}}, "randomization.markers.shift_mm = 1000.0: must be a number in [0, 20]"),
+        (MINI, {"name": 5}, "name = 5: must be a text"),
+        (BALL, {"name": 5}, "name = 5: must be a text"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)  # fmt: skip
+def test_what_a_changed_specification_holds_is_checked(spec: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(message)):
+        replace(spec, **changes)
+
+
+def test_a_changed_specification_takes_what_its_fields_name() -> None:
+    assert TactileWorld(replace(TASK, robot=replace(TASK.robot, sensor=MINI.source))).scene.robot.sensor == MINI.source
+    noise = {"noise_px": 0.5, "dropout": 0.1, "shift": 1e-3, "turn": 0.1}
+    assert replace(SWEEP, marker_perturbation=noise).marker_perturbation == noise
+    assert replace(SWEEP, randomization={"noise": np.float64(2.0)}).randomization == {"noise": 2.0}
 
 
 def test_a_surface_of_another_sensor_is_refused() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.photographs import decode
+from raytac.checks import check_whole
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 from raytac.specs.sensor_check import led_corners
@@ -137,8 +138,7 @@ def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
     Raises:
         InputError: no whole number >= 1.
     """
-    if int(count) != count or count < 1:
-        raise InputError("split", value=count, rule="must be a whole number >= 1")
+    count = check_whole("split", count)
     if count == 1:
         return sensor.lights
     half, leds = 0.5 * np.array(sensor.case.size), []

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from raytac.checks import check_known
 from raytac.cli.shadow_options import ShadowOptions
 from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
@@ -62,8 +63,7 @@ class PressArgs(ShadowOptions, SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
-        if self.optics not in OPTICS:
-            raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
+        check_known("optics", self.optics, OPTICS)
         every = sensor_outputs(self.optics)
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from raytac.checks import check_whole
+from raytac.checks import check_known, check_whole
 from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
@@ -78,8 +78,7 @@ class ViewArgs(ShadowOptions):
         check_viewer()
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
-        if self.optics not in OPTICS:
-            raise InputError("optics", value=self.optics, rule="must be a known name", choices=OPTICS)
+        check_known("optics", self.optics, OPTICS)
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":

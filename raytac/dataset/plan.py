@@ -89,15 +89,11 @@ class DatasetPlan:
         """Check all that can be told before anything is rendered.
 
         Raises:
-            InputError: a count, shard size or seed out of its range, an output that no data set has, a model that the sensor lacks, or
-                randomisation of markers that are not asked for.
+            InputError: an output that no data set has, a model that the sensor lacks, or randomisation of markers that are not
+                asked for.
             SpecError: a range that no press into one of the sensors can follow; names the file and key.
         """
         self.sweep = sweep
-        for name, least, most in (("count", 1, 10**9), ("shard_size", 1, 10**5), ("seed", 0, 2**32 - 1)):
-            value = getattr(sweep, name)
-            if not isinstance(value, int) or not least <= value <= most:
-                raise InputError(name, value=value, rule=f"must be a whole number in [{least}, {most}]")
         for name in sweep.outputs:
             if name not in DATASET_OUTPUTS:
                 raise InputError("outputs", value=name, rule="must be known names", choices=DATASET_OUTPUTS)

@@ -13,8 +13,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from raytac.checks import check_whole
 from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
-from raytac.errors import BackendError, InputError, RaytacError
+from raytac.errors import BackendError, RaytacError
 
 __all__ = ["render_on_ray"]
 
@@ -66,8 +67,8 @@ def render_on_ray(
         import ray
     except ImportError as error:
         raise BackendError(f"engine='ray' needs Ray ({error}): `pip install 'raytac[ray]'`") from error
-    if workers is not None and workers < 1:
-        raise InputError("workers", value=workers, rule="must be a whole number >= 1")
+    if workers is not None:
+        workers = check_whole("workers", workers)
     ours = not ray.is_initialized()
     if ours:
         _start(ray, workers, address)

@@ -14,6 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from raytac.checks import check_known, check_whole
 from raytac.dataset.describe import FILE, describe, read_description, write_description
 from raytac.dataset.engines import ENGINES, render_here
 from raytac.dataset.manifest import check_pyarrow, write_manifest
@@ -90,10 +91,8 @@ def render_dataset(
         InputError: a bad argument, a folder with another data set or in use by another run, or a disk without room enough.
         BackendError: pyarrow, Ray, a renderer or a solver is missing or does not work.
     """
-    if engine not in ENGINES:
-        raise InputError("engine", value=engine, rule="must be a known name", choices=ENGINES)
-    if not isinstance(batch, int) or batch < 1:
-        raise InputError("batch", value=batch, rule="must be a whole number >= 1")
+    check_known("engine", engine, ENGINES)
+    batch = check_whole("batch", batch)
     if engine == "local" and (workers is not None or address is not None):
         raise InputError("workers, address", value=(workers, address), rule="are settings of engine='ray'")
     check_pyarrow()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from raytac.checks import check_whole
 from raytac.dataset.loader import PressDataset
 from raytac.errors import InputError
 
@@ -35,11 +36,9 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 
     Raises:
-        InputError: the data set has neither images nor heights, or no sound press, or a number is below 1.
+        InputError: the data set has neither images nor heights, or no sound press, or a number is not whole or below 1.
     """
-    for name, value in (("count", count), ("columns", columns)):
-        if value < 1:
-            raise InputError(name, value=value, rule="must be a whole number >= 1")
+    count, columns = check_whole("count", count), check_whole("columns", columns)
     shown = [name for name in ("rgb", "height") if name in data.description["arrays"]]
     if not shown or not len(data):
         raise InputError("data set", value=data.folder, rule="must hold a sound press with an image or a height")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from raytac.checks import check_numbers, check_whole
+from raytac.checks import check_known, check_numbers, check_whole
 from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.envs.variation import VariationDraws
@@ -95,8 +95,7 @@ class TaskBatch:
         Raises:
             InputError: a value out of its choices; as ``TactileWorld``.
         """
-        if action not in ACTIONS:
-            raise InputError("action", value=action, rule="must be a known kind of action", choices=ACTIONS)
+        check_known("action", action, ACTIONS)
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ class TactileObserver:
 
     def __init__(
         self,
-        sensor: str | SensorSpec,
+        sensor: str | Path | SensorSpec,
         settings: ObservationSettings | None = None,
         *,
         num_envs: int = 1,

@@ -27,7 +27,7 @@ import numpy as np
 from raytac.errors import CalibrationError, InputError
 from raytac.io.folder import result_folder
 from raytac.optics.calib_params import params_of, read_params
-from raytac.optics.npy_file import check_numbers, file_bytes, npy_array, npz_arrays, npz_names
+from raytac.optics.npy_file import check_file_numbers, file_bytes, npy_array, npz_arrays, npz_names
 from raytac.optics.table import PolyTable, ShadowTable, TaximConstants
 
 __all__ = ["CALIBRATION_FILES", "load_calibration", "processed_background", "save_calibration"]
@@ -135,7 +135,7 @@ def _gradients(path: Path) -> np.ndarray:
     n = int(bins.reshape(()))
     arrays = npz_arrays(path, tuple(f"grad_{c}" for c in _BGR), _bytes(n, n, 6))
     for c in _BGR:
-        check_numbers(path, f"grad_{c}", arrays[f"grad_{c}"], (n, n, 6))
+        check_file_numbers(path, f"grad_{c}", arrays[f"grad_{c}"], (n, n, 6))
     return np.stack([arrays[f"grad_{c}"].astype(np.float64) for c in _BGR])
 
 
@@ -149,7 +149,7 @@ def _image(path: Path) -> np.ndarray:
 
 def _gel_map(path: Path, shape: tuple[int, int]) -> np.ndarray:
     data = file_bytes(path)
-    return check_numbers(path, "", npy_array(path, "", data), shape).astype(np.float64)
+    return check_file_numbers(path, "", npy_array(path, "", data), shape).astype(np.float64)
 
 
 def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
@@ -160,12 +160,12 @@ def _own_arrays(path: Path, n: int, shape: tuple[int, ...]) -> dict[str, np.ndar
     if "gradients" in arrays and "surround" not in arrays:
         raise CalibrationError("must come with the array 'surround'", file=path, key="gradients", value=arrays["gradients"].shape)
     for name in {"surround", "gradients"} & set(arrays):
-        arrays[name] = check_numbers(path, name, arrays[name], (3, n, n, 6)).astype(np.float64)
+        arrays[name] = check_file_numbers(path, name, arrays[name], (3, n, n, 6)).astype(np.float64)
     covered = arrays.get("covered")
     if covered is not None and (covered.shape != (n, n) or covered.dtype != np.bool_):
         value = f"{covered.dtype} {covered.shape}"
         raise CalibrationError(f"must be bool of shape {(n, n)}", file=path, key="covered", value=value)
-    return arrays | {"background": check_numbers(path, "background", arrays["background"], shape).astype(np.float32)}
+    return arrays | {"background": check_file_numbers(path, "background", arrays["background"], shape).astype(np.float32)}
 
 
 def _shadow(path: Path, settings: dict[str, Any]) -> ShadowTable:
@@ -173,7 +173,7 @@ def _shadow(path: Path, settings: dict[str, Any]) -> ShadowTable:
     directions, lists = arrays["shadowDirections"], arrays["shadowTable"]
     if directions.ndim != 1 or not 1 <= len(directions) <= 4096:
         raise CalibrationError("must have shape (n_dir,)", file=path, key="shadowDirections", value=directions.shape)
-    check_numbers(path, "shadowDirections", directions, directions.shape)
+    check_file_numbers(path, "shadowDirections", directions, directions.shape)
     if lists.ndim != 3 or lists.shape[:2] != (3, len(directions)) or not 1 <= lists.shape[2] <= 4096:
         rule = f"must have shape (3, {len(directions)}, n_depth), as shadowDirections says"
         raise CalibrationError(rule, file=path, key="shadowTable", value=lists.shape)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import CalibrationError
-from raytac.optics.npy_file import check_numbers, npz_arrays, npz_names
+from raytac.optics.npy_file import check_file_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
 __all__ = [
@@ -123,13 +123,13 @@ def load_mlp(path: str | Path) -> MlpWeights:
         rows = 3 if k == count - 1 else (shape[0] if shape else 0)
         if not 1 <= rows <= _LARGEST:
             raise CalibrationError(f"must have 1 to {_LARGEST} rows", file=path, key=f"matrix_{k}", value=shape)
-        matrices.append(check_numbers(path, f"matrix_{k}", arrays[f"matrix_{k}"], (rows, width)))
-        offsets.append(check_numbers(path, f"offset_{k}", arrays[f"offset_{k}"], (rows,)))
+        matrices.append(check_file_numbers(path, f"matrix_{k}", arrays[f"matrix_{k}"], (rows, width)))
+        offsets.append(check_file_numbers(path, f"offset_{k}", arrays[f"offset_{k}"], (rows,)))
         width = rows
     background = arrays["background"]
     if background.ndim != 3 or background.shape[2] != 3 or min(background.shape[:2]) < 3:
         raise CalibrationError("must have shape (H, W, 3)", file=path, key="background", value=background.shape)
-    check_numbers(path, "background", background, background.shape)
+    check_file_numbers(path, "background", background, background.shape)
     return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), _provenance(path), _view(path))
 
 
@@ -164,7 +164,7 @@ def _provenance(path: Path) -> dict[str, str]:
 def _view(path: Path) -> tuple[float, float] | None:
     if "view" not in npz_names(path):
         return None
-    width, height = check_numbers(path, "view", npz_arrays(path, ("view",))["view"], (2,)).tolist()
+    width, height = check_file_numbers(path, "view", npz_arrays(path, ("view",))["view"], (2,)).tolist()
     if min(width, height) <= 0:
         raise CalibrationError("must be two lengths > 0 [m]", file=path, key="view", value=(width, height))
     return width, height

@@ -13,13 +13,13 @@ import numpy as np
 from raytac.errors import CalibrationError, RaytacError
 from raytac.optics.restricted_pickle import load_restricted
 
-__all__ = ["check_numbers", "file_bytes", "npy_array", "npz_arrays", "npz_names"]
+__all__ = ["check_file_numbers", "file_bytes", "npy_array", "npz_arrays", "npz_names"]
 
 _LARGEST = 2**30
 """Longest file or array read [byte]."""
 
 
-def check_numbers(path: Path, key: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def check_file_numbers(path: Path, key: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """``array`` if it holds finite numbers and has this shape."""
     if array.shape != shape or array.dtype.kind not in "iuf":
         raise CalibrationError(f"must be numbers of shape {shape}", file=path, key=key, value=f"{array.dtype} {array.shape}")

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.checks import check_known, check_names, check_seed, check_whole, is_whole
 from raytac.device import total_memory
 from raytac.errors import InputError, SpecError
 from raytac.gel.pad import grid_pitch, make_grid
@@ -127,19 +128,13 @@ class RayTracer:
             SpecError: with ``refraction.model = "slab"``, a camera or LED that is not below the slab.
             BackendError: Mitsuba cannot run on ``device``.
         """
-        if integrator not in INTEGRATORS:
-            raise InputError("integrator", value=integrator, rule="must be a known integrator", choices=INTEGRATORS)
-        if layers not in ("colour", "led"):
-            raise InputError("layers", value=layers, rule="must be a known grouping", choices=("colour", "led"))
-        for name in outputs:
-            if name not in OPTICAL_OUTPUTS:
-                raise InputError("outputs", value=name, rule="must be an optical output", choices=OPTICAL_OUTPUTS)
-        for name, value, lowest in (("spp", spp, 1), ("led_points", led_points, 1), ("max_depth", max_depth, -1)):
-            if value is not None and (int(value) != value or value < lowest or (name == "max_depth" and value == 0)):
-                rule = "must be a whole number >= 1" + (", or -1 for no limit" if name == "max_depth" else "")
-                raise InputError(name, value=value, rule=rule)
-        if int(seed) != seed or not 0 <= seed < 2**32:
-            raise InputError("seed", value=seed, rule="must be a whole number in [0, 2^32)")
+        check_known("integrator", integrator, INTEGRATORS)
+        check_known("layers", layers, ("colour", "led"))
+        outputs = check_names("outputs", outputs, OPTICAL_OUTPUTS)
+        spp = None if spp is None else check_whole("spp", spp)
+        led_points, seed = check_whole("led_points", led_points), check_seed("seed", seed)
+        if not is_whole(max_depth) or max_depth < -1 or max_depth == 0:
+            raise InputError("max_depth", value=max_depth, rule="must be a whole number >= 1, or -1 for no limit")
         if resolution is not None and (len(resolution) != 2 or min(resolution) < 1):
             raise InputError("resolution", value=resolution, rule="must be (width, height), each >= 1 pixel")
         self.rays = round(np.sqrt(spp or 1))

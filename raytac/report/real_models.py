@@ -19,6 +19,7 @@ from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
 from raytac.calibrate.shading_fit import with_shading
 from raytac.calibrate.table_fit import fit_table, with_cast_shadows
+from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError
 from raytac.gel.pad import make_grid
@@ -86,9 +87,8 @@ def check_fit(
         for value in values:
             if value not in choices:
                 raise InputError(name, value=value, rule=rule, choices=choices)
-    for name, number, least in (("starts", starts, 1), ("rounds", rounds, 0)):
-        if int(number) != number or number < least:
-            raise InputError(name, value=number, rule=f"must be a whole number >= {least}")
+    check_whole("starts", starts)
+    check_whole("rounds", rounds, 0)
 
 
 def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:

@@ -6,6 +6,7 @@ import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.optics.base import chosen_shadows
 from raytac.specs import SensorSpec
@@ -50,13 +51,17 @@ class Imaging:
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
-        """``integrator``, ``spp`` and ``exposure`` of a mode that traces rays, the last as a number; empty if it does not."""
+        """``integrator``, ``spp`` and ``exposure`` of a mode that traces rays; empty if it does not.
+
+        The exposure is a number. It is absent while it is ``AUTO``, where no output needs it.
+        """
         integrator = getattr(self.mode, "integrator", None)
         if integrator is None:
             return {}
         spp = getattr(self.mode, "rays", 1) ** 2 if integrator == "fast" else getattr(self.mode, "spp", None)
         exposure = getattr(getattr(self.mode, "sensor", self._spec), "response", self._spec.response).exposure
-        return {"integrator": integrator} | ({} if spp is None else {"spp": spp}) | {"exposure": exposure}
+        found = {"integrator": integrator, "spp": spp, "exposure": exposure if is_number(exposure) else None}
+        return {key: value for key, value in found.items() if value is not None}
 
     @property
     def mode(self) -> OpticalMode:

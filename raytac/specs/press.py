@@ -148,6 +148,8 @@ class PressScene:
     """One of ``PADS``; None leaves it to whoever presses."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise SpecError("must be a text", file=self.source, key="name", value=self.name)
         if not isinstance(self.object, ObjectSpec):
             raise SpecError("must be an ObjectSpec", file=self.source, key="object", value=self.object)
         if not isinstance(self.trajectory, tuple) or not all(isinstance(stage, StageSpec) for stage in self.trajectory):

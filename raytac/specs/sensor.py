@@ -389,6 +389,8 @@ class SensorSpec:
     """File that it was read from."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise SpecError("must be a text", file=self.source, key="name", value=self.name)
         for name, kind in SENSOR_PARTS.items():
             value = getattr(self, name)
             if not isinstance(value, kind):

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from raytac.errors import SpecError
 from raytac.specs.press import PADS, PHYSICS, PressScene
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.toml import ANY, Integer, Number, Schema, Text, check_fields, split_unit
+from raytac.specs.toml import ANY, REQUIRED, Integer, Number, Schema, Text, check_fields, split_unit
 
-__all__ = ["RANGE_SCHEMA", "SWEEP_SCHEMA", "PressRanges", "Range", "SweepSpec"]
+__all__ = ["MARKER_NOISE_SCHEMA", "RANDOMIZATION_SCHEMA", "RANGE_SCHEMA", "SWEEP_SCHEMA", "PressRanges", "Range", "SweepSpec"]
 
 Range = tuple[float, float]
 """Least and greatest value; draws are uniform between them."""
@@ -44,6 +44,28 @@ RANGE_SCHEMA: Final[Schema] = {
     "twist_deg": Number("[-180, 180]", length=2, default=(0.0, 0.0)),
 }
 """Keys of ``[press]``: least and greatest value."""
+
+_WIDTH = Number("[0, 1)", default=None)
+RANDOMIZATION_SCHEMA: Final[Mapping[str, Number]] = {
+    "led_power": _WIDTH,
+    "led_colour": _WIDTH,
+    "reflectance": _WIDTH,
+    "youngs_modulus": _WIDTH,
+    "friction": _WIDTH,
+    "exposure": _WIDTH,
+    "white_balance": _WIDTH,
+    "gamma": _WIDTH,
+    "noise": Number("[0, 255]", default=None),
+}
+"""Keys of ``[randomization]``: those of ``raytac.observe.Randomization``."""
+
+MARKER_NOISE_SCHEMA: Final[Mapping[str, Number]] = {
+    "noise_px": Number("[0, 100]", default=None),
+    "dropout": Number("[0, 1)", default=None),
+    "shift_mm": Number("[0, 20]", default=None),
+    "turn_deg": Number("[0, 180]", default=None),
+}
+"""Keys of ``[randomization.markers]``: those of ``raytac.markers.MarkerPerturbation``."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +124,46 @@ class SweepSpec:
     variants: int = 1
     """Drawn copies of every sensor, where the randomisation changes sensors."""
     randomization: Mapping[str, float] = field(default_factory=dict)
-    """Fields of ``raytac.observe.Randomization`` by name, without ``markers``."""
+    """Fields of ``raytac.observe.Randomization`` by name, those that ``RANDOMIZATION_SCHEMA`` has."""
     marker_perturbation: Mapping[str, float] = field(default_factory=dict)
     """Fields of ``raytac.markers.MarkerPerturbation`` by name."""
     source: Path | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise SpecError("must be a text", file=self.source, key="name", value=self.name)
         own = {key: rule for key, rule in SWEEP_SCHEMA.items() if key not in ("sensors", "objects")}
         check_fields(vars(self), own, file=self.source)
+        if self.pad is not None and self.physics != "ipc":
+            rule = 'is how finely a simulated pad is cut, so physics must be "ipc"'
+            raise SpecError(rule, file=self.source, key="pad", value=self.pad)
+        self._check_pressed("sensors", SensorSpec)
+        self._check_pressed("objects", PressScene)
+        for scene in self.objects:
+            if scene.object.kind == "none":
+                raise SpecError("must be press scenes with an object", file=self.source, key="objects", value=scene.name)
+        if not isinstance(self.ranges, PressRanges):
+            raise SpecError("must be a PressRanges", file=self.source, key="ranges", value=self.ranges)
+        markers = {split_unit(key)[0] if key != "noise_px" else key: (key, rule) for key, rule in MARKER_NOISE_SCHEMA.items()}
+        self._check_widths("randomization", self.randomization, {key: (key, rule) for key, rule in RANDOMIZATION_SCHEMA.items()})
+        self._check_widths("randomization.markers", self.marker_perturbation, markers)
+
+    def _check_pressed(self, key: str, kind: type[SensorSpec] | type[PressScene]) -> None:
+        """Refuse what is no tuple of specifications of this kind, each with a name of its own."""
+        specs = getattr(self, key)
+        if not isinstance(specs, tuple) or not specs or not all(isinstance(spec, kind) for spec in specs):
+            raise SpecError(f"must be a tuple of one or more {kind.__name__}", file=self.source, key=key, value=specs)
+        names = [spec.name for spec in specs]
+        if len(set(names)) != len(names):
+            rule = "must have names of their own: the data set tells them apart by the stems of their files"
+            raise SpecError(rule, file=self.source, key=key, value=names)
+
+    def _check_widths(self, prefix: str, widths: object, known: Mapping[str, tuple[str, Number]]) -> None:
+        """Refuse a name that no field has, or a value that no file could give; ``known``: field to its key and rule in a file."""
+        if not isinstance(widths, Mapping):
+            raise SpecError("must be a mapping of names to numbers", file=self.source, key=prefix, value=widths)
+        for name, value in widths.items():
+            if name not in known:
+                raise SpecError("must have known names", file=self.source, key=prefix, value=name, choices=tuple(known))
+            key, rule = known[name]
+            check_fields({split_unit(key)[0]: value}, {key: replace(rule, default=REQUIRED)}, prefix, self.source)

@@ -135,7 +135,7 @@ class RobotSpec:
 
     model: str
     """One of ``ROBOTS``, or the absolute path of an MJCF file."""
-    sensor: str | SensorSpec = "gelsight_mini"
+    sensor: str | Path | SensorSpec = "gelsight_mini"
     """Every sensor on it: name or path of a sensor file, or a specification."""
     joints: tuple[float, ...] | None = None
     """Where an arm's joints start [rad]; None: the Panda's READY, another robot's own start."""
@@ -155,6 +155,12 @@ class RobotSpec:
     def __post_init__(self) -> None:
         given = {key: rule for key, rule in _unturned(ROBOT_SCHEMA).items() if key not in ("sensor", "arm_joints")}
         check_fields(vars(self), given, "robot")
+        if not isinstance(self.sensor, (str, Path, SensorSpec)):
+            raise SpecError("must be a name, a path or a SensorSpec", key="robot.sensor", value=self.sensor)
+        if not isinstance(self.mounts, tuple) or not all(isinstance(mount, MountSpec) for mount in self.mounts):
+            raise SpecError("must be a tuple of MountSpec", key="robot.mount", value=self.mounts)
+        if not isinstance(self.arm_joints, tuple) or not all(isinstance(joint, str) for joint in self.arm_joints):
+            raise SpecError("must be a tuple of names", key="robot.arm_joints", value=self.arm_joints)
         check_quaternion(self.quaternion, "robot.quaternion_wxyz")
 
 
@@ -230,6 +236,12 @@ class TaskScene:
     """File that it was read from."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise SpecError("must be a text", file=self.source, key="name", value=self.name)
+        if not isinstance(self.robot, RobotSpec):
+            raise SpecError("must be a RobotSpec", file=self.source, key="robot", value=self.robot)
+        if not isinstance(self.bodies, tuple) or not all(isinstance(body, BodySpec) for body in self.bodies):
+            raise SpecError("must be a tuple of BodySpec", file=self.source, key="body", value=self.bodies)
         check_fields(vars(self), TASK_SCHEMA, file=self.source)
         for long, short in (("soft_timestep", "timestep"), ("control_timestep", "soft_timestep")):
             ratio = getattr(self, long) / getattr(self, short)

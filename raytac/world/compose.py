@@ -156,7 +156,7 @@ class _Robot:
 def _robot(scene: TaskScene) -> tuple[_Robot, tuple[SensorSpec, ...]]:
     """The robot of a scene, not compiled, and the sensors on it."""
     robot = scene.robot
-    sensor = load_sensor(robot.sensor) if isinstance(robot.sensor, str) else robot.sensor
+    sensor = robot.sensor if isinstance(robot.sensor, SensorSpec) else load_sensor(robot.sensor)
     if robot.model == "panda_one_sensor":
         made = one_sensor_panda(sensor)
     elif robot.model == "panda_two_fingers":

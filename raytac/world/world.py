@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from raytac.checks import MOST_ENVIRONMENTS, check_numbers, check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
@@ -101,8 +101,8 @@ class TactileWorld:
         """
         check_physics(physics, pad)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
-        if coupling is not None and coupling not in COUPLINGS:
-            raise InputError("coupling", value=coupling, rule="must be a known coupling", choices=COUPLINGS)
+        if coupling is not None:
+            check_known("coupling", coupling, COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
         self.physics = chosen_physics(physics, pad, self.scene.physics)
         self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]

@@ -243,8 +243,9 @@ def test_a_split_led_is_a_row_of_the_same_light(sensor: SensorSpec) -> None:
         np.testing.assert_allclose(np.abs(step @ np.array(led.edges[0])), row[0].size[0], err_msg="the row has no gaps")
         assert np.linalg.norm(step) * 3 == pytest.approx(1.5 * led.size[0])
     assert leds_split(sensor, 1) == sensor.lights
-    with pytest.raises(InputError, match="whole number >= 1"):
-        leds_split(sensor, 0)
+    for count in (0, 1.5, float("nan"), "2"):
+        with pytest.raises(InputError, match=r"split = .*whole number >= 1"):
+            leds_split(sensor, count)  # type: ignore[arg-type]
 
 
 def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:

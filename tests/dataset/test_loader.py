@@ -321,3 +321,5 @@ def test_a_contact_sheet_says_what_each_press_is_and_how_deep_with_a_scale(folde
     assert sheet.dtype == np.uint8 and sheet.ndim == 3 and len(np.unique(sheet.reshape(-1, 3), axis=0)) > 50
     with pytest.raises(InputError, match="columns = 0"):
         contact_sheet(data, columns=0)
+    with pytest.raises(InputError, match="count = '5'"):
+        contact_sheet(data, "5")  # type: ignore[arg-type]

@@ -119,8 +119,9 @@ def test_shapes_and_bytes_are_those_of_the_arrays(sweep: SweepSpec) -> None:
 def test_the_size_of_the_whole_is_the_sum_of_its_shards(sweep: SweepSpec) -> None:
     light = replace(sweep, outputs=("rgb",), markers=None, randomization={"led_power": 0.1}, marker_perturbation={}, variants=2)
     for count in (1, 4, 10, 33):
-        sensors = (sweep.sensors[0], replace(sweep.sensors[0], gelpad=replace(sweep.sensors[0].gelpad, size=(22e-3, 18e-3))))
-        plan = DatasetPlan(replace(light, sensors=(sensors[0], load_sensor("gelsight_mini"), sensors[1]), count=count))
+        first = sweep.sensors[0]
+        small = replace(first, name="small", gelpad=replace(first.gelpad, size=(22e-3, 18e-3)))
+        plan = DatasetPlan(replace(light, sensors=(first, load_sensor("gelsight_mini"), small), count=count))
         assert plan.total_bytes() == sum(plan.shard_bytes(shard) for shard in range(plan.shards))
         without = set(range(0, plan.shards, 2))
         assert plan.total_bytes(without) == sum(plan.shard_bytes(shard) for shard in range(plan.shards) if shard not in without)

@@ -119,6 +119,8 @@ def test_a_full_disk_and_bad_arguments_are_told_before_anything_is_rendered(
     for options, message in (
         ({"engine": "raay"}, r"engine = 'raay'.*local, ray"),
         ({"batch": 0}, "batch = 0"),
+        ({"batch": True}, "batch = True"),
+        ({"engine": ["local"]}, "engine = "),
         ({"workers": 2}, "engine='ray'"),
     ):
         with pytest.raises(InputError, match=message):

@@ -13,6 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from raytac import TactileSensor
 from raytac.cli import main
 from raytac.errors import SpecError
 from raytac.gel.surface import GelSurface
@@ -119,6 +120,13 @@ def test_cheap_modes_of_a_white_sensor_tell_of_it(monkeypatch: pytest.MonkeyPatc
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         at_rest(TaximMode(WHITE, calibration=white, **COMMON))  # photographs, of which the file's exposure says nothing
+
+
+def test_the_recorded_exposure_is_a_number_or_absent() -> None:
+    for exposure, outputs, number in ((AUTO, ("normals",), False), (3.0, ("normals",), True), (AUTO, ("rgb",), True)):
+        sampling = TactileSensor(exposed(exposure), optics="raytrace", outputs=outputs, **COMMON).sampling
+        assert (sampling["integrator"], sampling["spp"]) == ("fast", 1)
+        assert isinstance(sampling.get("exposure"), float) == number and ("exposure" in sampling) == number
 
 
 def test_a_file_may_say_auto_and_what_is_written_holds_the_number(tmp_path: Path) -> None:

@@ -221,7 +221,7 @@ WRONG: dict[str, Any] = {
     "prior": ("strong", "free, tied, tied-dark, tied-darkest"),
     "device": ("gpu", "auto, cpu, cuda"),
     "starts": (0, "whole number >= 1"),
-    "rounds": (-1, "whole number >= 0"),
+    "rounds": (float("nan"), "whole number >= 0"),
 }
 """Values that a fit cannot use, and what must be said of them."""
 

@@ -273,7 +273,8 @@ def test_what_cannot_be_is_refused(scene: TaskScene, error: type[Exception], rul
 def test_wrong_arguments_are_refused() -> None:
     wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"physics": "physx"}, "must be a known"),
-        ({"coupling": "three_way"}, "must be a known coupling"),
+        ({"coupling": "three_way"}, r"coupling = 'three_way': must be a known name.*two_way, one_way"),
+        ({"coupling": ["two_way"]}, "coupling = "),
         ({"num_envs": 0}, "whole number"),
     )
     for options, rule in wrong:
