@@ -214,7 +214,7 @@ def _side_by_side(jobs: list[_Job]) -> None:
         raise
     failed = [process.name for process in running if process.exitcode]
     if failed:
-        raise InputError("trainings", value=failed, rule="ended with an error, which is told above")
+        raise InputError("trainings", value=failed, rule="ended with an error, which is printed above")
 
 
 def _child(job: _Job) -> None:

@@ -100,7 +100,7 @@ def render_dataset(
     with FolderLock(folder):
         store = ShardStore(folder, plan.digest, compress=compress)
         _check_same(folder, plan, store)
-        with _told(folder):
+        with _write_errors(folder):
             store.clear_partial()
         records = _whole(store, progress, say)
         _check_room(folder, plan, records, say)
@@ -114,7 +114,7 @@ def render_dataset(
             total = sum(len(record.rows) for record in records.values())
             with tqdm(total=plan.sweep.count, initial=total, unit="press", disable=None if progress else True) as bar:
                 for result in results:
-                    with _told(folder):
+                    with _write_errors(folder):
                         if first is None:
                             # Not before something is rendered: a refusal leaves nothing at which a corrected command would stop.
                             write_description(folder, describe(plan, _ordered(records), None))
@@ -124,7 +124,7 @@ def render_dataset(
                     bar.update(len(result.rows))
         took = time.perf_counter() - start
         whole = _ordered(records)
-        with _told(folder):
+        with _write_errors(folder):
             write_description(folder, describe(plan, whole, write_manifest(folder, whole)))
     failed = sum(row["status"] == "failed" for record in whole for row in record.rows)
     steady = (done - first[1]) / (start + took - first[0]) if first is not None and done > first[1] else None
@@ -204,7 +204,7 @@ def _check_room(folder: Path, plan: DatasetPlan, records: dict[int, ShardRecord]
 
 
 @contextmanager
-def _told(folder: Path) -> Iterator[None]:
+def _write_errors(folder: Path) -> Iterator[None]:
     """Say in a sentence that the folder cannot be written, as where the disk becomes full."""
     try:
         yield

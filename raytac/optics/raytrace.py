@@ -146,8 +146,8 @@ class RayTracer:
             raise InputError("denoise", value=denoise, rule="the fast integrator has no noise", choices=(False,))
         casts = chosen_shadows(sensor, shadows, integrator)
         if integrator != "fast" and not casts:
-            told = f"optics.shadows = false of sensor {sensor.name!r} is for 'fast': {integrator!r} casts shadows as light does"
-            warnings.warn(told, stacklevel=2)
+            text = f"optics.shadows = false of sensor {sensor.name!r} is for 'fast': {integrator!r} casts shadows as light does"
+            warnings.warn(text, stacklevel=2)
         self.mi, self.device = load_mitsuba(device)
         if sensor.response.exposure == AUTO and {"rgb", "layers"} & set(outputs):
             sensor = with_exposure(sensor, self.device)

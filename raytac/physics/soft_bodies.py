@@ -202,7 +202,7 @@ def object_body(
 
 
 def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMesh:
-    """``object_surface`` of a body, without a mesh that crosses itself: whether a pad passes through such a body cannot be told.
+    """``object_surface`` of a body, without a mesh that crosses itself: no test can say whether a pad passes through such a body.
 
     Parts that overlap are common in models of robots, and only their outer walls touch anything, so they are a warning.
     """
@@ -217,8 +217,8 @@ def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMes
     if len(parts) > 1 and not any(part.joined for part in parts):
         crossings = find_crossings(surface.vertices, surface.faces)
         if crossings:
-            told = f"the parts of {name!r} overlap: {crossings.text(1e-3, 'mm')}; tests of whether a pad passes through it see them too"
-            warnings.warn(told, stacklevel=3)
+            text = f"the parts of {name!r} overlap: {crossings.text(1e-3, 'mm')}; tests of whether a pad passes through it see them too"
+            warnings.warn(text, stacklevel=3)
     return surface
 
 
