@@ -46,7 +46,8 @@ def in_body(text: str) -> str:
         (in_body('<replicate count="&#49;000000000"><geom size=".004"/></replicate>'), "copies"),
         (in_body(f'<replicate count="&#{"9" * 5000};"><geom size=".004"/></replicate>'), "must be whole numbers"),
         (
-            in_body('<replicate count="1000000000"><geom size=".004"/></replicate>').replace("<mujoco>", '<mujoco model="<!--">'),
+            in_body('<replicate count="1000000000"><geom size=".004"/></replicate>').replace("<mujoco>", '<mujoco model="<!--">')
+            + "<!-- -->",
             "copies",
         ),
         (in_body('<!-- a -- comment --><replicate count="1000000000"><geom size=".004"/></replicate>'), "copies"),
