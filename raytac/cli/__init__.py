@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import signal
@@ -21,6 +20,7 @@ from raytac.cli.doctor import DoctorArgs
 from raytac.cli.press import PressArgs
 from raytac.cli.view import ViewArgs
 from raytac.errors import RaytacError
+from raytac.io.folder import DISK_ERRORS
 
 __all__ = ["main"]
 
@@ -33,8 +33,6 @@ _Command = (
     | Annotated[ViewArgs, tyro.conf.subcommand("view")]
     | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
 )
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
-"""Errors of a disk, or of what standard output goes to."""
 _DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."
 
 
@@ -59,7 +57,7 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"raytac: error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        if error.errno not in _DISK:
+        if error.errno not in DISK_ERRORS:
             raise
         _drop_output()
         print(f"raytac: error: cannot write ({error})", file=sys.stderr)

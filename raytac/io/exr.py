@@ -6,6 +6,7 @@ Conventions (OpenEXR technical introduction): ``R G B`` linear; ``led_red.R`` â€
 
 from __future__ import annotations
 
+import errno
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,6 +38,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
 
     Raises:
         InputError: no channels, shapes that differ, or a header value that is not text.
+        OSError: the file cannot be written.
     """
     if not channels:
         raise InputError("channels", value={}, rule="must hold at least one image")
@@ -61,7 +63,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
         try:
             file.write(str(plain))
         except RuntimeError as error:
-            raise OSError(str(error)) from error
+            raise OSError(errno.EIO, f"{error} The disk may be full.") from error
         path.write_bytes(plain.read_bytes())
 
 

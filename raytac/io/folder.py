@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -9,9 +10,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from raytac.errors import InputError
+from raytac.errors import InputError, RaytacError
 
-__all__ = ["result_folder"]
+__all__ = ["DISK_ERRORS", "result_folder"]
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""Numbers of the errors of a disk, or of what standard output goes to."""
 
 
 @contextmanager
@@ -24,7 +28,8 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
 
     Raises:
         InputError: ``out`` is a file or a link to nothing, its folder cannot be written, it holds a folder where a file is to be written
-            (found before the block, for those that are ``owned``), or the disk is full.
+            (found before the block, for those that are ``owned``), or the disk is full or fails. What
+            else the block raises stays what it is.
     """
     out, owned = Path(out), tuple(owned)
     try:
@@ -48,14 +53,20 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
             out.mkdir(exist_ok=True)
             _move(work, old, out, owned)
         except OSError as error:
-            place = None if error.filename is None else Path(os.fsdecode(error.filename))
-            ours = place is None or place.is_relative_to(base) or place.is_relative_to(out)
-            if not ours or isinstance(error, ConnectionError):  # a reader that went away is no matter of the folder
+            if isinstance(error, RaytacError) or not _is_of_folder(error, (base, out)):
                 raise
-            reason = error.strerror or f"{error}: the disk may be full"
+            reason = error.strerror or error
             raise InputError("out", value=out, rule=f"cannot be written ({reason}); nothing in it has changed") from error
     finally:
         shutil.rmtree(base, ignore_errors=True)
+
+
+def _is_of_folder(error: OSError, folders: Iterable[Path]) -> bool:
+    """Whether the file that the error names lies in one of the folders; if it names none, whether it is one of a disk."""
+    if not isinstance(error.filename, str | bytes | os.PathLike):  # none, or the number of an open file
+        return error.errno in DISK_ERRORS
+    place = Path(os.path.abspath(os.fsdecode(error.filename)))
+    return any(place.is_relative_to(os.path.abspath(folder)) for folder in folders)
 
 
 def _check_no_folders(out: Path, names: Iterable[str]) -> None:

@@ -23,13 +23,14 @@ class FolderLock:
     Only runs that ask for the lock are kept out. Where the folder did not exist and nothing is written to it, it is removed again.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: str | Path) -> None:
         """Take the lock.
 
         Raises:
             InputError: another run has it, the folder cannot be written, or ``.lock`` in it is a link or no file.
         """
-        self._folder, self._made = Path(folder), not folder.exists()
+        folder = Path(folder)
+        self._folder, self._made = folder, not folder.exists()
         self._handle = -1
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -62,11 +63,16 @@ class FolderLock:
         """Let others in; a second call does nothing."""
         if self._handle < 0:
             return
-        if self._made and os.listdir(self._folder) == [LOCK]:
-            (self._folder / LOCK).unlink()
-            self._folder.rmdir()
-        os.close(self._handle)
-        self._handle = -1
+        handle, self._handle = self._handle, -1
+        try:
+            # Only while the lock in it is ours: another run may have made a folder of that name after ours was removed.
+            if self._made and self._is_there(handle) and os.listdir(self._folder) == [LOCK]:
+                (self._folder / LOCK).unlink()
+                self._folder.rmdir()
+        except OSError:  # the folder was removed or cannot be changed: an empty one that stays harms nobody
+            pass
+        finally:
+            os.close(handle)
 
     def __enter__(self) -> FolderLock:
         return self
@@ -77,5 +83,5 @@ class FolderLock:
     def _is_there(self, handle: int) -> bool:
         try:
             return os.path.samestat(os.fstat(handle), os.lstat(self._folder / LOCK))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return False

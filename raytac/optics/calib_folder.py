@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import CalibrationError, InputError
+from raytac.io.arrays import npy_bytes
 from raytac.io.folder import result_folder
 from raytac.optics.calib_params import params_of, read_params
 from raytac.optics.npy_file import check_file_numbers, file_bytes, npy_array, npz_arrays, npz_names
@@ -226,7 +227,7 @@ def save_calibration(table: PolyTable, folder: str | Path) -> None:
         gradients: dict[str, Any] = {f"grad_{c}": for_one[k] for k, c in enumerate(_BGR)}
         np.savez(work / "polycalib.npz", bins=np.int64(table.n_bins), **gradients)
         np.savez(work / "dataPack.npz", f0=rest[..., ::-1], img_size=np.array(rest.shape))
-        np.save(work / "gelmap.npy", np.zeros((height, width)) if table.gel_map is None else table.gel_map)
+        (work / "gelmap.npy").write_bytes(npy_bytes(np.zeros((height, width)) if table.gel_map is None else table.gel_map))
         names = ("covered", "surround") if table.one_sheet is None else ("covered", "surround", "gradients")
         own: dict[str, Any] = {name: getattr(table, name) for name in names if getattr(table, name) is not None}
         np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **own)

@@ -21,10 +21,14 @@ _LARGEST = 2**26
 _DEEPEST = 200
 """Elements within each other."""
 _COPIERS = ("replicate", "composite", "flexcomp")
-# As lenient as MuJoCo's own reader, which takes what a strict one does not, such as two hyphens in a comment.
-_IGNORED = re.compile(r"<!--.*?-->|<!\[CDATA\[.*?\]\]>", re.DOTALL)
-_TAG = re.compile(r"<(/?)([^\s<>/!?]+)([^<>\"']*(?:(?:\"[^\"]*\"|'[^']*')[^<>\"']*)*)>")
-_ATTRIBUTE = re.compile(r"([^\s=\"']+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+# As lenient as MuJoCo's own reader, which takes what a strict one does not, such as two hyphens in a comment. Each is read in a time
+# in proportion to the text, whatever the text is: what is not closed goes to the end, and nothing is tried again in a shorter form.
+_TOKEN = re.compile(
+    r"<!--(?:.*?-->|.*)|<!\[CDATA\[(?:.*?\]\]>|.*)|<\?(?:.*?\?>|.*)|<![^>]*+"
+    r"|<(?P<slash>/?)(?P<name>[^\s<>/!?\"']++)(?P<rest>(?:[^<>\"']++|\"[^\"]*+\"|'[^']*+')*+)>",
+    re.DOTALL,
+)
+_ATTRIBUTE = re.compile(r"(?<![^\s=\"'])([^\s=\"']++)\s*+=\s*+(?:\"([^\"]*+)\"|'([^']*+)')")
 
 
 def check_mjcf_size(path: str | Path) -> None:
@@ -48,14 +52,17 @@ def _check_file(path: Path, root: Path, above: tuple[Path, ...]) -> None:
     if len(data) > _LARGEST:
         raise InputError("MJCF file", value=path, rule=f"must be at most {_LARGEST} bytes long")
     copies, folders, files, included = [1], [root], [], []
-    for opens, closes, name, values in _tags(_IGNORED.sub("", data.decode("utf-8", "replace"))):
+    for opens, closes, name, values in _tags(data.decode("utf-8", "replace")):
         if opens:
             copies.append(copies[-1] * (_count(path, values.get("count", "")) if name in _COPIERS else 1))
             _check_element(path, name, values, copies)
             if name == "compiler":
                 folders += [root / values[key] for key in ("meshdir", "texturedir", "assetdir") if key in values]
-            if "file" in values:
-                (included if name in ("include", "model") else files).append(values["file"])
+            for key, value in values.items():
+                if name in ("include", "model") and key == "file":
+                    included.append(value)
+                elif key.startswith("file"):  # `filename` of a URDF, of which MuJoCo takes the last part, or `fileup` of a cube
+                    files += [value, re.split(r"[/\\]", value)[-1]]
         if closes and len(copies) > 1:
             copies.pop()
     for file in files:
@@ -67,10 +74,19 @@ def _check_file(path: Path, root: Path, above: tuple[Path, ...]) -> None:
 
 def _tags(text: str) -> Iterator[tuple[bool, bool, str, dict[str, str]]]:
     """Whether each tag opens and closes an element, its name, and its attributes."""
-    for match in _TAG.finditer(text):
-        slash, name, rest = match.groups()
-        values = {key: html.unescape(one or two) for key, one, two in _ATTRIBUTE.findall(rest)}
-        yield not slash, bool(slash) or rest.rstrip().endswith("/") or name.endswith("/"), name, values
+    for match in _TOKEN.finditer(text):
+        slash, name, rest = match["slash"], match["name"], match["rest"]
+        if name is None:  # a comment, or text that holds no tags
+            continue
+        values = {key: _unescaped(one or two) for key, one, two in _ATTRIBUTE.findall(rest)}
+        yield not slash, bool(slash) or rest.rstrip().endswith("/"), name, values
+
+
+def _unescaped(text: str) -> str:
+    try:
+        return html.unescape(text)
+    except ValueError:  # the number of a character has more digits than Python reads
+        return text
 
 
 def _is_file(path: Path) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
+from raytac.io.arrays import npy_bytes
 from raytac.io.exr import vector_channels, write_exr
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
@@ -56,9 +57,9 @@ def run_press(
         if channels:
             write_exr(folder / "frame.exr", channels, exr_header(sensor, scene, frame))
         if "height" in outputs:
-            np.save(folder / "height.npy", frame.surface.height[0].astype(np.float32))
+            (folder / "height.npy").write_bytes(npy_bytes(frame.surface.height[0].astype(np.float32)))
         if "traction" in outputs and frame.traction is not None:
-            np.save(folder / "traction.npy", frame.traction[0])
+            (folder / "traction.npy").write_bytes(npy_bytes(frame.traction[0]))
         if frame.markers is not None:
             names = ("displacement", "displacement_px", "rest", "rest_px", "position")
             np.savez(folder / "markers.npz", **{name: getattr(frame.markers, name)[0] for name in names})

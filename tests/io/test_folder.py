@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from raytac.errors import InputError
+from raytac.errors import AssetError, InputError
 from raytac.io.folder import result_folder
 
 
@@ -132,6 +136,65 @@ def test_a_move_that_fails_puts_back_what_was_there(tmp_path: Path, fails_at: in
         for name in ("height.npy", "metrics.json"):
             (folder / name).write_text("new")
     assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        AssetError("the folder scenes/ cannot be found"),
+        OSError("the camera is gone"),
+        TimeoutError("the server does not answer"),
+        OSError(errno.EBADF, "Bad file descriptor", 99),
+        PermissionError(errno.EACCES, "Permission denied", "/elsewhere"),
+        OSError(errno.ENOSPC, "No space left on device", "/elsewhere"),
+    ],
+    ids=repr,
+)
+def test_an_error_of_something_else_stays_what_it_is(tmp_path: Path, error: OSError) -> None:
+    with pytest.raises(OSError, match=re.escape(str(error))) as caught, result_folder(tmp_path / "out"):
+        raise error
+    assert caught.value is error and not list(tmp_path.iterdir())
+
+
+def test_a_file_of_the_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"cannot be written \(Is a directory\)"), result_folder(Path("out")) as folder:
+        (folder / "a").mkdir()
+        (folder.absolute() / "a").write_text("")
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "exr", "png"])
+def test_a_disk_that_fills_up_is_told_for_every_kind_of_file(tmp_path: Path, kind: str) -> None:
+    """A limit on the length of files stands for the disk, since libraries report both alike."""
+    code = """if True:
+        import resource, sys
+        from pathlib import Path
+        import numpy as np
+        from raytac.errors import AssetError, InputError
+        from raytac.io.exr import write_exr
+        from raytac.io.folder import result_folder
+        from raytac.io.arrays import npy_bytes
+        from raytac.io.png import write_png
+
+        noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8)
+        write = {
+            "npy": lambda path: path.write_bytes(npy_bytes(noise)),
+            "npz": lambda path: np.savez(path, a=noise),
+            "exr": lambda path: write_exr(path, {"Z": noise[..., 0] / 7}),
+            "png": lambda path: write_png(path, noise),
+        }[sys.argv[1]]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        try:
+            with result_folder(Path(sys.argv[2])) as folder:
+                write(folder / f"a.{sys.argv[1]}")
+        except InputError as error:
+            print(error)
+    """
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-c", code, kind, str(tmp_path / "out")]
+    said = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
+    assert "cannot be written (" in said and "nothing in it has changed" in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_error_that_is_not_of_the_folder_stays_what_it_is(tmp_path: Path) -> None:

@@ -67,6 +67,26 @@ def test_a_folder_in_which_nothing_was_done_is_removed_again(tmp_path: Path) -> 
     assert (tmp_path / "empty").exists(), "it was there before"
 
 
+def test_a_folder_given_as_text(tmp_path: Path) -> None:
+    with FolderLock(str(tmp_path / "out")), pytest.raises(InputError, match="in use by another run"):
+        FolderLock(str(tmp_path / "out"))
+
+
+@pytest.mark.parametrize("then", ["nothing", "file", "folder of another run"])
+def test_a_folder_that_is_removed_meanwhile_hides_no_error(then: str, tmp_path: Path) -> None:
+    out, gone, handles = tmp_path / "out", tmp_path / "gone", set(os.listdir("/proc/self/fd"))
+    with pytest.raises(ValueError, match="of the block"), FolderLock(out):
+        out.rename(gone)
+        if then == "file":
+            out.write_text("mine")
+        elif then != "nothing":
+            out.mkdir()
+            (out / ".lock").write_text("")
+        raise ValueError("of the block")
+    assert set(os.listdir("/proc/self/fd")) == handles
+    assert (out / ".lock").exists() == (then == "folder of another run")
+
+
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "out"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,8 @@ from raytac.physics.objects import object_parts
 from raytac.specs.press import ObjectSpec
 
 BALL = '<mujoco><worldbody><body name="b"><geom size="0.004"/></body></worldbody></mujoco>'
+
+URDF = '<robot name="r"><link name="l"><collision><geometry><mesh filename="pipe.stl"/></geometry></collision></link></robot>'
 
 
 def model(tmp_path: Path, text: str, name: str = "m.xml") -> Path:
@@ -40,11 +44,29 @@ def in_body(text: str) -> str:
         (in_body('<composite type="particle" count="2000 2000 2000"/>'), "copies"),
         (in_body(f'<replicate count="{"9" * 5000}"><geom size=".004"/></replicate>'), "copies"),
         (in_body('<replicate count="&#49;000000000"><geom size=".004"/></replicate>'), "copies"),
+        (in_body(f'<replicate count="&#{"9" * 5000};"><geom size=".004"/></replicate>'), "must be whole numbers"),
+        (
+            in_body('<replicate count="1000000000"><geom size=".004"/></replicate>').replace("<mujoco>", '<mujoco model="<!--">')
+            + "<!-- -->",
+            "copies",
+        ),
         (in_body('<!-- a -- comment --><replicate count="1000000000"><geom size=".004"/></replicate>'), "copies"),
         (in_body('<replicate count="1e9"><geom size=".004"/></replicate>'), "must be whole numbers"),
         ("<mujoco>" + "<body>" * 20000, "at most 200 elements within each other"),
     ],
-    ids=["hfield", "replicate", "nested", "composite", "digits", "entity", "comment", "float", "deep"],
+    ids=[
+        "hfield",
+        "replicate",
+        "nested",
+        "composite",
+        "digits",
+        "entity",
+        "long entity",
+        "quoted comment",
+        "comment",
+        "float",
+        "deep",
+    ],
 )
 def test_a_model_that_asks_for_too_much_is_refused(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message) as caught:
@@ -63,9 +85,35 @@ def test_devices_and_pipes_are_not_opened(tmp_path: Path) -> None:
         text,
         text.replace("<asset>", f'<compiler meshdir="{tmp_path}"/><asset>'),
         '<mujoco><include file="pipe.stl"/></mujoco>',
+        text.replace("<mesh", '<texture type="cube" fileup="pipe.stl"/><mesh').replace(
+            'file="pipe.stl"/></', 'file="none.stl"/></'
+        ),
+        URDF,
+        URDF.replace("pipe.stl", "package://robot/meshes/pipe.stl"),
+        URDF.replace("pipe.stl", r"meshes\pipe.stl"),
     ):
         with pytest.raises(InputError, match=r"pipe\.stl: must be a regular file"):
             check_mjcf_size(model(tmp_path, changed))
+
+
+@pytest.mark.parametrize(
+    "part",
+    ["<!--", "<![CDATA[", "<?", "<!", "<", "<a ", "<a b='", '<a "', """<a "'""", '<a" "', '<a b="c" '],
+)
+def test_what_is_not_closed_is_read_once(part: str, tmp_path: Path) -> None:
+    """A time that grows with the square of the length would be many minutes; the limit is no measure of speed."""
+    read_in_time(model(tmp_path, part * (1_000_000 // len(part))))
+
+
+@pytest.mark.parametrize("part", ["b", " ", "b ", "=", "b= ", "b='' ", "/"])
+def test_a_long_tag_is_read_once(part: str, tmp_path: Path) -> None:
+    read_in_time(model(tmp_path, f"<a {part * (1_000_000 // len(part))}>"))
+
+
+def read_in_time(path: Path) -> None:
+    code = "import sys; from raytac.physics.mjcf_size import check_mjcf_size; check_mjcf_size(sys.argv[1])"
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    subprocess.run([sys.executable, "-c", code, str(path)], env=env, check=True, timeout=60)
 
 
 def test_what_is_small_passes(tmp_path: Path) -> None:
