@@ -1,5 +1,8 @@
 """Playing: a film's pictures, the success rate of a scripted policy and of a checkpoint, and what is refused."""
 
+# pyright: reportMissingImports=false
+# (PyTorch belongs to the extra "rl", which the tests do without.)
+
 from __future__ import annotations
 
 import ast
