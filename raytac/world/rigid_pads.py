@@ -116,12 +116,9 @@ class RigidPads:
             OverlapError: a body starts beyond a pad's bonded face.
         """
         for sensor, pad, _, pad_from_body in self._poses([datas[b] for b in envs]):
-            near = self._near(pad, pad_from_body)
-            for i, body in enumerate(self.bodies):
-                rows = np.flatnonzero(near[:, i])
-                if len(rows) and (pierced := pad.face.pierced(body.parts, pad_from_body[rows, i], float(self._radius[i]))).any():
-                    rule = f"{body.spec.name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
-                    raise OverlapError(f"environment {envs[int(rows[pierced][0])]}: {rule}")
+            for row, i in np.argwhere(self._pierced(pad, pad_from_body)).tolist():
+                rule = f"{self.bodies[i].spec.name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
+                raise OverlapError(f"environment {envs[row]}: {rule}")
         for b in envs:
             self._laws[b] = {}
             for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
@@ -240,18 +237,24 @@ class RigidPads:
             near[:, self._planes] = lowest < np.vecdot(normal, at)
         return near
 
+    def _pierced(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
+        """Which bodies at poses (n, bodies, 4, 4) lie beyond the pad's bonded face, (n, bodies)."""
+        result = self._near(pad, pad_from_body)
+        for i, body in enumerate(self.bodies):
+            rows = np.flatnonzero(result[:, i])
+            if len(rows):
+                result[rows, i] = pad.face.pierced(body.parts, pad_from_body[rows, i], float(self._radius[i]))
+        return result
+
     def _mark_pierced(
         self, poses: Sequence[_PadPoses], envs: np.ndarray, before: dict[str, np.ndarray], failed: np.ndarray
     ) -> None:
         """Mark environments in which a body is beyond a pad's bonded face, or was on the path from ``before``, which is renewed."""
         for name, pad, _, pad_from_body in poses:
-            was, near = before[name][envs], self._near(pad, pad_from_body)
+            was, beyond = before[name][envs], self._pierced(pad, pad_from_body)
             before[name][envs] = pad_from_body
             for i, body in enumerate(self.bodies):
-                radius, now = float(self._radius[i]), pad_from_body[:, i]
-                pierced, rows = np.zeros(len(envs), bool), np.flatnonzero(near[:, i])
-                if len(rows):
-                    pierced[rows] = pad.face.pierced(body.parts, now[rows], radius)
+                radius, now, pierced = float(self._radius[i]), pad_from_body[:, i], beyond[:, i]
                 pieces = pad.face.pieces(was[:, i], now, radius)
                 for row in np.flatnonzero(pieces > 1).tolist():
                     path = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
