@@ -32,14 +32,14 @@ import tyro
 import ipc
 from raytac.errors import InputError, RaytacError
 from raytac.gel.coat_mesh import CoatMesh
-from raytac.gel.object_height import object_height
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
 from raytac.markers.surface import bind
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_mesh import PadLevel, PadMesh, pad_mesh
+from raytac.physics.soft.mesh import PadLevel, PadMesh, pad_mesh
+from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import PADS
+from raytac.shapes.underside import object_height
 from raytac.specs import SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 

@@ -27,8 +27,8 @@ from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
 from raytac.markers.calibration import PUBLISHED
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
-from raytac.physics.rigid import RigidPad
-from raytac.physics.soft_mesh import pad_mesh
+from raytac.physics.rigid.pad import RigidPad
+from raytac.physics.soft.mesh import pad_mesh
 from raytac.report.machine import machine
 from raytac.specs import MarkerMotionSpec, PunchSpec, SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec

@@ -31,10 +31,10 @@ from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
-from raytac.report.equal_error import cost_at, spp_for_error
+from raytac.report.compare.metrics import cost_at, spp_for_error
+from raytac.report.compare.references import References
 from raytac.report.image_error import mae, psnr, rmse
 from raytac.report.machine import machine
-from raytac.report.references import References
 from raytac.report.surfaces import press_peaks
 from raytac.report.timing import moving, once, timed
 from raytac.report.tracers import Tracers, path_trace
@@ -460,7 +460,7 @@ def main(args: Args) -> None:
     if args.spp < 2 or args.frames < 1:
         raise InputError("spp, frames", value=(args.spp, args.frames), rule="must be at least 2 and 1")
     out = args.out if args.out is not None else Path("runs") / "bench_optics"
-    from raytac.optics.variant import load_mitsuba
+    from raytac.optics.runtime import load_mitsuba
 
     device = load_mitsuba(args.device)[1]
     size = (80, 60) if args.quick else (320, 240)

@@ -28,9 +28,7 @@ import tyro
 from raytac.device import resolve_device
 from raytac.envs.push_cube import PushCubeVectorEnv
 from raytac.errors import RaytacError
-from raytac.gel.elastic import ElasticSurround
-from raytac.gel.object_height import object_height
-from raytac.gel.part import primitive
+from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
@@ -38,6 +36,8 @@ from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
 from raytac.report.machine import machine
 from raytac.sensor import TactileSensor
+from raytac.shapes.part import primitive
+from raytac.shapes.underside import object_height
 
 MODES: dict[str, ObservationSettings | None] = {
     "none": None,

@@ -31,8 +31,8 @@ from raytac.errors import InputError, RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.soft.mesh import PadLevel, pad_mesh
+from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import PADS, TactileSensor
 from raytac.specs import SensorSpec, load_press, load_sensor
 from raytac.specs.press import PressScene, StageSpec
@@ -143,7 +143,7 @@ def forces(spec: SensorSpec) -> dict[str, Metric]:
 
 
 def layer_law(spec: SensorSpec) -> float:
-    from raytac.physics.rigid import RigidPad
+    from raytac.physics.rigid.pad import RigidPad
 
     pad = RigidPad(spec, ball(StageSpec("indent", depth=DEPTH)), pitch=0.05e-3)
     return float(pad.peak(pad.run()).normal_force[0])

@@ -58,8 +58,8 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-    from raytac.optics.phong import PhongMode
-    from raytac.optics.taxim import TaximMode
+    from raytac.optics.image.phong import PhongMode
+    from raytac.optics.taxim.mode import TaximMode
 
     if family == "phong":
         return PhongMode(spec, resolution=size, device=device)
@@ -119,7 +119,7 @@ def device_call(mode: Any) -> Callable[[Any], None]:
 
 def peer(surfaces: Sequence[GelSurface], name: str, size: tuple[int, int], device: str, args: Args) -> dict[str, Metric]:
     """Time of the package ``taxim`` on the same contacts; empty, with a word, where it does not run."""
-    from raytac.report.peer_taxim import PeerTaxim
+    from raytac.report.compare.peer_taxim import PeerTaxim
 
     metrics: dict[str, Metric] = {}
     for family, shadow in (("peer", False), ("peer_shadow", True)):
@@ -137,15 +137,15 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-    from raytac.optics.raytrace import RayTracer
+    from raytac.optics.trace.fast_tracer import RayTracer
 
     tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 
 def main(args: Args) -> None:
-    from raytac.optics.bake import baked_table
-    from raytac.optics.bake_settings import BakeSettings
+    from raytac.optics.taxim.bake.bake import baked_table
+    from raytac.optics.taxim.bake.settings import BakeSettings
 
     start = time.perf_counter()
     device = resolve_device(args.device)

@@ -14,12 +14,12 @@ import numpy as np
 
 from experiments.running import recorded, run
 from raytac.errors import InputError
-from raytac.gel.part import primitive
 from raytac.io.options import CommonOptions
-from raytac.physics.rotation import rotations
-from raytac.physics.soft_bodies import scene_body
-from raytac.physics.soft_mesh import pad_mesh
-from raytac.physics.soft_scene import ScenePad, SoftScene
+from raytac.physics.soft.bodies import scene_body
+from raytac.physics.soft.mesh import pad_mesh
+from raytac.physics.soft.scene import ScenePad, SoftScene
+from raytac.se3 import rotations
+from raytac.shapes.part import primitive
 from raytac.specs.press import PADS
 from raytac.specs.sensor_file import load_sensor
 

@@ -35,8 +35,8 @@ from raytac.io.atomic import write_atomic
 from raytac.io.lock import FolderLock
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
-from raytac.physics.soft_scene import SceneState
-from raytac.physics.soft_travel import Poses
+from raytac.physics.soft.scene import SceneState
+from raytac.physics.soft.substeps import Poses
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld
 

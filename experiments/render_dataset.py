@@ -22,7 +22,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.io.png import write_png
-from raytac.physics.solver import hush_solver
+from raytac.physics.soft.availability import hush_solver
 from raytac.report.machine import machine
 from raytac.sensor import OPTICS, PHYSICS
 from raytac.specs import SweepSpec, load_sweep

@@ -24,8 +24,8 @@ from raytac.envs.roll_ball import RollBall
 from raytac.envs.scripted import SCRIPTED
 from raytac.envs.task import Start, Task
 from raytac.errors import InputError
-from raytac.gel.object_height import object_bounds
 from raytac.io.options import CommonOptions
+from raytac.shapes.underside import object_bounds
 from raytac.specs.task_file import load_task
 
 _PRESSED, _NOTHING = 0.05, 1e-6

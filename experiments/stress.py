@@ -34,8 +34,8 @@ from raytac.gel.traction import cell_areas
 from raytac.io.lock import FolderLock
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.options import CommonOptions, parse_names
-from raytac.physics.soft import SoftPad
-from raytac.physics.solver import hush_solver
+from raytac.physics.soft.availability import hush_solver
+from raytac.physics.soft.pad import SoftPad
 from raytac.report.machine import machine
 from raytac.sensor import PADS, PHYSICS, TactileSensor
 from raytac.specs import load_press, load_sensor, validate_press

@@ -26,7 +26,7 @@ __all__ = ["PROBES", "Check", "Probe", "Report", "diagnose", "run_probe"]
 
 _TRACE = """
 import numpy as np
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba({device!r})
 scene = mi.load_dict({{
     "type": "scene", "integrator": {{"type": "path", "max_depth": 3}},
@@ -109,8 +109,8 @@ print("jinja2", jinja2.__version__, "pyarrow", pyarrow.__version__, "scikit-imag
 
 _DENOISER = """
 import numpy as np
-from raytac.optics.denoise import make_denoiser
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.trace.denoise import make_denoiser
+from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba()
 grey = np.full((32, 32, 3), 0.5, np.float32)
 assert abs(make_denoiser(mi, device, (32, 32))(grey) - grey).max() < 0.05, "a grey image does not stay grey"

@@ -13,7 +13,7 @@ from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
-from raytac.physics.solver import check_solver, hush_solver
+from raytac.physics.soft.availability import check_solver, hush_solver
 from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs import PressScene, TaskScene, load_scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from raytac.optics.base import INTEGRATORS
-from raytac.sensor.contact_width import NarrowContactWarning
+from raytac.physics.soft.contact_width import NarrowContactWarning
 from raytac.sensor.options import LARGEST_SIDE, OPTICS, sensor_outputs
 from raytac.sensor.tactile_sensor import TactileSensor
 from raytac.specs.press import PADS, PHYSICS
