@@ -18,8 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from raytac import foreign_ipc
 from raytac.device import LLVM_NAMED_BY_USER, cuda_missing, llvm_library
+from raytac.installation import foreign_ipc
 from raytac.io.metrics import versions
 
 __all__ = ["PROBES", "Check", "Probe", "Report", "diagnose", "run_probe"]

@@ -15,7 +15,7 @@ from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare.page import write_comparison
 from raytac.report.compare.run import run_comparison
 from raytac.report.compare.settings import CompareSettings
-from raytac.sensor import PADS
+from raytac.specs import PADS
 
 __all__ = ["CompareArgs"]
 

@@ -23,7 +23,7 @@ def test_code_of_a_mode_is_all_that_it_imports() -> None:
 
 
 def test_code_of_a_table_is_that_of_its_bake_and_not_of_the_mode_that_uses_it() -> None:
-    baked, used = (set(module_sources([f"raytac.optics.{name}"])) for name in ("bake", "taxim"))
+    baked, used = (set(module_sources([f"raytac.optics.taxim.{name}"])) for name in ("bake.bake", "mode"))
     assert {
         "raytac.gel.pyramid",
         "raytac.shapes.rasterize",

@@ -7,9 +7,9 @@ import importlib.util
 import os
 from collections.abc import Iterator
 
-from raytac import foreign_ipc
 from raytac.device import cuda_device_count
 from raytac.errors import BackendError
+from raytac.installation import foreign_ipc
 
 __all__ = ["check_solver", "hush_solver"]
 

@@ -128,6 +128,9 @@ def _sampled(family: str, spp: int) -> Mode:
     return Mode(family, build, code, spp, {"integrator": integrator, "denoise": denoise, "spp": spp})
 
 
+_MODULES = {"phong": "raytac.optics.image.phong", "mlp": "raytac.optics.image.mlp", "taxim": "raytac.optics.taxim.mode"}
+
+
 def _named(family: str, optics: str, options: dict[str, Any]) -> Mode:
     def build(setting: Setting) -> OpticalMode:
         tracers = setting.tracers
@@ -142,7 +145,7 @@ def _named(family: str, optics: str, options: dict[str, Any]) -> Mode:
         return sensor.optical_mode
 
     table = optics == "taxim"
-    code = (f"raytac.optics.{optics}",)
+    code = (_MODULES[optics],)
     note = "" if table else "lights and constants as published for another sensor, not fitted to this one"
     return Mode(family, build, code, options={"optics": optics, **options}, prepare=_bake if table else None, note=note)
 

@@ -10,8 +10,8 @@ from raytac.errors import BackendError, InputError
 from raytac.markers.fots import marker_motion_of
 from raytac.physics.soft.availability import check_solver
 from raytac.report.image_error import SSIM_BORDER
-from raytac.sensor import LARGEST_SIDE, PADS
-from raytac.specs import load_press, load_sensor, validate_press
+from raytac.sensor import LARGEST_SIDE
+from raytac.specs import PADS, load_press, load_sensor, validate_press
 
 __all__ = ["SPP", "CompareSettings"]
 
