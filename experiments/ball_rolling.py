@@ -17,9 +17,8 @@ from experiments.rolling_control import PHASES, RollingController, Strokes
 from experiments.running import recorded, run
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
-from raytac.io.metrics import Metric
-from raytac.io.options import CommonOptions, parse_resolution
-from raytac.world.world import TactileWorld
+from raytac.io import CommonOptions, Metric, parse_resolution
+from raytac.world import TactileWorld
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,9 +34,7 @@ from ipc.collision import Collision
 from ipc.layout import Layout, build_layout, rotation_matrix
 from ipc.meshes import surface_of
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
 
 WAYS = ("lists", "bvh")
 SUNK = 0.5e-3

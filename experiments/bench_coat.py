@@ -31,17 +31,12 @@ import tyro
 
 import ipc
 from raytac.errors import InputError, RaytacError
-from raytac.gel.coat_mesh import CoatMesh
-from raytac.gel.object_height import object_height
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.markers.surface import bind
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_mesh import PadLevel, PadMesh, pad_mesh
-from raytac.sensor import PADS
-from raytac.specs import SensorSpec, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.gel import CoatMesh
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.markers import bind
+from raytac.physics import PadLevel, PadMesh, SoftPad, pad_mesh
+from raytac.shapes import object_height
+from raytac.specs import PADS, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
 
 SHAPES = {"edge": 0.0, "bar": 1.5e-3}
 """y of the sharp line [m]."""

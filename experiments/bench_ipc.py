@@ -44,9 +44,7 @@ from bench_ipc_scenes import (
 
 import ipc
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
 
 CUT: ipc.Cut = "alike"
 """Cells of the pad (``ipc.box_mesh``): docs/performance.md has figures of these, also pyuipc's."""

@@ -44,12 +44,20 @@ from numpy.typing import ArrayLike, NDArray
 
 import ipc
 from raytac.errors import InputError, RaytacError
-from raytac.io.arrays import npz_bytes
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.io.seal import SealError, read_sealed, write_sealed
-from raytac.report.machine import machine
+from raytac.io import (
+    VERSIONED,
+    CommonOptions,
+    Metric,
+    SealError,
+    npz_bytes,
+    parse_names,
+    read_sealed,
+    result_folder,
+    versions,
+    write_metrics,
+    write_sealed,
+)
+from raytac.report import machine
 
 KINDS: tuple[ipc.Cut, ...] = ("alike", "mirrored")
 """How cells are cut, see ``ipc.box_mesh``: as in ``bench_ipc.py``, and as in raytac's soft pad."""

@@ -52,9 +52,7 @@ from bench_ipc_scenes import (
 import ipc
 from ipc.meshes import surface_of
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
 
 ENERGIES = {
     # Ψ = μ/2 (I_C − 3) − μ (J − 1) + λ/2 (J − 1)², or what differs from it by a constant

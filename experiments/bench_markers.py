@@ -20,18 +20,12 @@ import numpy as np
 import tyro
 
 from raytac.errors import InputError, RaytacError
-from raytac.gel.coat_mesh import DeformedCoat
-from raytac.gel.surface import GelSurface
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
-from raytac.markers.calibration import PUBLISHED
-from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
-from raytac.physics.rigid import RigidPad
-from raytac.physics.soft_mesh import pad_mesh
-from raytac.report.machine import machine
-from raytac.specs import MarkerMotionSpec, PunchSpec, SensorSpec, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.gel import DeformedCoat, GelSurface
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
+from raytac.markers import MARKER_MODELS, PUBLISHED, MarkerTracker
+from raytac.physics import RigidPad, pad_mesh
+from raytac.report import machine
+from raytac.specs import MarkerMotionSpec, ObjectSpec, PressScene, PunchSpec, SensorSpec, StageSpec, load_sensor
 
 MODELS = (*MARKER_MODELS, PUBLISHED)
 NAMES = {"surface": "surface_markers"}

@@ -27,18 +27,24 @@ import tyro
 from tqdm import tqdm
 
 from raytac.errors import InputError, RaytacError
-from raytac.gel.surface import GelSurface
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.report.equal_error import cost_at, spp_for_error
-from raytac.report.image_error import mae, psnr, rmse
-from raytac.report.machine import machine
-from raytac.report.references import References
-from raytac.report.surfaces import press_peaks
-from raytac.report.timing import moving, once, timed
-from raytac.report.tracers import Tracers, path_trace
-from raytac.specs.sensor import SensorSpec
+from raytac.gel import GelSurface
+from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.report import (
+    References,
+    Tracers,
+    cost_at,
+    machine,
+    mae,
+    moving,
+    once,
+    path_trace,
+    press_peaks,
+    psnr,
+    rmse,
+    spp_for_error,
+    timed,
+)
+from raytac.specs import SensorSpec
 
 PARTS = ("speed", "error", "peer", "stages", "memory", "first_image")
 SPP = (1, 4, 16, 64)
@@ -460,7 +466,7 @@ def main(args: Args) -> None:
     if args.spp < 2 or args.frames < 1:
         raise InputError("spp, frames", value=(args.spp, args.frames), rule="must be at least 2 and 1")
     out = args.out if args.out is not None else Path("runs") / "bench_optics"
-    from raytac.optics.variant import load_mitsuba
+    from raytac.optics import load_mitsuba
 
     device = load_mitsuba(args.device)[1]
     size = (80, 60) if args.quick else (320, 240)

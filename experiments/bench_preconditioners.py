@@ -28,9 +28,7 @@ import ipc
 from ipc import linear
 from ipc.rest_inverse import RestInverse
 from raytac.errors import RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
 
 KINDS = ("block_jacobi", "fsai", "rest_alone", "rest_inverse", "rest_whole")
 STAGED = 3

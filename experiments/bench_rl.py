@@ -26,18 +26,14 @@ import numpy as np
 import tyro
 
 from raytac.device import resolve_device
-from raytac.envs.push_cube import PushCubeVectorEnv
+from raytac.envs import PushCubeVectorEnv
 from raytac.errors import RaytacError
-from raytac.gel.elastic import ElasticSurround
-from raytac.gel.object_height import object_height
-from raytac.gel.part import primitive
-from raytac.gel.surface import GelSurface
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names, parse_resolution
+from raytac.gel import ElasticSurround, GelSurface
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, parse_resolution, result_folder, versions, write_metrics
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
-from raytac.report.machine import machine
+from raytac.report import machine
 from raytac.sensor import TactileSensor
+from raytac.shapes import object_height, primitive
 
 MODES: dict[str, ObservationSettings | None] = {
     "none": None,
@@ -130,7 +126,7 @@ def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
 
 def frames(optics: str, args: Args) -> dict[str, Metric]:
     """Keys of one optical mode with ``--frames``."""
-    from raytac.observe.device_images import DeviceImages
+    from raytac.observe import DeviceImages
 
     settings = ObservationSettings(("rgb",), resolution=args.size, optics=optics, difference=True)
     observer = TactileObserver(args.sensor, settings, num_envs=args.envs, seed=args.seed)

@@ -28,14 +28,10 @@ import numpy as np
 import tyro
 
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
-from raytac.sensor import PADS, TactileSensor
-from raytac.specs import SensorSpec, load_press, load_sensor
-from raytac.specs.press import PressScene, StageSpec
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.physics import PadLevel, SoftPad, pad_mesh
+from raytac.sensor import TactileSensor
+from raytac.specs import PADS, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
 DEPTH, STEPS = 0.8e-3, 8
 REFINED = PadLevel(0.45e-3, 10, 5.0, 3.0, 1e-5)
@@ -143,7 +139,7 @@ def forces(spec: SensorSpec) -> dict[str, Metric]:
 
 
 def layer_law(spec: SensorSpec) -> float:
-    from raytac.physics.rigid import RigidPad
+    from raytac.physics import RigidPad
 
     pad = RigidPad(spec, ball(StageSpec("indent", depth=DEPTH)), pitch=0.05e-3)
     return float(pad.peak(pad.run()).normal_force[0])

@@ -25,15 +25,10 @@ from tqdm import tqdm
 
 from raytac.device import resolve_device
 from raytac.errors import BackendError, RaytacError
-from raytac.gel.surface import GelSurface
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.report.machine import machine
-from raytac.report.surfaces import press_peaks
-from raytac.report.table_error import error_metrics, table_errors
-from raytac.report.timing import moving, timed, timed_within
-from raytac.specs.sensor import SensorSpec
+from raytac.gel import GelSurface
+from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
+from raytac.specs import SensorSpec
 
 SCENES = "sphere,coin,cone,cylinder,edge,mesh,pins,torus,none"
 SIZES = {"320x240": (320, 240), "640x480": (640, 480)}
@@ -58,8 +53,7 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-    from raytac.optics.phong import PhongMode
-    from raytac.optics.taxim import TaximMode
+    from raytac.optics import PhongMode, TaximMode
 
     if family == "phong":
         return PhongMode(spec, resolution=size, device=device)
@@ -119,7 +113,7 @@ def device_call(mode: Any) -> Callable[[Any], None]:
 
 def peer(surfaces: Sequence[GelSurface], name: str, size: tuple[int, int], device: str, args: Args) -> dict[str, Metric]:
     """Time of the package ``taxim`` on the same contacts; empty, with a word, where it does not run."""
-    from raytac.report.peer_taxim import PeerTaxim
+    from raytac.report import PeerTaxim
 
     metrics: dict[str, Metric] = {}
     for family, shadow in (("peer", False), ("peer_shadow", True)):
@@ -137,15 +131,14 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-    from raytac.optics.raytrace import RayTracer
+    from raytac.optics import RayTracer
 
     tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 
 def main(args: Args) -> None:
-    from raytac.optics.bake import baked_table
-    from raytac.optics.bake_settings import BakeSettings
+    from raytac.optics import BakeSettings, baked_table
 
     start = time.perf_counter()
     device = resolve_device(args.device)

@@ -14,14 +14,11 @@ import numpy as np
 
 from experiments.running import recorded, run
 from raytac.errors import InputError
-from raytac.gel.part import primitive
-from raytac.io.options import CommonOptions
-from raytac.physics.rotation import rotations
-from raytac.physics.soft_bodies import scene_body
-from raytac.physics.soft_mesh import pad_mesh
-from raytac.physics.soft_scene import ScenePad, SoftScene
-from raytac.specs.press import PADS
-from raytac.specs.sensor_file import load_sensor
+from raytac.io import CommonOptions
+from raytac.physics import ScenePad, SoftScene, pad_mesh, scene_body
+from raytac.se3 import rotations
+from raytac.shapes import primitive
+from raytac.specs import PADS, load_sensor
 
 SHAPES = {
     "ball": ("sphere", (4e-3,), 4e-3),

@@ -30,15 +30,10 @@ from experiments.grasp_control import GraspController, smooth
 from experiments.running import run
 from raytac.device import resolve_device
 from raytac.errors import RaytacError
-from raytac.io.arrays import npz_bytes
-from raytac.io.atomic import write_atomic
-from raytac.io.lock import FolderLock
-from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
-from raytac.physics.soft_scene import SceneState
-from raytac.physics.soft_travel import Poses
-from raytac.specs.task_file import load_task
-from raytac.world.world import TactileWorld
+from raytac.io import CommonOptions, FolderLock, Metric, npz_bytes, versions, write_atomic, write_metrics
+from raytac.physics import Poses, SceneState
+from raytac.specs import load_task
+from raytac.world import TactileWorld
 
 OBJECT = "object"
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from raytac.robots.impedance import CartesianImpedance
-from raytac.robots.pose import pose
-from raytac.world.state import WorldState
-from raytac.world.world import TactileWorld
+from raytac.robots import CartesianImpedance, pose
+from raytac.world import TactileWorld, WorldState
 
 __all__ = ["GraspController", "smooth"]
 

@@ -26,9 +26,7 @@ import tyro
 from experiments.hard_run import Setup, Worst
 from experiments.hard_scenes import CASES, random_presses
 from raytac.errors import RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from experiments.ppo_learner import Learner
-from raytac.envs.sb3 import TactileVecEnv
-from raytac.envs.scripted import SCRIPTED
+from raytac.envs import SCRIPTED, TactileVecEnv
 
 __all__ = ["imitate", "regress"]
 

@@ -24,9 +24,7 @@ import ipc
 from experiments.contact_meshes import ball_tool, equal_area, even_block, flat_tool, rim_block
 from experiments.contact_oracles import BondedLayer, Elastic, boussinesq_displacement, hertz_force, punch_force
 from raytac.errors import RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -19,11 +19,9 @@ from experiments.grasp_control import GraspController, smooth
 from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import InputError, RaytacError
-from raytac.io.options import CommonOptions
-from raytac.specs.task import TaskScene
-from raytac.specs.task_file import load_task
-from raytac.world.state import WorldState
-from raytac.world.world import TactileWorld
+from raytac.io import CommonOptions
+from raytac.specs import TaskScene, load_task
+from raytac.world import TactileWorld, WorldState
 
 OBJECT = "object"
 SLIPPED = 1e-3

@@ -21,9 +21,7 @@ import numpy as np
 import tyro
 
 from raytac.errors import InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import CommonOptions, result_folder, versions, write_metrics
 
 FEWEST_TEETH = 12
 """With fewer, the roots of the teeth would cut into the face, whose outer edge has radius 4.3 m."""

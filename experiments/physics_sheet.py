@@ -28,12 +28,10 @@ import tyro
 
 from raytac.errors import InputError, RaytacError
 from raytac.frame import TactileFrame
-from raytac.gel.surface import GelSurface
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.sensor import PADS, TactileSensor
-from raytac.specs import load_press
+from raytac.gel import GelSurface
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.sensor import TactileSensor
+from raytac.specs import PADS, load_press
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,7 +178,7 @@ def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: Tac
     """One row for each scene: its name, and its frames under the rigid and the simulated pad."""
     from matplotlib.figure import Figure
 
-    from raytac.report.preview import camera_extent_mm
+    from raytac.report import camera_extent_mm
 
     left, right, bottom, top = camera_extent_mm(sensor.spec.camera)
     titles = (

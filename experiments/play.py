@@ -24,11 +24,9 @@ import numpy as np
 import tyro
 
 from raytac.errors import BackendError, InputError, RaytacError
-from raytac.io.folder import result_folder
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
 from raytac.observe import MODALITIES, ObservationSettings
-from raytac.report.machine import machine
+from raytac.report import machine
 from raytac.sensor import OPTICS
 
 if TYPE_CHECKING:
@@ -117,7 +115,7 @@ def main(args: Args) -> dict[str, Metric]:
 
 def _recipe(args: Args) -> Recipe | None:
     """That of the policy; None for a scripted one."""
-    from raytac.envs.scripted import SCRIPTED
+    from raytac.envs import SCRIPTED
 
     if args.policy != "scripted":
         from experiments.ppo_learner import Checkpoint
@@ -138,7 +136,7 @@ def _together(args: Args) -> int:
 def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
     """Over held-out seeds."""
     from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Evaluation, Learner, evaluate
-    from raytac.envs.scripted import SCRIPTED
+    from raytac.envs import SCRIPTED
 
     if recipe is not None:
         learner = Learner(recipe)
@@ -163,7 +161,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
 
 def _film(args: Args, recipe: Recipe | None) -> Film:
     from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
-    from raytac.envs.scripted import SCRIPTED
+    from raytac.envs import SCRIPTED
 
     seed = HELD_OUT + 2 * 10**6 + args.seed
     if recipe is None:

@@ -20,12 +20,19 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from raytac.checks import check_number, check_numbers, check_seed, check_whole
-from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
-from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
+from raytac.envs import (
+    BalancePoleVectorEnv,
+    LiftCubeVectorEnv,
+    ProcessVecEnv,
+    PushCubeVectorEnv,
+    RollBallVectorEnv,
+    TactileVecEnv,
+    TactileVectorEnv,
+)
 from raytac.errors import InputError
-from raytac.io.atomic import write_atomic
+from raytac.io import write_atomic
 from raytac.observe import ObservationSettings
-from raytac.report.proportion import wilson_interval
+from raytac.report import wilson_interval
 
 __all__ = ["HELD_OUT", "KINDS", "SMALLEST_SIDE", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
 

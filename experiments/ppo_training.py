@@ -28,8 +28,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from experiments.imitation import imitate
 from experiments.ppo_learner import HELD_OUT, Checkpoint, Learner, Recipe, evaluate
 from raytac.errors import InputError
-from raytac.io.atomic import write_atomic
-from raytac.io.lock import FolderLock
+from raytac.io import FolderLock, write_atomic
 
 __all__ = ["Training"]
 

@@ -14,11 +14,8 @@ import tyro
 
 from raytac.errors import RaytacError
 from raytac.frame import OUTPUTS
-from raytac.io.folder import result_folder
-from raytac.io.metrics import read_metrics, versions, write_metrics
-from raytac.io.options import CommonOptions
-from raytac.report.press import run_press
-from raytac.report.sheet import write_sheet
+from raytac.io import CommonOptions, read_metrics, result_folder, versions, write_metrics
+from raytac.report import run_press, write_sheet
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 

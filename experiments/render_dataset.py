@@ -19,13 +19,11 @@ import tyro
 
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError, RaytacError
-from raytac.io.metrics import versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names, parse_resolution
-from raytac.io.png import write_png
-from raytac.physics.solver import hush_solver
-from raytac.report.machine import machine
-from raytac.sensor import OPTICS, PHYSICS
-from raytac.specs import SweepSpec, load_sweep
+from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
+from raytac.physics import hush_solver
+from raytac.report import machine
+from raytac.sensor import OPTICS
+from raytac.specs import PHYSICS, SweepSpec, load_sweep
 
 
 @dataclass(frozen=True, kw_only=True)

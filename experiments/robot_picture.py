@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.io.options import CommonOptions
-from raytac.world.scene_camera import SceneCamera
-from raytac.world.world import TactileWorld
+from raytac.io import CommonOptions
+from raytac.world import SceneCamera, TactileWorld
 
 SCENES = {"ball_rolling": "one sensor on the flange", "lift_cube": "two sensors as fingers"}
 MIDDLE, ABOVE = np.array([0.25, 0.0, 0.36]), np.array([0.0, 0.0, 0.03])

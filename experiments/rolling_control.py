@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from raytac.robots.ik import DifferentialIk
-from raytac.robots.impedance import JointImpedance
-from raytac.robots.panda import MAX_VELOCITY
-from raytac.world.world import TactileWorld
+from raytac.robots import MAX_VELOCITY, DifferentialIk, JointImpedance
+from raytac.world import TactileWorld
 
 __all__ = ["PHASES", "RollingController", "Strokes"]
 

@@ -17,10 +17,7 @@ import tyro
 
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
-from raytac.io.atomic import write_atomic
-from raytac.io.folder import result_folder
-from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions
+from raytac.io import CommonOptions, Metric, result_folder, versions, write_atomic, write_metrics
 
 __all__ = ["recorded", "resumed", "run", "store"]
 

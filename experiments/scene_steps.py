@@ -16,17 +16,11 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.envs.balance_pole import BalancePole
-from raytac.envs.batch import TaskBatch
-from raytac.envs.lift_cube import LiftCube
-from raytac.envs.push_cube import PushCube
-from raytac.envs.roll_ball import RollBall
-from raytac.envs.scripted import SCRIPTED
-from raytac.envs.task import Start, Task
+from raytac.envs import SCRIPTED, BalancePole, LiftCube, PushCube, RollBall, Start, Task, TaskBatch
 from raytac.errors import InputError
-from raytac.gel.object_height import object_bounds
-from raytac.io.options import CommonOptions
-from raytac.specs.task_file import load_task
+from raytac.io import CommonOptions
+from raytac.shapes import object_bounds
+from raytac.specs import load_task
 
 _PRESSED, _NOTHING = 0.05, 1e-6
 """Force from which a pad counts as pressed, and up to which as not touched [N]."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from raytac.world.world import TactileWorld
+from raytac.world import TactileWorld
 
 __all__ = ["Snapshot", "draw_strip", "film", "snapshot"]
 

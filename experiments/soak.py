@@ -23,11 +23,9 @@ from experiments.running import resumed, store
 from raytac.device import resolve_device
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.errors import InputError, RaytacError
-from raytac.io.lock import FolderLock
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
+from raytac.io import VERSIONED, CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
 from raytac.observe import MODALITIES, ObservationSettings
-from raytac.report.machine import machine
+from raytac.report import machine
 
 TASKS: dict[str, type[TactileVectorEnv]] = {
     "push": PushCubeVectorEnv,

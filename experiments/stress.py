@@ -30,16 +30,12 @@ from experiments.running import resumed, run, store
 from raytac.device import resolve_device
 from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
-from raytac.gel.traction import cell_areas
-from raytac.io.lock import FolderLock
-from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.physics.soft import SoftPad
-from raytac.physics.solver import hush_solver
-from raytac.report.machine import machine
-from raytac.sensor import PADS, PHYSICS, TactileSensor
-from raytac.specs import load_press, load_sensor, validate_press
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.gel import cell_areas
+from raytac.io import CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
+from raytac.physics import SoftPad, hush_solver
+from raytac.report import machine
+from raytac.sensor import TactileSensor
+from raytac.specs import PADS, PHYSICS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
 
 SENSORS = ("gelsight_mini", "gelsight_dome")
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh", "soft_ball")

@@ -26,9 +26,8 @@ from typing import Any
 import tyro
 
 from raytac.errors import InputError, RaytacError
-from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.io.options import CommonOptions, parse_names
-from raytac.report.machine import machine
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, versions, write_metrics
+from raytac.report import machine
 
 TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
 RECIPES: dict[str, dict[str, Any]] = {
@@ -195,7 +194,7 @@ def _final_s(args: Args, last: float, recipe: Any) -> float:
 
 def _side_by_side(jobs: list[_Job]) -> None:
     """Each in a process of its own; Ctrl-C reaches all of them, and each ends by itself."""
-    from raytac.envs.sb3 import one_thread
+    from raytac.envs import one_thread
 
     context = multiprocessing.get_context("spawn")
     running = [context.Process(target=_child, args=(job,), name=job.name) for job in jobs]
@@ -228,7 +227,7 @@ def _child(job: _Job) -> None:
 
 def _gathered(jobs: list[_Job]) -> dict[str, Metric]:
     """``<tactile>.seed<k>.<key>`` of the trainings that have been evaluated to the end."""
-    from raytac.io.metrics import read_metrics
+    from raytac.io import read_metrics
 
     found: dict[str, Metric] = {}
     for job in jobs:

@@ -17,10 +17,9 @@ from experiments.grasp_control import GraspController, smooth
 from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import RaytacError
-from raytac.io.metrics import Metric
-from raytac.io.options import CommonOptions
-from raytac.specs.task_file import load_task
-from raytac.world.world import TactileWorld
+from raytac.io import CommonOptions, Metric
+from raytac.specs import load_task
+from raytac.world import TactileWorld
 
 BEAM = "beam"
 

@@ -43,7 +43,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
     """Return ``"cuda"`` or ``"cpu"`` for a ``device`` option.
 
     ``"auto"`` is CUDA when a device answers (and, for ``ray_tracing``, the driver brings OptiX and is new enough), else the CPU. This
-    loads the driver and runs nothing on it; the ray tracer traces a ray before it commits itself (``raytac.optics.variant``).
+    loads the driver and runs nothing on it; the ray tracer traces a ray before it commits itself (``raytac.optics.runtime``).
 
     Raises:
         InputError: ``device`` is not one of ``DEVICES``.

@@ -18,15 +18,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from raytac import foreign_ipc
 from raytac.device import LLVM_NAMED_BY_USER, cuda_missing, llvm_library
+from raytac.installation import foreign_ipc
 from raytac.io.metrics import versions
 
 __all__ = ["PROBES", "Check", "Probe", "Report", "diagnose", "run_probe"]
 
 _TRACE = """
 import numpy as np
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba({device!r})
 scene = mi.load_dict({{
     "type": "scene", "integrator": {{"type": "path", "max_depth": 3}},
@@ -109,8 +109,8 @@ print("jinja2", jinja2.__version__, "pyarrow", pyarrow.__version__, "scikit-imag
 
 _DENOISER = """
 import numpy as np
-from raytac.optics.denoise import make_denoiser
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.trace.denoise import make_denoiser
+from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba()
 grey = np.full((32, 32, 3), 0.5, np.float32)
 assert abs(make_denoiser(mi, device, (32, 32))(grey) - grey).max() < 0.05, "a grey image does not stay grey"

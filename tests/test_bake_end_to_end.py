@@ -10,7 +10,7 @@ import pytest
 from raytac.cli import main
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
-from raytac.optics.calib_folder import CALIBRATION_FILES, load_calibration
+from raytac.optics.taxim.folder import CALIBRATION_FILES, load_calibration
 
 
 def test_quick_bake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

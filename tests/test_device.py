@@ -65,7 +65,7 @@ def test_an_unknown_device_is_refused_with_the_choices(sensor_spec: SensorSpec) 
 
 _FALLS_BACK = """
 import sys, warnings
-import raytac.optics.variant as variant
+import raytac.optics.runtime as variant
 from raytac.errors import BackendError
 variant.resolve_device = lambda device: "cuda" if device == "auto" else device  # the libraries load, and nothing runs
 if sys.argv[1] == "cuda":
@@ -120,7 +120,7 @@ class Untraceable:
 
 
 def test_a_cuda_that_can_be_set_and_does_not_trace_is_never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    from raytac.optics import variant
+    from raytac.optics import runtime as variant
 
     monkeypatch.setattr(variant, "_require_llvm", lambda: None)
     mi = Untraceable()
@@ -150,8 +150,8 @@ def test_an_optix_that_the_user_named_is_the_only_one_tried(monkeypatch: pytest.
 
 
 def test_auto_stays_with_the_device_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    from raytac.optics.variant import load_mitsuba
+    from raytac.optics.runtime import load_mitsuba
 
     load_mitsuba("cpu")
-    monkeypatch.setattr("raytac.optics.variant.resolve_device", lambda device: "cuda")
+    monkeypatch.setattr("raytac.optics.runtime.resolve_device", lambda device: "cuda")
     assert load_mitsuba("auto")[1] == "cpu"

@@ -26,16 +26,15 @@ from ipc.errors import IpcError
 from raytac import TactileSensor
 from raytac.assets import asset_root
 from raytac.errors import RaytacError
-from raytac.gel.pad import make_grid
-from raytac.gel.part import hfield_part, mesh_part, primitive
-from raytac.gel.surface import GelSurface
+from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.metrics import read_metrics
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization, TactileObserver
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.calib_folder import load_calibration, save_calibration
-from raytac.optics.mlp_weights import load_mlp
-from raytac.optics.table import PolyTable, ShadowTable, TaximConstants
+from raytac.optics.image.mlp_weights import load_mlp
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.folder import load_calibration, save_calibration
+from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants
+from raytac.shapes.part import hfield_part, mesh_part, primitive
 from raytac.specs import load_lights, load_press, load_sensor, load_sweep
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.mesh import load_mesh

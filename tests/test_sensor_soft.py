@@ -13,9 +13,9 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.traction import cell_areas
+from raytac.physics.soft.contact_width import NarrowContactWarning
 from raytac.report.press import press_metrics
 from raytac.sensor import TactileSensor
-from raytac.sensor.contact_width import NarrowContactWarning
 from raytac.specs import load_press
 from raytac.specs.press import StageSpec
 

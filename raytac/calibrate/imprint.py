@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.pad import rest_height
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.surface import GelSurface, PadGrid, rest_height
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["KNOTS", "RIGID_PAD", "WIDEST", "PixelGeometry", "circles_on_pad", "pixel_geometry", "press_surface"]

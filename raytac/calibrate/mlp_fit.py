@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from raytac.calibrate.press_samples import PressSamples
-from raytac.optics.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
+from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["fit_mlp"]

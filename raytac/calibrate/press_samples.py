@@ -8,8 +8,8 @@ import numpy as np
 
 from raytac.calibrate.imprint import KNOTS, press_surface
 from raytac.calibrate.photographs import Photographs
-from raytac.gel.pad import make_grid
-from raytac.optics.phong import PhongMode
+from raytac.gel.surface import make_grid
+from raytac.optics.image.phong import PhongMode
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MOVED", "PressSamples", "press_samples"]

@@ -22,7 +22,7 @@ import numpy as np
 
 from raytac.errors import CalibrationError, InputError
 from raytac.io.png import read_png
-from raytac.optics.npy_file import npz_arrays
+from raytac.optics.taxim.restricted_pickle import npz_arrays
 
 __all__ = ["RealPresses", "read_presses"]
 

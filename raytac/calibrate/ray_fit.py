@@ -21,9 +21,8 @@ from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.raytrace import RayTracer
+from raytac.gel.surface import GelSurface, PadGrid, make_grid
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec
 
 __all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]

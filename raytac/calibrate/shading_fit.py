@@ -15,10 +15,9 @@ import numpy as np
 
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface
-from raytac.optics.raytrace import RayTracer, total
-from raytac.optics.shading import fit_log_gain
+from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics.response import fit_log_gain
+from raytac.optics.trace.fast_tracer import RayTracer, total
 from raytac.specs import SensorSpec
 
 __all__ = ["DEGREE", "with_shading"]

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from raytac.calibrate.press_samples import PressSamples
-from raytac.optics.bake import PLAIN, bake_shadow
-from raytac.optics.bake_fit import BinSums
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.bake_views import Calibration
-from raytac.optics.table import PolyTable, slope_bins
+from raytac.optics.taxim.bake.bake import PLAIN, bake_shadow
+from raytac.optics.taxim.bake.fit import BinSums
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.views import Calibration
+from raytac.optics.taxim.table import PolyTable, slope_bins
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["N_BINS", "fit_table", "with_cast_shadows"]

@@ -37,7 +37,7 @@ class BakeArgs(ShadowOptions, CommonOptions):
     """Few presses and coarse bins, in seconds: shows that all runs; a poor table, which only --calibration FOLDER uses."""
 
     def run(self) -> int:
-        from raytac.optics.bake_settings import BakeSettings
+        from raytac.optics.taxim.bake.settings import BakeSettings
 
         start = time.perf_counter()
         resolution = None if self.resolution is None else parse_resolution(self.resolution)

@@ -12,10 +12,10 @@ import tyro
 
 from raytac.cli.solver_options import SolverOptions
 from raytac.io.options import parse_names, parse_resolution
-from raytac.report.compare import run_comparison
-from raytac.report.compare_report import write_comparison
-from raytac.report.compare_settings import CompareSettings
-from raytac.sensor import PADS
+from raytac.report.compare.page import write_comparison
+from raytac.report.compare.run import run_comparison
+from raytac.report.compare.settings import CompareSettings
+from raytac.specs import PADS
 
 __all__ = ["CompareArgs"]
 

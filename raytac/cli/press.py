@@ -16,9 +16,10 @@ from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKER_MODELS
+from raytac.optics import INTEGRATORS
 from raytac.report.press import run_press
-from raytac.sensor import INTEGRATORS, OPTICS, PADS, PHYSICS, TactileSensor, sensor_outputs
-from raytac.specs import load_press
+from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
+from raytac.specs import PADS, PHYSICS, load_press
 from raytac.specs.press import chosen_physics
 
 __all__ = ["PressArgs"]

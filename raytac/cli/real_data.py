@@ -45,7 +45,7 @@ def read_data(
     """
     sensor = load_sensor(sensor_name)
     if sensor.response.exposure == AUTO:
-        from raytac.optics.raytrace import with_exposure
+        from raytac.optics.trace.fast_tracer import with_exposure
 
         sensor = with_exposure(sensor, device)
     if sides != OWN_LEDS:

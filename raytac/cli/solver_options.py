@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from raytac.io.options import CommonOptions
-from raytac.physics.solver import check_solver, hush_solver
+from raytac.physics.soft.availability import check_solver, hush_solver
 
 __all__ = ["SolverOptions"]
 

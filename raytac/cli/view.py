@@ -13,10 +13,10 @@ from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
-from raytac.physics.solver import check_solver, hush_solver
-from raytac.sensor import OPTICS, PADS, PHYSICS, TactileSensor
+from raytac.physics.soft.availability import check_solver, hush_solver
+from raytac.sensor import OPTICS, TactileSensor
 from raytac.sensor.options import sensor_spec
-from raytac.specs import PressScene, TaskScene, load_scene
+from raytac.specs import PADS, PHYSICS, PressScene, TaskScene, load_scene
 from raytac.specs.press import chosen_physics
 from raytac.specs.task import COUPLINGS
 

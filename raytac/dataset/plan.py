@@ -15,8 +15,7 @@ import numpy as np
 
 from raytac.dataset.arrays import ARRAYS, DATASET_OUTPUTS, SHARED, ArrayKind
 from raytac.errors import InputError, RaytacError, SpecError
-from raytac.gel.pad import grid_pitch, make_grid
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import PadGrid, grid_pitch, make_grid
 from raytac.markers import MarkerPerturbation
 from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor

@@ -16,7 +16,8 @@ from raytac.frame import TactileFrame
 from raytac.io.git_state import git_state
 from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
-from raytac.sensor import NarrowContactWarning, TactileSensor
+from raytac.physics import NarrowContactWarning
+from raytac.sensor import TactileSensor
 from raytac.sensor.pad import load_pad
 from raytac.specs import PressScene, SensorSpec
 from raytac.specs.press import PADS

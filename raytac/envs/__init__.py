@@ -1,27 +1,9 @@
 """Gymnasium environments; importing this registers them: ``import raytac.envs; gymnasium.make("raytac/PushCube-v0")``."""
 
-from __future__ import annotations
+import lazy_loader
 
-from raytac.envs.balance_pole import BalancePoleEnv, BalancePoleVectorEnv
-from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.lift_cube import LiftCubeEnv, LiftCubeVectorEnv
-from raytac.envs.push_cube import PushCubeEnv, PushCubeVectorEnv
-from raytac.envs.registration import IDS, register_envs
-from raytac.envs.roll_ball import RollBallEnv, RollBallVectorEnv
+from raytac.envs.registration import register_envs
 
-__all__ = [
-    "IDS",
-    "BalancePoleEnv",
-    "BalancePoleVectorEnv",
-    "LiftCubeEnv",
-    "LiftCubeVectorEnv",
-    "PushCubeEnv",
-    "PushCubeVectorEnv",
-    "RollBallEnv",
-    "RollBallVectorEnv",
-    "TactileEnv",
-    "TactileVectorEnv",
-    "register_envs",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 register_envs()

@@ -15,11 +15,10 @@ from raytac.envs.steering import ACTIONS, Steering
 from raytac.envs.task import Situation, Task
 from raytac.envs.variation import VariationDraws
 from raytac.errors import InputError
-from raytac.gel.batch import rounded_envs
-from raytac.gel.pad import COARSEST_PITCH
+from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
-from raytac.physics.rotation import inverse
 from raytac.robots.pose import pose_error
+from raytac.se3 import inverse
 from raytac.specs.press import chosen_physics
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task

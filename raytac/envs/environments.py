@@ -15,7 +15,7 @@ from raytac.envs.batch import Outcome, TaskBatch
 from raytac.envs.picture import EnvironmentPicture
 from raytac.envs.task import Task
 from raytac.errors import InputError
-from raytac.gel.batch import chosen_envs
+from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
 
 __all__ = ["TactileEnv", "TactileVectorEnv"]

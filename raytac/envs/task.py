@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from raytac.physics.rotation import rotations
+from raytac.se3 import rotations
 
 __all__ = ["Motion", "Situation", "Start", "Task", "Verdict", "far", "near", "placed", "turned"]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytac.observe import Randomization
-from raytac.physics.rotation import rotations
+from raytac.se3 import rotations
 from raytac.specs.task import TaskScene
 from raytac.world.variation import Variation
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.gel.product import product
+from raytac.gel.matmul import product
 
 __all__ = ["GaussianBlur", "fast_gaussian_matrix", "gaussian_matrix"]
 

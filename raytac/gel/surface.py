@@ -7,11 +7,26 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from raytac.checks import check_kind, check_number
 from raytac.errors import InputError
 from raytac.gel.coat_mesh import DeformedCoat
+from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["GelSurface", "PadGrid", "summary"]
+__all__ = [
+    "COARSEST_PITCH",
+    "MOST_CELLS",
+    "GelSurface",
+    "PadGrid",
+    "check_grid",
+    "chosen_envs",
+    "grid_pitch",
+    "make_grid",
+    "rest_height",
+    "rounded_envs",
+    "summary",
+]
 
 
 def summary(record: Any) -> str:
@@ -115,3 +130,85 @@ class GelSurface:
     def indentation(self) -> np.ndarray:
         """Indentation depth rest − height [m], shape (B, Ny, Nx); negative where the gel bulges outwards."""
         return self.grid.rest[None] - self.height
+
+
+def rounded_envs(envs: list[int], batch: int) -> list[int]:
+    """The same with the last of them named again, up to a power of two or ``batch``: kernels are recorded for each number of rows."""
+    count = min(1 << max(len(envs) - 1, 0).bit_length(), batch)
+    return [*envs, *envs[-1:] * (count - len(envs))]
+
+
+def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
+    """Numbers of the environments that a mask (B,) or a list names, in its order; None names all.
+
+    Raises:
+        InputError: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
+    """
+    if envs is None:
+        return list(range(batch))
+    try:
+        chosen = np.asarray(envs)
+    except ValueError as error:  # lists of several lengths
+        raise InputError("envs", value=envs, rule=f"must name environments 0 to {batch - 1}") from error
+    if chosen.dtype == bool:
+        if chosen.shape != (batch,):
+            raise InputError("envs", value=chosen.shape, rule=f"a mask must have shape ({batch},)")
+        return np.flatnonzero(chosen).tolist()
+    if chosen.size == 0:
+        return []
+    if not np.issubdtype(chosen.dtype, np.integer) or chosen.min() < 0 or chosen.max() >= batch:
+        raise InputError("envs", value=chosen.tolist(), rule=f"must name environments 0 to {batch - 1}")
+    return chosen.ravel().tolist()
+
+
+COARSEST_PITCH = 0.1e-3
+"""Spacing of the pad's grid where the image does not ask for a finer one [m]."""
+
+
+MOST_CELLS = 8192
+"""Most cells of the pad's grid along an axis, as many as an image can have pixels."""
+_SAME = 1e-6
+"""Difference within which a grid is of a pad [m]."""
+
+
+def grid_pitch(pixel: tuple[float, float]) -> float:
+    """Spacing [m] of the nodes for an image whose pixels cover ``pixel`` (x, y) [m] of the pad: as fine as the image."""
+    return min(COARSEST_PITCH, *pixel)
+
+
+def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rest surface z [m] at pad-frame positions ``x``, ``y`` [m] of any shapes that broadcast.
+
+    z = −``gelpad.sag(x, y)``: 0 at the pad centre, an exact circle along both axes, the paraboloid −x²/(2Rx) − y²/(2Ry) to fourth
+    order, flat along an axis whose radius is ``inf``.
+    """
+    return -gelpad.sag(np.asarray(x, float), np.asarray(y, float))
+
+
+def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
+    """Raise ``InputError`` unless ``grid`` spans this gelpad, to a micrometre, and rests on its dome."""
+    ends = [float(nodes[k]) for nodes in (grid.x, grid.y) for k in (0, -1)]
+    own = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
+    if not np.allclose(ends, own, rtol=0.0, atol=_SAME):
+        rule = f"must be a grid of this sensor's pad, x and y from {own} m"
+        raise InputError("surface.grid", value=ends, rule=rule)
+    off = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
+    if not off <= _SAME:
+        raise InputError("surface.grid", value=off, rule="must rest on this sensor's dome; its nodes are so far off it [m]")
+
+
+def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
+    """Grid of nodes over the whole pad.
+
+    ``pitch`` [m] is the wanted spacing; along each axis it is adjusted to size / round(size / pitch), so that nodes fall on both
+    edges. Raises ``InputError`` if the pitch is not positive and finite, or leaves fewer than two cells along an axis or more than
+    ``MOST_CELLS``.
+    """
+    check_kind("gelpad", gelpad, GelpadSpec)
+    check_number("pitch", pitch, "(0, inf)", "m")
+    for axis, size in zip("xy", gelpad.size, strict=True):
+        if not 1.5 <= size / pitch <= MOST_CELLS:
+            rule = f"must divide the pad's {size:g} m along {axis} into 2 to {MOST_CELLS} cells"
+            raise InputError("pitch", value=pitch, rule=rule)
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
+    return PadGrid(x=x, y=y, rest=rest_height(gelpad, x[None, :], y[:, None]))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 __all__ = ["code_digest", "module_sources"]
 
-WITHIN = ("raytac.gel", "raytac.optics")
+WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
 """Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
 
 

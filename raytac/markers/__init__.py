@@ -1,8 +1,5 @@
 """Markers: how the dots on the coat move, by four models behind one interface; see docs/markers.md."""
 
-from __future__ import annotations
+import lazy_loader
 
-from raytac.markers.perturbation import MarkerPerturbation
-from raytac.markers.tracker import MARKER_MODELS, MarkerFrame, MarkerTracker
-
-__all__ = ["MARKER_MODELS", "MarkerFrame", "MarkerPerturbation", "MarkerTracker"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

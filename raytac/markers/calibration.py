@@ -21,7 +21,7 @@ from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.marker_motion import FotsConstants
+    from raytac.markers.fots_kernel import FotsConstants
 
 __all__ = ["PUBLISHED", "ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
 
@@ -66,7 +66,7 @@ class ProbeData:
     @classmethod
     def of(cls, sensor: SensorSpec, frames: Sequence[PressFrame]) -> ProbeData:
         """Follow every press from its start; ``frames`` hold whole presses, in order."""
-        from raytac.gel.pad import rest_height
+        from raytac.gel.surface import rest_height
         from raytac.markers.sampling import height_and_slope, object_way
 
         xy = marker_centres(probe_sensor(sensor).markers)
@@ -131,7 +131,7 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     published and once as a punch (``PunchSpec``), whose three constants shear and twist share. A cap is no more than the largest motion
     in the data: beyond it nobody knows.
     """
-    from raytac.optics.marker_motion import TWIST_SLIP, FotsConstants, FotsKernel
+    from raytac.markers.fots_kernel import TWIST_SLIP, FotsConstants, FotsKernel
 
     kernel = FotsKernel(data.cells.x, data.cells.y, device=device)
 

@@ -174,10 +174,10 @@ def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = 
         RaytacError: the press did not settle.
         SpecError: the press does not fit this sensor.
     """
-    from raytac.physics.solver import check_solver
+    from raytac.physics.soft.availability import check_solver
 
     check_solver("a press on the simulated pad")
-    from raytac.physics.soft import SoftPad
+    from raytac.physics.soft.pad import SoftPad
 
     soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=pad, device=device)
     loads, poses, coats = [], [], []
@@ -199,7 +199,7 @@ def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[
     Raises:
         SpecError: the press does not fit this sensor.
     """
-    from raytac.physics.rigid import RigidPad
+    from raytac.physics.rigid.pad import RigidPad
 
     rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)
     frames = []

@@ -14,7 +14,7 @@ import numpy as np
 from raytac.io.arrays import npy_bytes
 from raytac.io.cache import cache_folder, keep_cached, read_cached
 from raytac.io.code_digest import code_digest
-from raytac.physics.soft_mesh import PadMesh
+from raytac.physics.soft.mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["cached_compliance", "coat_compliance", "rest_stiffness"]

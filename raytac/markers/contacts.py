@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.batch import chosen_envs
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.components import find_edges, join_runs
+from raytac.gel.components import find_edges, join_runs
+from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
 
 __all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "contact_boxes"]
 

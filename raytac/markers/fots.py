@@ -13,7 +13,7 @@ from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.marker_motion import FotsConstants
+    from raytac.markers.fots_kernel import FotsConstants
 
 __all__ = ["FotsMarkers", "fots_constants", "marker_motion_of"]
 
@@ -35,7 +35,7 @@ def marker_motion_of(sensor: SensorSpec) -> MarkerMotionSpec:
 
 def fots_constants(motion: MarkerMotionSpec) -> FotsConstants:
     """What the kernel needs of a marker motion."""
-    from raytac.optics.marker_motion import FotsConstants
+    from raytac.markers.fots_kernel import FotsConstants
 
     return FotsConstants(
         motion.dilate_gain,
@@ -49,14 +49,14 @@ def fots_constants(motion: MarkerMotionSpec) -> FotsConstants:
 
 
 class FotsMarkers:
-    """The model ``fots``; formulas and sources in ``raytac.optics.marker_motion``, constants from the sensor's marker motion."""
+    """The model ``fots``; formulas and sources in ``raytac.markers.fots_kernel``, constants from the sensor's marker motion."""
 
     name = "fots"
     needs_contacts = True
 
     def __init__(self, sensor: SensorSpec, grid: PadGrid, *, device: str = "auto") -> None:
         """Raises ``InputError`` if the sensor has no marker motion, ``BackendError`` if Dr.Jit cannot run on ``device``."""
-        from raytac.optics.marker_motion import FotsKernel
+        from raytac.markers.fots_kernel import FotsKernel
 
         motion = marker_motion_of(sensor)
         cells = ContactCells.over(grid)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.pad import rest_height
+from raytac.gel.surface import rest_height
 from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 

@@ -38,7 +38,7 @@ class SuperpositionMarkers:
 
     def __init__(self, sensor: SensorSpec) -> None:
         from raytac.markers.compliance import cached_compliance
-        from raytac.physics.soft_mesh import pad_mesh
+        from raytac.physics.soft.mesh import pad_mesh
 
         mesh = pad_mesh(sensor.gelpad, _LEVEL)
         self.coat = mesh.coat

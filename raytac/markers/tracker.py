@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.batch import chosen_envs
-from raytac.gel.surface import GelSurface, PadGrid, summary
+from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
 from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber

@@ -12,7 +12,7 @@ import numpy as np
 from raytac.checks import MOST_ENVIRONMENTS, check_kind, check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.gel.batch import chosen_envs, rounded_envs
+from raytac.gel.surface import chosen_envs, rounded_envs
 from raytac.observe.cells import CellMeans
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout

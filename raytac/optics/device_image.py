@@ -10,9 +10,9 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.image_mode import ImageMode
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.recording import no_collection
+from raytac.optics.image.base import ImageMode
+from raytac.optics.runtime import no_collection
+from raytac.optics.trace.fast_tracer import RayTracer
 
 __all__ = ["DeviceImage", "ImageCut"]
 

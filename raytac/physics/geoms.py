@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.part import Part, hfield_part, mesh_part, primitive
 from raytac.physics.mjcf_size import check_mjcf_size
-from raytac.physics.rotation import rotation_of
+from raytac.se3 import rotation_of
+from raytac.shapes.part import Part, hfield_part, mesh_part, primitive
 
 __all__ = ["GEOM_TYPES", "body_parts", "geom_part", "load_mjcf"]
 

@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.part import Part, mesh_part, primitive
-from raytac.gel.relief import relief_part
-from raytac.physics.coin import coin_elevation
+from raytac.shapes.coin import coin_elevation
+from raytac.shapes.part import Part, mesh_part, primitive
+from raytac.shapes.relief import relief_part
 from raytac.specs.shape_file import OBJECT_SCHEMA
 
 __all__ = ["Shape", "object_parts"]

@@ -16,10 +16,14 @@ from raytac.report.table_error import SceneError, error_metrics, table_errors
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.bake import Baked
-    from raytac.optics.bake_settings import BakeSettings
+    from raytac.optics.taxim.bake.bake import Baked
+    from raytac.optics.taxim.bake.settings import BakeSettings
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["bake_metrics", "run_bake"]
+if TYPE_CHECKING:
+    from raytac.optics.taxim.bake.fit import BinFit
+
+__all__ = ["ERROR_RANGE", "bake_metrics", "run_bake", "write_coverage", "write_table_sheet"]
 
 
 def run_bake(
@@ -43,10 +47,10 @@ def run_bake(
         InputError: a value out of its choices, or a folder that cannot be written.
         BackendError: the ray tracer cannot run on ``device``.
     """
-    from raytac.optics.bake import bake
-    from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
-    from raytac.optics.table_cache import keep, table_folder
-    from raytac.report.bake_figure import write_coverage, write_table_sheet
+    from raytac.optics.taxim.bake.bake import bake
+    from raytac.optics.taxim.cache import keep, table_folder
+    from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
+    from raytac.report.bake import write_coverage, write_table_sheet
 
     with result_folder(out, (*CALIBRATION_FILES, "coverage.png", "sheet.png", "metrics.json")) as folder:
         size = sensor.camera.resolution if resolution is None else resolution
@@ -88,3 +92,108 @@ def bake_metrics(baked: Baked, errors: dict[str, dict[str, SceneError]], bake_s:
     for degree in (0, 1, 2):
         metrics[f"bake.degree{degree}_share"] = float((fit.degree[:-1, :-1] == degree).mean())
     return metrics | error_metrics(errors)
+
+
+ERROR_RANGE = 32
+"""Levels that the signed error is shown to, in either direction, the same in every sheet."""
+_STYLE: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 7,
+}
+_FILLED = "#d9d9d9"
+_DEGREES = ("#fdcc8a", "#74a9cf", "#045a8d")
+
+
+def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
+    """Samples of every bin, and the degree of its polynomial, over direction and magnitude of the slope."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import ListedColormap, LogNorm
+    from matplotlib.patches import Patch
+
+    counts, degree = fit.counts[:-1, :-1].astype(float), fit.degree[:-1, :-1]
+    extent = (-180.0, 180.0, 0.0, 90.0)
+    with plt.rc_context(_STYLE):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
+        for axes in (left, right):
+            axes.set_facecolor(_FILLED)
+            axes.set_xlabel("direction of the slope [°]")
+            axes.set_xticks((-180, -90, 0, 90, 180))
+            axes.set_yticks((0, 15, 30, 45, 60, 75, 90))
+        left.set_ylabel("magnitude of the slope [°]")
+        shown = np.ma.masked_equal(counts, 0)
+        norm = LogNorm(1, max(10.0, float(counts.max())))
+        image = left.imshow(
+            shown, origin="lower", extent=extent, aspect="auto", cmap="viridis", norm=norm, interpolation="nearest"
+        )
+        left.set_title(f"a  touched samples a bin, {sensor}")
+        figure.colorbar(image, ax=left, pad=0.02)
+        shown = np.ma.masked_less(degree, 0)
+        colours = ListedColormap(_DEGREES)
+        right.imshow(
+            shown, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=-0.5, vmax=2.5, interpolation="nearest"
+        )
+        right.set_title("b  degree of the bin's polynomial")
+        names = ("mean", "linear", "quadratic")
+        keys = [Patch(facecolor=c, label=n) for c, n in zip(_DEGREES, names, strict=True)]
+        figure.legend(
+            handles=[*keys, Patch(facecolor=_FILLED, label="no sample (filled)")],
+            loc="outside lower right",
+            ncols=4,
+            frameon=False,
+        )
+        figure.savefig(path, dpi=300)
+        plt.close(figure)
+
+
+def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> None:
+    """One row a scene: ray tracer, table, table with shadows (if there are), and the table's signed error, mean of the channels."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = {"taxim": "table", "taxim_shadow": "with shadows"}
+    scenes = list(errors["taxim"])
+    columns = 1 + 2 * len(errors)
+    first = errors["taxim"][scenes[0]].traced
+    cell = 1.75
+    with plt.rc_context(_STYLE):
+        size = (columns * cell + 0.6, len(scenes) * (cell * first.shape[0] / first.shape[1] + 0.16) + 0.2)
+        figure, grid = plt.subplots(len(scenes), columns, figsize=size, squeeze=False, layout="constrained")
+        shown = None
+        for row, scene in enumerate(scenes):
+            images = [("ray tracer", errors["taxim"][scene].traced, "")]
+            for family, by_scene in errors.items():
+                images.append(
+                    (
+                        names[family],
+                        by_scene[scene].table,
+                        "equal" if np.isinf(by_scene[scene].box_psnr) else f"{by_scene[scene].box_psnr:.1f} dB",
+                    )
+                )
+            for axes, (title, image, note) in zip(grid[row], images, strict=False):
+                axes.imshow(image, interpolation="nearest")
+                axes.set_title(f"{scene}: {title}" if not note else f"{title}, {note}")
+            for axes, (family, by_scene) in zip(grid[row, len(images) :], errors.items(), strict=True):
+                error = by_scene[scene]
+                off = (error.table.astype(float) - error.traced).mean(axis=-1)
+                shown = axes.imshow(off, cmap="RdBu_r", vmin=-ERROR_RANGE, vmax=ERROR_RANGE, interpolation="nearest")
+                axes.set_title(f"error, {names[family]}")
+            for axes in grid[row]:
+                axes.set_xticks(())
+                axes.set_yticks(())
+        assert shown is not None
+        figure.colorbar(shown, ax=grid, shrink=0.8, pad=0.01, aspect=40, label="table − ray tracer [levels]")
+        figure.savefig(path, dpi=200)
+        plt.close(figure)

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from raytac.gel.surface import PadGrid
 from raytac.markers import MarkerFrame
-from raytac.report.markers_figure import draw_arrows
+from raytac.report.markers import draw_arrows
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
 __all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]

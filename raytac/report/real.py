@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,19 +14,31 @@ import numpy as np
 from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
-from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
+from raytac.calibrate.photographs import FAR, Photographs
 from raytac.calibrate.presses import RealPresses
 from raytac.calibrate.ray_fit import FEWEST
 from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
 from raytac.device import resolve_device
-from raytac.errors import InputError
+from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.report.real_models import MODES, Models, check_fit, fit_models, images_of, mode_times
-from raytac.report.real_score import noise_floor, press_scores, summary
+from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
-__all__ = ["ABLATIONS", "Ablation", "RealSettings", "compare_real"]
+__all__ = [
+    "ABLATIONS",
+    "BOX_MARGIN",
+    "Ablation",
+    "RealSettings",
+    "compare_real",
+    "draw",
+    "noise_floor",
+    "press_scores",
+    "summary",
+    "table_text",
+]
+
 
 SHOWN = 3
 """Presses on the image sheet: in true colour, with their noise, more make a large file."""
@@ -200,7 +212,7 @@ def compare_real(
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             **versions(),
         }
-        from raytac.report.real_figure import draw, table_text
+        from raytac.report.real import draw, table_text
 
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
         shown = sorted(images)[len(images) // (2 * SHOWN) :: max(1, len(images) // SHOWN)][:SHOWN]
@@ -252,3 +264,125 @@ def check_folds(presses: RealPresses, folds: int) -> None:
     """Raises ``InputError`` for folds that leave too few presses to fit to."""
     if len(presses) - -(-len(presses) // max(folds, 1)) < FEWEST:
         raise InputError("presses", value=len(presses), rule=f"are too few for {folds} folds: {FEWEST} must be left to fit to")
+
+
+_ROWS = (
+    ("raytrace", "ray tracer"),
+    (ALONE, "ray tracer, no photograph"),
+    ("taxim", "table"),
+    ("mlp", "network"),
+    ("phong", "Phong"),
+    ("background", "background only"),
+)
+_SPLITS = (("left_right.", "left half → right"), ("right_left.", "right half → left"), ("shallow_deep.", "shallow → deep"))
+
+
+def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
+    """Markdown tables of the figures; errors in levels of 255."""
+
+    def cell(key: str, digits: str = ".2f") -> str:
+        value = metrics.get(key)
+        return "–" if value is None else format(value, digits)
+
+    lines = [
+        "| mode | contact MAE | contact RMSE | ring MAE | box PSNR [dB] | box SSIM | frame MAE | contact, ring MAE, labelled circles | ms |"
+    ]
+    lines.append("|" + "---|" * 9)
+    for key, name in _ROWS:
+        cells = [cell(f"{key}.{m}") for m in ("contact_mae", "contact_rmse", "ring_mae", "box_psnr")]
+        cells += [
+            cell(f"{key}.box_ssim", ".3f"),
+            cell(f"{key}.frame_mae"),
+            cell(f"labelled.{key}.contact_mae") + ", " + cell(f"labelled.{key}.ring_mae"),
+            cell(f"{key}.ms", ".1f"),
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", f"Noise floor: {cell('noise_floor')}.", ""]
+    shown = [(prefix, name) for prefix, name in _SPLITS if f"{prefix}raytrace.contact_mae" in metrics]
+    if shown:
+        lines += ["| contact MAE (ring MAE) | " + " | ".join(name for _, name in shown) + " |", "|" + "---|" * (len(shown) + 1)]
+        for key, name in _ROWS:
+            cells = [f"{cell(f'{prefix}{key}.contact_mae')} ({cell(f'{prefix}{key}.ring_mae')})" for prefix, _ in shown]
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append("")
+    if ablations:
+        lines += ["| ray tracer, first fold | contact MAE | ring MAE |", "|---|---|---|"]
+        for name in ("nothing", *ablations):
+            row = f"ablation.{name}"
+            text = "nothing left out" if name == "nothing" else name.replace("_", " ")
+            lines.append(f"| {text} | {cell(f'{row}.contact_mae')} | {cell(f'{row}.ring_mae')} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
+    """A row a press: the photograph, every mode that uses the one at rest, and its signed error (grey is none), cut to what is about the
+    contact."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    modes = [(key, name) for key, name in _ROWS if key in images[0] and key not in (ALONE, "background")]
+    columns = ["photograph", *(name for _, name in modes), *(f"{name}, error × 4" for _, name in modes)]
+    with plt.rc_context({"font.size": 6.5}):
+        figure, axes = plt.subplots(
+            len(real), len(columns), figsize=(1.1 * len(columns), 1.12 * len(real)), squeeze=False, layout="constrained"
+        )
+        for line, photo, own, (x, y, r) in zip(axes, real, images, circles, strict=True):
+            low_x, low_y = (max(0, int(c - 2.2 * r)) for c in (x, y))
+            box = np.s_[low_y : int(y + 2.2 * r), low_x : int(x + 2.2 * r)]
+            shown = [photo, *(own[key] for key, _ in modes), *(128 + 4 * (own[key].astype(float) - photo) for key, _ in modes)]
+            for axis, image in zip(line, shown, strict=True):
+                axis.imshow(np.clip(image[box], 0, 255).astype(np.uint8))
+                axis.set(xticks=[], yticks=[])
+        for axis, name in zip(axes[0], columns, strict=True):
+            axis.set_title(name)
+        figure.savefig(path, dpi=110)
+        plt.close(figure)
+
+
+BOX_MARGIN = 15
+"""Pixels that the box reaches beyond the labelled circle."""
+
+
+def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
+    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press; regions are those of the labelled circles.
+
+    MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
+    ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
+    """
+    scores = []
+    height, width = shots.background.shape[:2]
+    for image, real, rho, (x, y, r) in zip(
+        images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
+    ):
+        off = np.abs(image - real)
+        left, right = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
+        top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
+        box = np.s_[top:bottom, left:right]
+        score = {
+            "contact_mae": float(off[rho < 1].mean()),
+            "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),
+            "ring_mae": float(off[(rho >= 1) & (rho < 2)].mean()),
+            "box_psnr": psnr(rmse(image[box], real[box])),
+            "frame_mae": float(off.mean()),
+        }
+        try:
+            ssim = ssim_map(np.clip(image, 0, 255).astype(np.uint8), real.astype(np.uint8))
+            score["box_ssim"] = float(np.nanmean(ssim[box]))
+        except BackendError:
+            pass
+        scores.append(score)
+    return scores
+
+
+def summary(scores: list[dict[str, float]]) -> dict[str, float]:
+    """Means over presses."""
+    return {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
+
+
+def noise_floor(sensor: SensorSpec, shots: Photographs) -> float:
+    """Mean absolute difference [levels] of the photographs from the background, more than ``FAR`` radii from the contact."""
+    far = shots.distance(sensor) > FAR
+    return float(np.abs(shots.presses - shots.background)[far].mean())

@@ -12,22 +12,22 @@ import numpy as np
 from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.fit_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import INNER
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.optics.calib_folder import CALIBRATION_FILES, save_calibration
-from raytac.optics.mlp import MlpMode
-from raytac.optics.mlp_weights import save_mlp
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.taxim import TaximMode
-from raytac.report.real_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
-from raytac.report.real_score import press_scores, summary
+from raytac.optics.image.mlp import MlpMode
+from raytac.optics.image.mlp_weights import save_mlp
+from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.report.real import press_scores, summary
 from raytac.specs import SensorSpec
-from raytac.specs.lights_text import lights_text
 from raytac.specs.sensor import OpticsSpec
+from raytac.specs.sensor_file import lights_text
 from raytac.specs.sensor_text import sensor_files
 
 __all__ = ["OUTLIER", "run_calibrate_optics"]

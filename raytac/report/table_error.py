@@ -14,8 +14,8 @@ from raytac.report.image_error import contact_box, mae, psnr, rmse
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.raytrace import RayTracer
-    from raytac.optics.table import PolyTable
+    from raytac.optics.taxim.table import PolyTable
+    from raytac.optics.trace.fast_tracer import RayTracer
 
 __all__ = ["BOX_MARGIN", "SceneError", "error_metrics", "table_errors"]
 
@@ -68,8 +68,8 @@ def table_errors(
 
     ``surfaces`` (B = 1 each) share one grid, that of the first image of ``tracer`` if it has rendered already.
     """
-    from raytac.optics.raytrace import RayTracer
-    from raytac.optics.taxim import TaximMode
+    from raytac.optics.taxim.mode import TaximMode
+    from raytac.optics.trace.fast_tracer import RayTracer
 
     setting: dict[str, Any] = {"resolution": tracer.camera.resolution, "device": tracer.device}
     seen = RayTracer(sensor, outputs=("depth",), **setting)

@@ -12,7 +12,7 @@ from raytac.report.image_error import regions
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.raytrace import RayTracer
+    from raytac.optics.trace.fast_tracer import RayTracer
 
 __all__ = ["Tracers", "path_trace"]
 
@@ -33,7 +33,7 @@ class Tracers:
         """
         key = repr((size, sorted(options.items())))
         if key not in self.built:
-            from raytac.optics.raytrace import RayTracer
+            from raytac.optics.trace.fast_tracer import RayTracer
 
             spec = self.spec
             if options.get("integrator") in ("path", "reference"):

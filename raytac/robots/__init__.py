@@ -1,0 +1,5 @@
+"""Arms and grippers as MuJoCo models: mounting sensors, inverse kinematics, impedance control."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -24,9 +24,9 @@ import mujoco
 import numpy as np
 
 from raytac.errors import BackendError, InputError
-from raytac.physics.rotation import quaternion
 from raytac.robots.arm import Arm
 from raytac.robots.pose import check_pose, pose_error
+from raytac.se3 import quaternion
 
 __all__ = ["DifferentialIk", "Reached"]
 

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.physics.rotation import quaternion
 from raytac.robots.pose import check_pose, pose, world_from_site
+from raytac.se3 import quaternion
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MountedSensor", "case_depth", "mount_sensor", "standing_on"]

@@ -12,7 +12,7 @@ import numpy as np
 
 from raytac.checks import check_numbers
 from raytac.errors import InputError
-from raytac.physics.rotation import rotation_vector
+from raytac.se3 import rotation_vector
 
 __all__ = ["body_poses", "check_pose", "pose", "pose_error", "site_poses", "world_from_site"]
 

@@ -1,11 +1,5 @@
 """The sensor as one object: pad, optical mode, markers and forces behind ``TactileSensor``."""
 
-from __future__ import annotations
+import lazy_loader
 
-from raytac.optics.base import INTEGRATORS
-from raytac.sensor.contact_width import NarrowContactWarning
-from raytac.sensor.options import LARGEST_SIDE, OPTICS, sensor_outputs
-from raytac.sensor.tactile_sensor import TactileSensor
-from raytac.specs.press import PADS, PHYSICS
-
-__all__ = ["INTEGRATORS", "LARGEST_SIDE", "OPTICS", "PADS", "PHYSICS", "NarrowContactWarning", "TactileSensor", "sensor_outputs"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

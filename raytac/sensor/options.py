@@ -18,7 +18,7 @@ from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-    from raytac.physics.soft_mesh import PadMesh
+    from raytac.physics.soft.mesh import PadMesh
 
 __all__ = [
     "LARGEST_SIDE",

@@ -10,16 +10,16 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import cell_areas
-from raytac.physics.pad_reading import PadReading
-from raytac.physics.solver import check_solver
-from raytac.sensor.contact_width import cells_across
+from raytac.physics.base import PadReading
+from raytac.physics.soft.availability import check_solver
+from raytac.physics.soft.contact_width import cells_across
 from raytac.specs import PressScene, SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.physics.contact_state import ContactState
-    from raytac.physics.rigid import RigidPad
-    from raytac.physics.soft import SoftPad
-    from raytac.physics.soft_mesh import PadMesh
+    from raytac.physics.base import ContactState
+    from raytac.physics.rigid.pad import RigidPad
+    from raytac.physics.soft.mesh import PadMesh
+    from raytac.physics.soft.pad import SoftPad
 
 __all__ = ["load_pad", "pad_forces", "reading_forces", "state_surface"]
 
@@ -43,10 +43,10 @@ def load_pad(
     """
     if physics == "ipc":
         check_solver("physics='ipc'")
-        from raytac.physics.soft import SoftPad
+        from raytac.physics.soft.pad import SoftPad
 
         return SoftPad(spec, press, pad=level, device=resolve_device(device, ray_tracing=False), **settings)
-    from raytac.physics.rigid import RigidPad
+    from raytac.physics.rigid.pad import RigidPad
 
     return RigidPad(spec, press, **settings)
 

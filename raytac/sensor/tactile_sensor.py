@@ -15,15 +15,13 @@ from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_whol
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.gel.batch import chosen_envs
-from raytac.gel.pad import check_grid, grid_pitch, make_grid
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.optics.base import OPTICAL_OUTPUTS
-from raytac.physics.pad_reading import PadReading
-from raytac.sensor.contact_width import holds_force, warn_if_narrow
-from raytac.sensor.imaging import Imaging
+from raytac.optics.registry import Imaging
+from raytac.physics.base import PadReading
+from raytac.physics.soft.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.options import (
     check_markers,
     check_optics,
@@ -40,10 +38,10 @@ from raytac.specs.press import PADS, chosen_physics
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-    from raytac.physics.contact_state import ContactState
-    from raytac.physics.rigid import RigidPad
-    from raytac.physics.soft import SoftPad
-    from raytac.physics.soft_mesh import PadMesh
+    from raytac.physics.base import ContactState
+    from raytac.physics.rigid.pad import RigidPad
+    from raytac.physics.soft.mesh import PadMesh
+    from raytac.physics.soft.pad import SoftPad
 
 __all__ = ["TactileSensor"]
 

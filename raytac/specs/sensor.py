@@ -231,7 +231,7 @@ class ResponseSpec:
         """The exposure as a number.
 
         Raises:
-            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.raytrace.with_exposure``).
+            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.trace.fast_tracer.with_exposure``).
         """
         if self.exposure == AUTO:
             raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from raytac.specs.files import find_file, name_of
 from raytac.specs.marker_motion import load_marker_motion
-from raytac.specs.sensor import LED_SCHEMA, SENSOR_PARTS, SENSOR_SCHEMA, LedSpec, LightsSpec, SensorSpec
+from raytac.specs.sensor import (
+    LED_SCHEMA,
+    SENSOR_PARTS,
+    SENSOR_SCHEMA,
+    LedSpec,
+    LightsSpec,
+    ResponseSpec,
+    SensorSpec,
+    shading_degree,
+)
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.toml import Table, Text, read_toml
 
-__all__ = ["load_lights", "load_sensor", "with_lights"]
+__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "with_lights"]
+
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
@@ -113,3 +124,43 @@ def _read_led(table: Table) -> LedSpec:
         raise table.error("must be a direction of length > 0", "axis", table.data["axis"])
     values["axis"] = tuple(component / length for component in values["axis"])
     return LedSpec(**values)
+
+
+def lights_text(lights: LightsSpec, comment: str) -> str:
+    """A light file: ``comment``, its lines marked with #, then one table an LED. Millimetres to 10 µm, powers to four digits."""
+
+    def row(values: tuple[float, ...], scale: float, digits: str) -> str:
+        return ", ".join(f"{scale * value:{digits}}" for value in values)
+
+    tables = [
+        f'[[led]]\nname = "{led.name}"\nlayer = "{led.layer}"\nposition_mm = [{row(led.position, 1e3, ".2f")}]\n'
+        f"axis = [{row(led.axis, 1, '.4f')}]\nsize_mm = [{row(led.size, 1e3, '.2f')}]\nlobe = {led.lobe:.2f}\n"
+        f"power_w_per_sr = [{row(led.power, 1, '.3e')}]\n" + (f"glow_per_m2 = {led.glow:.4g}\n" if led.glow else "")
+        for led in lights.leds
+    ]
+    return "\n".join([*(f"# {line}" for line in comment.splitlines()), "", "\n".join(tables)])
+
+
+def response_text(response: ResponseSpec) -> str:
+    """The table ``[response]`` to six digits, colour shading to four decimals with one line for each order in x."""
+
+    def row(values: tuple[float, ...]) -> str:
+        return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
+
+    lines = [
+        "[response]",
+        f"exposure = {response.gain:.6g}",
+        f"white_balance = {row(response.white_balance)}",
+        f"gamma = {response.gamma:.6g}",
+        f"black_level = {row(response.black_level)}",
+        f"vignetting = {row(response.vignetting)}",
+    ]
+    for channel, found in zip(("red", "green", "blue"), response.shading, strict=True):
+        if not found:
+            continue
+        lines.append(f"shading_{channel} = [")
+        rest = iter(found)
+        for order in range(shading_degree(len(found)), -1, -1):
+            lines.append("    " + ", ".join(f"{value:.4f}" for value in islice(rest, order + 1)) + ",")
+        lines.append("]")
+    return "\n".join(lines) + "\n"

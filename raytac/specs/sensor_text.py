@@ -6,9 +6,8 @@ from dataclasses import replace
 
 from raytac.specs.files import available, find_file
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
-from raytac.specs.response_text import response_text
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.sensor_file import SENSOR_SCHEMA, load_sensor
+from raytac.specs.sensor_file import SENSOR_SCHEMA, load_sensor, response_text
 from raytac.specs.toml import split_unit
 
 __all__ = ["sensor_files"]

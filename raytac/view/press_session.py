@@ -11,12 +11,12 @@ import numpy as np
 
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
-from raytac.gel.part import Part
-from raytac.physics.contact_state import ContactState
-from raytac.physics.part_surface import object_surface
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_bodies import OBJECT, PAD
+from raytac.physics.base import ContactState
+from raytac.physics.soft.bodies import OBJECT, PAD
+from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import TactileSensor
+from raytac.shapes.part import Part
+from raytac.shapes.triangulate import object_surface
 from raytac.specs import PressScene, validate_press
 from raytac.specs.press import StageSpec
 from raytac.view.sensor_view import (

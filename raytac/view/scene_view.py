@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from raytac.physics.rotation import quaternion
+from raytac.se3 import quaternion
 from raytac.view.colours import ColourScale
 from raytac.view.glb import coloured_glb
 from raytac.view.session import PadView, Session, Snapshot

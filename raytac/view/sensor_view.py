@@ -6,9 +6,8 @@ import numpy as np
 
 from raytac.frame import TactileFrame
 from raytac.gel.coat_mesh import CoatMesh
-from raytac.gel.pad import rest_height
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.sensor.contact_width import LEAST_CELLS
+from raytac.gel.surface import GelSurface, PadGrid, rest_height
+from raytac.physics.soft.contact_width import LEAST_CELLS
 from raytac.specs import SensorSpec
 from raytac.view.session import Lines, PadView, Solid
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import BackendError
-from raytac.physics.rotation import rotations
 from raytac.robots.ik import DifferentialIk
 from raytac.robots.impedance import JointImpedance
+from raytac.se3 import rotations
 from raytac.view.session import Control
 from raytac.world.world import TactileWorld
 

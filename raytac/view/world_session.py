@@ -10,7 +10,7 @@ import numpy as np
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.physics.geoms import geom_part
-from raytac.physics.part_surface import part_surface
+from raytac.shapes.triangulate import part_surface
 from raytac.view.sensor_view import (
     MESH_COLOUR,
     MESH_WIDTH,

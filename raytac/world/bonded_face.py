@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from raytac.gel.object_height import object_height
-from raytac.gel.pad import make_grid
-from raytac.gel.part import Part
-from raytac.gel.primitives import UNDERSIDES, bounds
-from raytac.physics.rotation import rotation_vector, rotations, turn_angle
+from raytac.gel.surface import make_grid
+from raytac.se3 import rotation_vector, rotations, turn_angle
+from raytac.shapes.part import Part
+from raytac.shapes.primitives import UNDERSIDES, bounds
+from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["BondedFace"]

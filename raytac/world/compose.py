@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError, MeshError, SpecError
-from raytac.gel.part import Part
 from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.objects import object_parts
-from raytac.physics.rotation import quaternion, rotation_of
 from raytac.robots.arm import Arm
 from raytac.robots.gripper import floating_gripper
 from raytac.robots.mount import MountedSensor, mount_sensor
 from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
 from raytac.robots.pose import pose
+from raytac.se3 import quaternion, rotation_of
+from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import load_sensor
 from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, RobotSpec, TaskScene
@@ -233,7 +233,7 @@ def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, name: str) 
     if part.kind == "mesh":
         vertices, faces = part.vertices, part.faces
     else:
-        from raytac.physics.part_surface import part_surface
+        from raytac.shapes.triangulate import part_surface
 
         surface = part_surface(part)
         vertices, faces = surface.vertices, surface.faces

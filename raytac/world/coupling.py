@@ -36,7 +36,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.physics.rotation import rotation_vector, rotations
+from raytac.se3 import rotation_vector, rotations
 
 __all__ = ["Coupling", "FreePartner", "Touching"]
 

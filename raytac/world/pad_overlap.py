@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.gel.object_height import object_height
-from raytac.gel.pad import make_grid
-from raytac.gel.part import Part
-from raytac.physics.load_law import LoadLaw
+from raytac.gel.surface import make_grid
+from raytac.physics.rigid.load_law import LoadLaw
+from raytac.shapes.part import Part
+from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["PadOverlap", "Touches"]

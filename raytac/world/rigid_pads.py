@@ -30,15 +30,15 @@ import mujoco
 import numpy as np
 
 from raytac.errors import OverlapError
-from raytac.gel.elastic import ElasticSurround
-from raytac.gel.object_height import object_height, object_radius
 from raytac.gel.pierced import without_pierced
+from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
-from raytac.physics.load_law import LoadLaw
-from raytac.physics.pad_reading import PadReading
+from raytac.physics.base import PadReading
+from raytac.physics.rigid.load_law import LoadLaw
 from raytac.robots.mount import MountedSensor
 from raytac.robots.pose import body_poses, site_poses
+from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
 from raytac.world.bonded_face import BondedFace
 from raytac.world.compose import ComposedScene

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from raytac.physics.geoms import geom_part
-from raytac.physics.point_depth import SOLIDS, point_depth
+from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.world.compose import ComposedScene
 
 __all__ = ["Inside", "RobotOverlap"]

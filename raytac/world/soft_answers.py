@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from raytac.physics.soft_scene import SoftScene
+from raytac.physics.soft.scene import SoftScene
 from raytac.world.coupling import FreePartner, Touching
 
 __all__ = ["STIFFENING", "Answer", "soft_answers"]

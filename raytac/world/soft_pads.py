@@ -18,18 +18,18 @@ import numpy as np
 
 import ipc
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.gel.part import Part
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
+from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
-from raytac.physics.pad_reading import PadReading
-from raytac.physics.part_surface import enclosed_volume, object_surface
-from raytac.physics.point_depth import SOLIDS, point_depth
-from raytac.physics.rotation import quaternion
-from raytac.physics.soft_bodies import SceneBody, scene_body
-from raytac.physics.soft_mesh import pad_mesh
-from raytac.physics.soft_scene import ScenePad, SceneReport, SoftScene
+from raytac.physics.soft.bodies import SceneBody, scene_body
+from raytac.physics.soft.mesh import pad_mesh
+from raytac.physics.soft.scene import ScenePad, SceneReport, SoftScene
 from raytac.robots.pose import body_poses, site_poses
+from raytac.se3 import quaternion
+from raytac.shapes.part import Part
+from raytac.shapes.point_depth import SOLIDS, point_depth
+from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene, pose_of
 from raytac.world.coupling import Coupling

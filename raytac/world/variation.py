@@ -17,8 +17,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.physics.batch_check import rigid_poses
-from raytac.physics.rotation import quaternion, rotation_of
+from raytac.se3 import quaternion, rigid_poses, rotation_of
 from raytac.world.compose import ComposedScene
 
 __all__ = ["EnvironmentModels", "Variation"]

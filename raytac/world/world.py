@@ -17,13 +17,12 @@ from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_w
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
-from raytac.gel.batch import chosen_envs
-from raytac.physics.batch_check import rigid_poses
-from raytac.physics.rotation import quaternion
-from raytac.physics.solver import check_solver
+from raytac.gel.surface import chosen_envs
+from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.pose import body_poses, site_poses
+from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics
 from raytac.specs.press import PADS, chosen_physics
@@ -35,7 +34,7 @@ from raytac.world.state import BatchController, Control, Drive, WorldState
 from raytac.world.variation import EnvironmentModels, Variation
 
 if TYPE_CHECKING:
-    from raytac.physics.soft_scene import SoftScene
+    from raytac.physics.soft.scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
 __all__ = ["TactileWorld"]
@@ -340,7 +339,7 @@ class TactileWorld:
             there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
             rule = "must be the name of a body or a simulated pad, and no half-space"
             raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
-        from raytac.physics.part_surface import object_surface
+        from raytac.shapes.triangulate import object_surface
 
         surface = object_surface(body.parts)
         poses = self.state().world_from_body[name]

@@ -13,13 +13,13 @@ from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.press_samples import PressSamples, press_samples
 from raytac.calibrate.table_fit import fit_table, with_cast_shadows
-from raytac.gel.pad import make_grid
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.bake_shadow import NOTHING
-from raytac.optics.calib_folder import load_calibration, save_calibration
-from raytac.optics.mlp import MlpMode
-from raytac.optics.table import PolyTable, polynomial_basis, slope_bins
-from raytac.optics.taxim import TaximMode
+from raytac.gel.surface import make_grid
+from raytac.optics.image.mlp import MlpMode
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.shadow import NOTHING
+from raytac.optics.taxim.folder import load_calibration, save_calibration
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.taxim.table import PolyTable, polynomial_basis, slope_bins
 from raytac.specs import load_sensor
 
 RADIUS = 3.155e-3

@@ -7,7 +7,7 @@ import pytest
 
 from raytac.calibrate.imprint import KNOTS, RIGID_PAD, circles_on_pad, pixel_geometry, press_surface
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
+from raytac.gel.surface import make_grid
 from raytac.specs import SensorSpec, load_sensor
 
 RADIUS = np.array([3.155e-3, 4.0e-3])

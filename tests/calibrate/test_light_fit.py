@@ -16,9 +16,8 @@ from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
 from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface
-from raytac.optics.raytrace import RayTracer
+from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor_check import validate_sensor
 

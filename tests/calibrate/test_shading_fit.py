@@ -12,12 +12,11 @@ import pytest
 from raytac.calibrate.photographs import encode
 from raytac.calibrate.shading_fit import DEGREE, with_shading
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.shading import shading_gain
+from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics.response import shading_gain
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec, load_sensor, validate_sensor
-from raytac.specs.response_text import response_text
+from raytac.specs.sensor_file import response_text
 
 SIZE = (80, 60)
 OPTIONS: dict[str, Any] = {"bounce": False}

@@ -12,7 +12,7 @@ import pytest
 from experiments import stress
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
-from raytac.physics.soft import SoftPad
+from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press, load_sensor
 from raytac.specs.press import PressScene, StageSpec

@@ -10,18 +10,28 @@ from raytac.io.code_digest import code_digest, module_sources
 
 
 def test_code_of_a_mode_is_all_that_it_imports() -> None:
-    names = set(module_sources(["raytac.optics.raytrace"]))
-    assert {"raytac.optics.fast", "raytac.optics.reference", "raytac.optics.response", "raytac.gel.surface"} <= names
+    names = set(module_sources(["raytac.optics.trace.fast_tracer"]))
+    assert {
+        "raytac.optics.trace.direct",
+        "raytac.optics.trace.reference",
+        "raytac.optics.response",
+        "raytac.gel.surface",
+    } <= names
     assert all(name.startswith(("raytac.optics", "raytac.gel")) for name in names)
-    assert "raytac.optics.fast" not in module_sources(["raytac.optics.reference"])
+    assert "raytac.optics.trace.direct" not in module_sources(["raytac.optics.trace.reference"])
     assert not module_sources(["raytac.optics.no_such_module"])
 
 
 def test_code_of_a_table_is_that_of_its_bake_and_not_of_the_mode_that_uses_it() -> None:
-    baked, used = (set(module_sources([f"raytac.optics.{name}"])) for name in ("bake", "taxim"))
-    assert {"raytac.gel.elastic", "raytac.gel.rasterize", "raytac.optics.fast", "raytac.optics.bake_shadow"} <= baked
-    assert not {"raytac.optics.taxim", "raytac.optics.table_shadow", "raytac.optics.phong"} & baked
-    assert used >= baked | {"raytac.optics.table_shadow"}  # the mode imports the bake, inside a function
+    baked, used = (set(module_sources([f"raytac.optics.taxim.{name}"])) for name in ("bake.bake", "mode"))
+    assert {
+        "raytac.gel.pyramid",
+        "raytac.shapes.rasterize",
+        "raytac.optics.trace.direct",
+        "raytac.optics.taxim.bake.shadow",
+    } <= baked
+    assert not {"raytac.optics.taxim.mode", "raytac.optics.taxim.shadow", "raytac.optics.image.phong"} & baked
+    assert used >= baked | {"raytac.optics.taxim.shadow"}  # the mode imports the bake, inside a function
 
 
 def test_digest_changes_with_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.calibration_presses import Press, PressFrame
 from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.fots import FotsMarkers

@@ -9,8 +9,8 @@ import pytest
 from scipy import ndimage
 
 from raytac.errors import InputError
+from raytac.gel.components import find_runs, join_runs
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.components import find_runs, join_runs
 from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
 from tests.markers.pads import pose, pressed
 

@@ -39,7 +39,7 @@ def test_fots_on_cuda_equals_the_cpu(tmp_path: Path) -> None:
 @pytest.mark.skipif(bool(cuda_missing(ray_tracing=False)), reason=f"CUDA: {cuda_missing(ray_tracing=False)}")
 def test_surface_markers_of_a_pad_simulated_on_cuda_equal_the_cpu() -> None:
     pytest.importorskip("warp")
-    from raytac.physics.soft import SoftPad
+    from raytac.physics.soft.pad import SoftPad
 
     sensor = load_sensor("gelsight_mini_9x11")
     target = ObjectSpec("sphere", {"radius": 4e-3}, (1e-3, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)

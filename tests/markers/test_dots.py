@@ -11,8 +11,8 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.dots import dot_ink
 from raytac.markers.pattern import MarkerPattern
-from raytac.optics.phong import PhongMode
-from raytac.optics.raytrace import RayTracer
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec
 
 SIZE = (160, 120)

@@ -68,7 +68,7 @@ def test_it_equals_a_loop(shear: tuple[float, float], twist: float, sensor: Sens
 def test_the_sum_over_cells_alone_equals_a_loop_over_cells(sensor: SensorSpec, grid: PadGrid) -> None:
     """To rounding, on the kernel's own samples."""
     from raytac.markers.contacts import ContactCells
-    from raytac.optics.marker_motion import FotsConstants, FotsKernel
+    from raytac.markers.fots_kernel import FotsConstants, FotsKernel
 
     cells = ContactCells.over(grid)
     samples = cells.sample(pressed(grid, [(1e-3, 0, DEEP), (-3e-3, 2e-3, 3e-4)]))

@@ -11,7 +11,7 @@ import pytest
 from raytac.gel.surface import PadGrid
 from raytac.markers.calibration import PUBLISHED, model_errors
 from raytac.markers.contacts import ContactCells
-from raytac.optics.marker_motion import FotsConstants, FotsKernel
+from raytac.markers.fots_kernel import FotsConstants, FotsKernel
 from raytac.specs import PunchSpec, SensorSpec
 from tests.markers.pads import MOTION, fots_presses
 

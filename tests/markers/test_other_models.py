@@ -16,8 +16,8 @@ from raytac.markers.pattern import marker_centres
 from raytac.markers.sampling import height_and_slope
 from raytac.markers.superposition import SuperpositionMarkers
 from raytac.markers.tracker import MarkerTracker
-from raytac.physics.soft_bodies import pad_body
-from raytac.physics.soft_mesh import PadLevel, PadMesh, pad_mesh
+from raytac.physics.soft.bodies import pad_body
+from raytac.physics.soft.mesh import PadLevel, PadMesh, pad_mesh
 from raytac.specs import SensorSpec
 from tests.ipc.test_elasticity import energy_change, make_potential
 from tests.markers.pads import BALL, MOTION, pose, pressed

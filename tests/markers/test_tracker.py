@@ -49,7 +49,7 @@ def test_unknown_model(sensor: SensorSpec, grid: PadGrid) -> None:
 
 
 def test_another_number_of_environments_or_grid(sensor: SensorSpec, grid: PadGrid) -> None:
-    from raytac.gel.pad import make_grid
+    from raytac.gel.surface import make_grid
 
     tracker = MarkerTracker(sensor, "force_field", grid, num_envs=2)
     with pytest.raises(InputError, match="2 environments"):

@@ -9,8 +9,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface
+from raytac.gel.surface import GelSurface, make_grid
 from raytac.markers import MarkerFrame, MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization, TactileObserver, gymnasium_space, randomised_sensor
 from raytac.observe.cells import CellMeans

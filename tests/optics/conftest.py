@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from raytac.optics.raytrace import RayTracer
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs.sensor import SensorSpec
 from tests.optics.scenes import RESOLUTION
 

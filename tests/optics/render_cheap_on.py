@@ -7,8 +7,8 @@ import sys
 import numpy as np
 
 from raytac.gel.surface import GelSurface
-from raytac.optics.phong import PhongMode
-from raytac.optics.taxim import TaximMode
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.taxim.mode import TaximMode
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, relief
 from tests.optics.test_taxim_mode import make_table
 

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from raytac.optics.raytrace import RayTracer
+from raytac.optics.trace.fast_tracer import RayTracer
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, relief, surface
 
 MODES = {

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.specs.sensor import CameraSpec, LedSpec, LightsSpec, SensorSpec, Vec3
 from tests.conftest import make_sensor_spec
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from raytac.gel.elastic import ElasticSurround
-from raytac.gel.part import primitive
+from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
-from raytac.optics.bake import Baked, bake, calibrate
-from raytac.optics.bake_presses import pressed
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.bake_views import Calibration
-from raytac.optics.table import ShadowTable
-from raytac.optics.taxim import TaximMode
+from raytac.optics.taxim.bake.bake import Baked, bake, calibrate
+from raytac.optics.taxim.bake.presses import pressed
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.views import Calibration
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.taxim.table import ShadowTable
 from raytac.report.table_error import SceneError, table_errors
+from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 from raytac.specs.sensor import SensorSpec
 from tests.optics.scenes import at_rest, led, like_a_mini, sensor

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.optics.bake_fit import BinSums
-from raytac.optics.table import polynomial_basis, slope_bins
+from raytac.optics.taxim.bake.fit import BinSums
+from raytac.optics.taxim.table import polynomial_basis, slope_bins
 
 SIZE = (80, 60)
 BINS = 15
@@ -121,7 +121,7 @@ def test_neighbours_steady_a_bin_with_few_samples() -> None:
 @pytest.mark.parametrize("bad", [{"images": 0}, {"radius": (2e-3, 1e-3)}, {"bare_share": 1.5}, {"n_bins": 2}, {"pins": -1}])
 def test_impossible_settings_are_refused(bad: dict[str, object]) -> None:
     from raytac.errors import InputError
-    from raytac.optics.bake_settings import BakeSettings
+    from raytac.optics.taxim.bake.settings import BakeSettings
 
     with pytest.raises(InputError, match=f"bake.{next(iter(bad))}"):
         BakeSettings(**bad)  # type: ignore[arg-type]

@@ -8,9 +8,9 @@ from itertools import islice
 
 import numpy as np
 
-from raytac.optics.bake_presses import ball_presses, even_sequence, pin_presses, view_half
-from raytac.optics.bake_settings import BakeSettings
 from raytac.optics.camera import Pinhole
+from raytac.optics.taxim.bake.presses import ball_presses, even_sequence, pin_presses, view_half
+from raytac.optics.taxim.bake.settings import BakeSettings
 from tests.optics.scenes import grid_of, like_a_mini
 
 SPEC = like_a_mini()

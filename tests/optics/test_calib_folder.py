@@ -19,9 +19,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from raytac.errors import CalibrationError, InputError
-from raytac.optics.calib_folder import CALIBRATION_FILES, load_calibration, save_calibration
-from raytac.optics.restricted_pickle import load_restricted
-from raytac.optics.table import PolyTable, ShadowTable, TaximConstants, slope_bins
+from raytac.optics.taxim.folder import CALIBRATION_FILES, load_calibration, save_calibration
+from raytac.optics.taxim.restricted_pickle import load_restricted
+from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
 
 ARRAYS = ("gradients", "covered", "background", "rest_image", "gel_map")
 
@@ -312,7 +312,7 @@ def test_lists_in_lists_cannot_grow_without_bound() -> None:
     program = b"\x80\x02]q\x00" + b"".join(b"]q%c(h%ch%ce" % (k + 1, k, k) for k in range(40)) + b"."
     assert len(program) < 400
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("raytac.optics.restricted_pickle._MOST_ITEMS", 10_000)
+        patch.setattr("raytac.optics.taxim.restricted_pickle._MOST_ITEMS", 10_000)
         with pytest.raises(pickle.UnpicklingError, match="more than 10000 items"):
             load_restricted(program)
         with pytest.raises(pickle.UnpicklingError, match="more than 10000 items"):

@@ -9,9 +9,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from raytac.optics.fast import ggx
-from raytac.optics.scene import coat_bsdf
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
+from raytac.optics.trace.direct import ggx
+from raytac.optics.trace.scene import coat_bsdf
 from raytac.specs.sensor import CoatSpec
 
 COATS = [CoatSpec((0.5, 0.4, 0.3), s, a) for s, a in ((0.0, 0.4), (0.05, 0.4), (0.3, 0.1), (0.8, 0.9))]

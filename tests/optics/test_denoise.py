@@ -11,8 +11,8 @@ import pytest
 from raytac.device import cuda_missing
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.denoise import make_denoiser
-from raytac.optics.raytrace import RayTracer, total
+from raytac.optics.trace.denoise import make_denoiser
+from raytac.optics.trace.fast_tracer import RayTracer, total
 from tests.optics.conftest import Build
 from tests.optics.images import errors
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, surface

@@ -10,8 +10,8 @@ import pytest
 
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
+from raytac.optics.trace.fast_tracer import RayTracer
 from tests.optics.conftest import Build
 from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, led, like_a_mini, sensor, surface
 
@@ -71,13 +71,13 @@ def test_a_camera_that_sees_past_the_pad_is_refused(axis: str) -> None:
 
 def test_a_process_has_one_variant(monkeypatch: pytest.MonkeyPatch) -> None:
     load_mitsuba("cpu")
-    monkeypatch.setattr("raytac.optics.variant.resolve_device", lambda device: "cuda")
+    monkeypatch.setattr("raytac.optics.runtime.resolve_device", lambda device: "cuda")
     with pytest.raises(BackendError, match=r"already renders with llvm_ad_rgb.*one device per process"):
         load_mitsuba("cuda")
 
 
 def test_without_llvm_the_error_says_how_to_mend_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("raytac.optics.variant.llvm_library", lambda: None)
+    monkeypatch.setattr("raytac.optics.runtime.llvm_library", lambda: None)
     with pytest.raises(BackendError, match=r"pip install karellen-llvm-core.*DRJIT_LIBLLVM_PATH.*raytac doctor"):
         load_mitsuba("cpu")
 
@@ -145,7 +145,7 @@ def test_a_variant_that_the_user_set_first_works() -> None:
 
     code = (
         "import raytac.optics, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
-        "from raytac.optics.variant import load_mitsuba; load_mitsuba('cpu');"
+        "from raytac.optics.runtime import load_mitsuba; load_mitsuba('cpu');"
         "mi.load_dict({'type': 'rectangle', 'emitter': {'type': 'raytac_led', 'radiance': [1, 1, 1], 'lobe': 2.0}})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -17,14 +17,14 @@ from raytac import TactileSensor
 from raytac.cli import main
 from raytac.errors import SpecError
 from raytac.gel.surface import GelSurface
-from raytac.optics import bake
 from raytac.optics.exposure import mid_grey_exposure
-from raytac.optics.phong import PhongMode
-from raytac.optics.raytrace import RayTracer, with_exposure
-from raytac.optics.taxim import TaximMode
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.taxim.bake.bake import bake
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.fast_tracer import RayTracer, with_exposure
 from raytac.specs import SensorSpec, load_sensor
-from raytac.specs.response_text import response_text
 from raytac.specs.sensor import AUTO
+from raytac.specs.sensor_file import response_text
 from tests.optics.scenes import RESOLUTION, grid_of, like_a_mini
 from tests.optics.test_taxim_mode import make_table
 

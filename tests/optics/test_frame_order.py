@@ -1,7 +1,7 @@
 """A frame does not depend on those before it: what one object shows of rest, press, rest and another press is what fresh ones show.
 
 Dr.Jit records the kernels of a first frame and replays them for the next, so a recording must hold for every frame to come
-(``raytac.optics.recording`` says what that asks for). Every mode and marker model is taken through the same frames here.
+(``raytac.optics.runtime`` says what that asks for). Every mode and marker model is taken through the same frames here.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.fots import FotsMarkers
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
 from raytac.optics.device_image import DeviceImage, ImageCut
-from raytac.optics.image_mode import ImageMode
-from raytac.optics.mlp import MlpMode
-from raytac.optics.phong import PhongMode
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.taxim import TaximMode
+from raytac.optics.image.base import ImageMode
+from raytac.optics.image.mlp import MlpMode
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import PunchSpec
 from raytac.specs.sensor import LightsSpec, SensorSpec
 from tests.markers.pads import MOTION, coat_mesh, flat_sensor, pad_grid, pose, pressed, with_coat

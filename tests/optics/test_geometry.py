@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from raytac.optics.base import OpticsImages
 from raytac.optics.camera import Pinhole
-from raytac.optics.raytrace import total
+from raytac.optics.trace.fast_tracer import total
 from raytac.specs.sensor import CameraSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.images import assert_images_agree

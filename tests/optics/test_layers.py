@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.optics.raytrace import total
+from raytac.optics.trace.fast_tracer import total
 from raytac.specs.sensor import LightsSpec
 from tests.optics.conftest import Build
 from tests.optics.images import assert_images_agree

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.optics.memory import peak_bytes
+from raytac.optics.runtime import peak_bytes
 from tests.optics.conftest import Build
 from tests.optics.scenes import ball, grid_of, like_a_mini, surface
 

@@ -12,8 +12,8 @@ import pytest
 
 from raytac.errors import CalibrationError, InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.mlp import MlpMode
-from raytac.optics.mlp_weights import (
+from raytac.optics.image.mlp import MlpMode
+from raytac.optics.image.mlp_weights import (
     FORMAT,
     INPUTS,
     LEVELS,

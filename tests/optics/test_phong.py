@@ -10,7 +10,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.optics.phong import PHONG_LIGHTS, PhongLight, PhongMode
+from raytac.optics.image.phong import PHONG_LIGHTS, PhongLight, PhongMode
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, lit_from_three_sides, relief, sensor, surface

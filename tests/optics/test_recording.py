@@ -8,12 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-from raytac.optics.recording import no_collection
+from raytac.optics.runtime import no_collection
 
 CHILD = """
 import gc
 import numpy as np
-from raytac.optics.raytrace import RayTracer
+from raytac.optics.trace.fast_tracer import RayTracer
 from tests.optics.scenes import RESOLUTION, at_rest, grid_of, like_a_mini
 
 spec = like_a_mini()

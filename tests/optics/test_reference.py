@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import GelSurface
-from raytac.optics import reference
-from raytac.optics.raytrace import RayTracer, total
+from raytac.optics.trace import reference
+from raytac.optics.trace.fast_tracer import RayTracer, total
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import ball, grid_of, like_a_mini, surface

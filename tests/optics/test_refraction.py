@@ -11,10 +11,10 @@ import pytest
 
 from raytac.errors import SpecError
 from raytac.optics.camera import Pinhole
-from raytac.optics.raytrace import RayTracer, total
 from raytac.optics.refraction import Slab
-from raytac.optics.scene import UNIT
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
+from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.scene import UNIT
 from raytac.specs.sensor import RefractionSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.images import assert_images_agree, psnr_db

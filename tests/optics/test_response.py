@@ -8,9 +8,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from raytac.optics.raytrace import total
 from raytac.optics.response import Response
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.runtime import load_mitsuba
+from raytac.optics.trace.fast_tracer import total
 from raytac.specs.sensor import ResponseSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, surface
@@ -63,7 +63,7 @@ def background() -> np.ndarray:
 
 @pytest.mark.parametrize("options", [{}, {"integrator": "reference", "spp": 64}], ids=["fast", "reference"])
 def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
-    from raytac.optics.raytrace import RayTracer
+    from raytac.optics.trace.fast_tracer import RayTracer
 
     spec = like_a_mini()
     spec = replace(spec, response=replace(CURVE, black_level=(0.0, 0.0, 0.0)))
@@ -79,7 +79,7 @@ def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
 
 def test_flat_field_scales_in_linear_light(tracer: Build) -> None:
     """image = background × rendered / rendered at rest, before the gamma."""
-    from raytac.optics.raytrace import RayTracer
+    from raytac.optics.trace.fast_tracer import RayTracer
 
     spec = like_a_mini()
     grid = grid_of(spec)

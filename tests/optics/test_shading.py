@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from raytac.optics.raytrace import total
-from raytac.optics.shading import fit_log_gain, shading_gain
+from raytac.optics.response import fit_log_gain, shading_gain
+from raytac.optics.trace.fast_tracer import total
 from tests.optics.conftest import Build
 from tests.optics.scenes import at_rest, ball, grid_of, like_a_mini, surface
 

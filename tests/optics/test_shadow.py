@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.optics.raytrace import RayTracer, total
+from raytac.optics.trace.fast_tracer import RayTracer, total
 from raytac.specs.sensor import CameraSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import SMALL, at_rest, grid_of, led, plateau, sensor, surface

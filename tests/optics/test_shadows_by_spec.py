@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.optics import bake
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.raytrace import RayTracer
-from raytac.optics.taxim import TaximMode
+from raytac.optics.taxim.bake.bake import bake
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec, load_task
 from raytac.specs.sensor import OpticsSpec

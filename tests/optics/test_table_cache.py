@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from raytac.io import code_digest
-from raytac.optics import bake, table_cache
-from raytac.optics.bake_settings import BakeSettings
-from raytac.optics.table import PolyTable, TaximConstants
+from raytac.optics.taxim import cache as table_cache
+from raytac.optics.taxim.bake import bake
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.table import PolyTable, TaximConstants
 from raytac.specs.sensor import SensorSpec
 from tests.conftest import make_sensor_spec
 
@@ -104,7 +105,7 @@ def test_other_code_is_another_key(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     changed = tmp_path / "fast.py"
     changed.write_text("changed = True\n")
     sources = code_digest.module_sources
-    monkeypatch.setattr(code_digest, "module_sources", lambda roots: sources(roots) | {"raytac.optics.fast": changed})
+    monkeypatch.setattr(code_digest, "module_sources", lambda roots: sources(roots) | {"raytac.optics.trace.direct": changed})
     assert table_cache.table_key(*asked) != before
 
 
@@ -185,7 +186,7 @@ def test_an_interrupt_leaves_nothing(baker: Callable[..., Any], tmp_path: Path, 
 _WRITER = """
 import sys
 from pathlib import Path
-from raytac.optics.table_cache import keep
+from raytac.optics.taxim.cache import keep
 from tests.optics.test_table_cache import made_up
 for k in range(40):
     keep(made_up(int(sys.argv[1])), Path(sys.argv[2]) / str(k))

@@ -10,14 +10,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from raytac.gel.elastic import ElasticSurround
 from raytac.gel.gaussian import gaussian_matrix
+from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import PadGrid
-from raytac.optics.calib_folder import load_calibration, processed_background
-from raytac.optics.image_mode import ImageHeights
-from raytac.optics.table import PolyTable, ShadowTable, TaximConstants
-from raytac.optics.taxim import TableShader
-from raytac.optics.variant import load_mitsuba
+from raytac.optics.image.base import ImageHeights
+from raytac.optics.runtime import load_mitsuba
+from raytac.optics.taxim.folder import load_calibration, processed_background
+from raytac.optics.taxim.mode import TableShader
+from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants
 from tests.optics import taxim_upstream as upstream
 
 PIXMM = 0.0295

@@ -14,10 +14,10 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.calib_folder import save_calibration
-from raytac.optics.phong import PhongMode
-from raytac.optics.table import PolyTable, ShadowTable
-from raytac.optics.taxim import TaximMode, resized
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.taxim.folder import save_calibration
+from raytac.optics.taxim.mode import TaximMode, resized
+from raytac.optics.taxim.table import PolyTable, ShadowTable
 from raytac.sensor import TactileSensor
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
@@ -207,7 +207,7 @@ def test_what_it_cannot_do_is_refused(spec: SensorSpec, grid: PadGrid) -> None:
 @pytest.mark.parametrize("kind", ["table", "shadow", "phong"])
 def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadGrid, kind: str, device: str) -> None:
     """The peak of Dr.Jit's own arrays stays below what is stated, and that is no wild guess."""
-    from raytac.optics.memory import peak_bytes
+    from raytac.optics.runtime import peak_bytes
 
     size = (160, 120)
     mode = (

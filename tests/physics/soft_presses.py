@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from raytac.physics.soft import SoftPad
+from raytac.physics.soft.pad import SoftPad
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 

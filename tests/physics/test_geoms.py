@@ -14,10 +14,10 @@ import pytest
 import trimesh
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.object_height import object_height
-from raytac.gel.part import Part, hfield_part, mesh_part, primitive
 from raytac.physics.geoms import GEOM_TYPES, body_parts, geom_part, load_mjcf
-from raytac.physics.rigid import RigidPad
+from raytac.physics.rigid.pad import RigidPad
+from raytac.shapes.part import Part, hfield_part, mesh_part, primitive
+from raytac.shapes.underside import object_height
 from raytac.specs import load_press
 from tests.conftest import make_sensor_spec
 

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.pad import make_grid, rest_height
-from raytac.physics.first_touch import first_touch, first_touch_z, gap_at_touch
-from raytac.physics.load_law import LoadLaw, layer_stiffening, reduced_modulus
+from raytac.gel.surface import make_grid, rest_height
 from raytac.physics.objects import object_parts
-from raytac.physics.rig import PressRig
-from raytac.physics.rigid import CLEARANCE, ContactState, RigidPad
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch, layer_stiffening, reduced_modulus
+from raytac.physics.rigid.pad import CLEARANCE, ContactState, RigidPad
+from raytac.physics.rigid.rig import PressRig
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import (
     CameraSpec,

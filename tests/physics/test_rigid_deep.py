@@ -11,7 +11,7 @@ import pytest
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.traction import cell_areas
-from raytac.physics.rigid import RigidPad
+from raytac.physics.rigid.pad import RigidPad
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec

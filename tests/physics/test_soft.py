@@ -11,10 +11,10 @@ from scipy.ndimage import map_coordinates
 
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
-from raytac.physics.rigid import RigidPad
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_reading import UNSOLVED, UnsolvedContactWarning
-from raytac.physics.soft_scene import SoftScene
+from raytac.physics.rigid.pad import RigidPad
+from raytac.physics.soft.pad import SoftPad
+from raytac.physics.soft.reading import UNSOLVED, UnsolvedContactWarning
+from raytac.physics.soft.scene import SoftScene
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft
@@ -123,7 +123,7 @@ def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
 
 
 def test_a_contact_that_is_not_found_is_told_of_once(monkeypatch):
-    from raytac.gel import fine_contact
+    from raytac.physics.soft.correction import normal as fine_contact
 
     pad = soft(press(indent(0.3e-3)))
     state = pad.peak(pad.run())

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
-from raytac.physics.soft_contact import SoftContact
-from raytac.physics.soft_scene import SoftScene
+from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.scene import SoftScene
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import indent, press, soft
 
@@ -111,7 +111,7 @@ def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_fol
 
 
 def test_a_solver_that_never_converges_fails_the_press(monkeypatch):
-    monkeypatch.setattr("raytac.physics.soft_contact._CLOSE", 1e-40)
+    monkeypatch.setattr("raytac.physics.soft.press_solver._CLOSE", 1e-40)
     pad = soft(press(indent(0.02e-3)))
     state = pad.peak(pad.run())
     assert state.failed.all() and unconverged(state)[0] >= 2

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from raytac.physics.load_law import LoadLaw
-from raytac.physics.rigid import RigidPad
-from raytac.physics.soft import SoftPad
-from raytac.physics.soft_contact import SoftContact
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
+from raytac.physics.rigid.load_law import LoadLaw
+from raytac.physics.rigid.pad import RigidPad
+from raytac.physics.soft.mesh import PadLevel, pad_mesh
+from raytac.physics.soft.pad import SoftPad
+from raytac.physics.soft.press_solver import SoftContact
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft
 

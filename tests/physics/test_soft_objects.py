@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from raytac.physics.soft import SoftPad
+from raytac.physics.soft.pad import SoftPad
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 

@@ -7,11 +7,11 @@ import pytest
 
 import ipc
 from raytac.errors import InputError, OverlapError
-from raytac.gel.part import primitive
-from raytac.physics.soft_approach import STEP, Mover, allowed_share
-from raytac.physics.soft_bodies import scene_body
-from raytac.physics.soft_mesh import PadLevel, pad_mesh
-from raytac.physics.soft_scene import ScenePad, SoftScene
+from raytac.physics.soft.bodies import scene_body
+from raytac.physics.soft.mesh import PadLevel, pad_mesh
+from raytac.physics.soft.scene import ScenePad, SoftScene
+from raytac.physics.soft.substeps import STEP, Mover, allowed_share
+from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 
 SENSOR = load_sensor("gelsight_mini")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ipc
-from raytac.gel.part import primitive
-from raytac.physics.part_surface import enclosed_volume
-from raytac.physics.soft_skin import SoftSkin, _cut
+from raytac.physics.soft.skin import SoftSkin, _cut
+from raytac.shapes.part import primitive
+from raytac.shapes.triangulate import enclosed_volume
 
 RADIUS, SIDE = 4e-3, 6e-3
 

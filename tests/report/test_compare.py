@@ -16,10 +16,10 @@ from raytac.gel.surface import GelSurface
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
 from raytac.optics.base import OpticalMode, OpticsImages
-from raytac.report.compare import run_comparison
-from raytac.report.compare_report import FILES, write_comparison
-from raytac.report.compare_settings import CompareSettings
-from raytac.report.modes import Mode, Setting, comparison_modes
+from raytac.report.compare.modes import Mode, Setting, comparison_modes
+from raytac.report.compare.page import FILES, write_comparison
+from raytac.report.compare.run import run_comparison
+from raytac.report.compare.settings import CompareSettings
 
 for package in ("skimage", "jinja2", "pyarrow"):
     pytest.importorskip(package)
@@ -161,7 +161,7 @@ def test_interrupting_the_command_leaves_rows_but_no_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     greys = Greys(fail={"taxim": KeyboardInterrupt()})
-    monkeypatch.setattr("raytac.report.compare.comparison_modes", lambda *_, **__: greys.modes)
+    monkeypatch.setattr("raytac.report.compare.run.comparison_modes", lambda *_, **__: greys.modes)
     assert main([*QUICK, "--out", str(tmp_path / "out")]) == 130
     assert "finished rows are kept" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"rows", "references"}

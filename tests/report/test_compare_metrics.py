@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from raytac.report.compare import REGIONS
-from raytac.report.compare_figures import error_range, signed_error
-from raytac.report.compare_metrics import equal_errors, summaries
+from raytac.report.compare.figures import error_range, signed_error
+from raytac.report.compare.metrics import equal_errors, summaries
+from raytac.report.compare.row_store import Row, Value
+from raytac.report.compare.run import REGIONS
 from raytac.report.image_error import METRICS
-from raytac.report.row_store import Row, Value
 
 
 def row(mode: str, rmse: float | None, ms: float, scene: str = "sphere", **more: Value) -> Row:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from raytac.report.equal_error import cost_at, spp_for_error
+from raytac.report.compare.metrics import cost_at, spp_for_error
 
 
 @pytest.mark.parametrize("target", [5.0, 2.0, 1.0, 0.3, 0.01])

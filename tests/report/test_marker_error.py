@@ -12,11 +12,11 @@ from raytac.cli import main
 from raytac.errors import BackendError
 from raytac.io.metrics import check_metrics, read_metrics
 from raytac.markers.calibration import model_errors
-from raytac.report.compare import Comparison
-from raytac.report.compare_metrics import compare_metrics
-from raytac.report.compare_report import report_html
-from raytac.report.compare_settings import CompareSettings
-from raytac.report.marker_error import MarkerErrors, marker_error_metrics, marker_errors
+from raytac.report.compare.marker_error import MarkerErrors, marker_error_metrics, marker_errors
+from raytac.report.compare.metrics import compare_metrics
+from raytac.report.compare.page import report_html
+from raytac.report.compare.run import Comparison
+from raytac.report.compare.settings import CompareSettings
 from raytac.report.markers import TESTED
 from tests.markers.pads import flat_sensor, fots_presses, pad_grid
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import BackendError
-from raytac.report.peer_taxim import AWAY_MM, PeerTaxim, contact_height_map
+from raytac.report.compare.peer_taxim import AWAY_MM, PeerTaxim, contact_height_map
 from tests.conftest import BALL_DEPTH, BALL_RADIUS, make_surface
 
 WIDTH_MM = 18.88

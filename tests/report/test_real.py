@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.fit_models import MODES, fit_models
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.splits import by_press
@@ -19,16 +20,12 @@ from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
 from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
 from raytac.errors import InputError
-from raytac.gel.pad import make_grid
-from raytac.gel.surface import GelSurface
+from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.png import write_png
-from raytac.optics.raytrace import RayTracer
+from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.report.markers import run_calibrate_markers
-from raytac.report.real import RealSettings
+from raytac.report.real import RealSettings, noise_floor, press_scores, summary, table_text
 from raytac.report.real_calibration import run_calibrate_optics
-from raytac.report.real_figure import table_text
-from raytac.report.real_models import MODES, fit_models
-from raytac.report.real_score import noise_floor, press_scores, summary
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.physics.rotation import quaternion, rotation_vector
 from raytac.robots.mount import case_depth, mount_sensor, standing_on
 from raytac.robots.pose import pose, pose_error
+from raytac.se3 import quaternion, rotation_vector
 from raytac.specs.sensor_file import load_sensor
 
 ROBOT = """

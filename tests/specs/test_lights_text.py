@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from raytac.specs import available, load_lights
-from raytac.specs.lights_text import lights_text
+from raytac.specs.sensor_file import lights_text
 
 
 @pytest.mark.parametrize("name", available("lights"))

@@ -9,8 +9,8 @@ import pytest
 
 from raytac.specs import SensorSpec, load_sensor
 from raytac.specs.files import available
-from raytac.specs.lights_text import lights_text
 from raytac.specs.sensor import OpticsSpec
+from raytac.specs.sensor_file import lights_text
 from raytac.specs.sensor_text import sensor_files
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from raytac.gel.pad import make_grid
+from raytac.gel.surface import make_grid
 from raytac.specs import load_sensor
 from raytac.view.colours import ColourScale, legend_html
 from raytac.view.glb import coloured_glb, vertex_normals

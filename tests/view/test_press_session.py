@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, RaytacError
-from raytac.physics.rigid import RigidPad
+from raytac.physics.rigid.pad import RigidPad
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec

@@ -14,10 +14,10 @@ import pytest
 from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
 from raytac.errors import InputError, OverlapError
-from raytac.gel.object_height import object_radius
-from raytac.gel.part import mesh_part, primitive
-from raytac.physics.rotation import rotations
 from raytac.robots.mount import case_depth
+from raytac.se3 import rotations
+from raytac.shapes.part import mesh_part, primitive
+from raytac.shapes.underside import object_radius
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
 from raytac.world.bonded_face import BondedFace
 from raytac.world.world import TactileWorld

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.gel.part import primitive
-from raytac.physics.soft_bodies import scene_body
+from raytac.physics.soft.bodies import scene_body
+from raytac.shapes.part import primitive
 from raytac.world.coupling import Coupling, FreePartner, Touching
 from tests.world.coupled import Coupled, pose
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.gel.object_height import object_height, object_radius
-from raytac.gel.pad import make_grid
-from raytac.gel.part import Part, mesh_part, primitive
-from raytac.physics.load_law import LoadLaw
+from raytac.gel.surface import make_grid
+from raytac.physics.rigid.load_law import LoadLaw
+from raytac.shapes.part import Part, mesh_part, primitive
+from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
 from raytac.world.pad_overlap import PadOverlap
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
-from raytac.physics.rigid import RigidPad
+from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor, load_task
 from raytac.world.state import BatchController
 from raytac.world.world import TactileWorld

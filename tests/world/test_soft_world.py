@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.physics.soft_scene import SceneReport, SoftScene
+from raytac.physics.soft.scene import SceneReport, SoftScene
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 

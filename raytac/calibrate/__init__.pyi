@@ -1,0 +1,1 @@
+from .presses import read_presses as read_presses

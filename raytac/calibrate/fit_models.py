@@ -1,0 +1,192 @@
+"""Every optical mode fitted to the same real presses, and its images of others."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from raytac.calibrate.direct_fit import SIGMA, FitSettings
+from raytac.calibrate.imprint import press_surface
+from raytac.calibrate.mlp_fit import fit_mlp
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.press_samples import press_samples
+from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
+from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
+from raytac.calibrate.shading_fit import with_shading
+from raytac.calibrate.table_fit import fit_table, with_cast_shadows
+from raytac.checks import check_whole
+from raytac.device import DEVICES
+from raytac.errors import InputError
+from raytac.gel.surface import make_grid
+from raytac.optics.base import OpticalMode
+from raytac.optics.image.mlp import MlpMode
+from raytac.optics.image.phong import PhongMode
+from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.specs import SensorSpec
+
+__all__ = ["ALONE", "MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
+
+ALONE = "raytrace_alone"
+"""The fitted ray tracer without a photograph: colour shading (``with_shading``) in place of the flat field, as a sensor file has it."""
+MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
+"""Modes that are compared, beside the background alone."""
+SHADOW_TABLES = ("none", "raytrace")
+"""Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
+GRID_PITCH = 0.06e-3
+"""Spacing of the pad's nodes [m], about a pixel's."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
+
+    fitted: Fitted
+    rest: np.ndarray
+    """The image at rest of all modes [levels], (H, W, 3)."""
+    prior: str
+    """Name of the strength of priors (``STRENGTHS``)."""
+    modes: dict[str, OpticalMode]
+    device: str
+    options: Mapping[str, Any]
+    """Further options of the ray tracer."""
+
+    def circles(self, shots: Photographs) -> np.ndarray:
+        """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
+        own = dataclasses.replace(shots, background=self.rest)
+        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
+
+
+def check_fit(
+    *,
+    modes: Sequence[str] = MODES,
+    prior: str | None = None,
+    fixed: Sequence[str] = (),
+    shadow_table: str = SHADOW_TABLES[0],
+    device: str = "auto",
+    starts: int = 1,
+    rounds: int = 0,
+) -> None:
+    """Refuse arguments of ``fit_models`` that it could not use, at once and not after a fit.
+
+    Raises:
+        InputError: an unknown mode, strength of priors, block of parameters, source of shadows or device, no start, or rounds below 0.
+    """
+    for name, values, rule, choices in (
+        ("modes", modes, "must be known modes", MODES),
+        ("prior", () if prior is None else (prior,), "must be a known strength, or None to choose it", tuple(STRENGTHS)),
+        ("fixed", fixed, "must be known blocks of parameters", tuple(SIGMA)),
+        ("shadow_table", (shadow_table,), "must be a known source of shadows", SHADOW_TABLES),
+        ("device", (device,), "must be a known device", DEVICES),
+    ):
+        for value in values:
+            if value not in choices:
+                raise InputError(name, value=value, rule=rule, choices=choices)
+    check_whole("starts", starts)
+    check_whole("rounds", rounds, 0)
+
+
+def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
+    """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
+    height, width = background.shape[:2]
+    field = background.astype(np.uint8)
+    return RayTracer(sensor, resolution=(width, height), device=device, flat_field=field, **options)
+
+
+def fit_models(
+    sensor: SensorSpec,
+    shots: Photographs,
+    *,
+    settings: FitSettings | None = None,
+    modes: tuple[str, ...] = MODES,
+    device: str = "auto",
+    seed: int = 0,
+    starts: int = 3,
+    rounds: int = 3,
+    settle: bool = True,
+    prior: str | None = None,
+    shadow_table: str = SHADOW_TABLES[0],
+    options: Mapping[str, Any] | None = None,
+    tick: Callable[[str, float], None] | None = None,
+) -> Models:
+    """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
+
+    ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
+    ``shadow_table``: one of ``SHADOW_TABLES``.
+    ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
+
+    Raises as ``check_fit`` and ``fit_lights``.
+    """
+    options = {} if options is None else options
+    settings = FitSettings() if settings is None else settings
+    check_fit(
+        modes=modes,
+        prior=prior,
+        fixed=settings.fixed,
+        shadow_table=shadow_table,
+        device=device,
+        starts=starts,
+        rounds=rounds,
+    )
+    shots = shots.settled(sensor) if settle else shots
+    if prior is None:
+        prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
+    settings = dataclasses.replace(settings, **STRENGTHS[prior])
+    fitted = fit_lights(
+        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
+    )
+    state, background, built = fitted.state, shots.background, {}
+
+    def told(images: int) -> None:
+        if tick is not None:
+            tick(f"{images} images of shadows", fitted.costs[-1])
+
+    if {"taxim", "mlp"} & set(modes):
+        samples = press_samples(sensor, shots, state.circles, state.slopes, device=device)
+    for name in modes:
+        if name == "raytrace":
+            built[name] = raytrace_mode(fitted.sensor, background, device, options)
+        elif name == ALONE:
+            shaded = with_shading(fitted.sensor, background, device=device, options=options)
+            built[name] = RayTracer(shaded, resolution=(background.shape[1], background.shape[0]), device=device, **options)
+        elif name == "taxim":
+            table = fit_table(sensor, background, samples)
+            if shadow_table == "raytrace":
+                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
+            built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
+        elif name == "mlp":
+            built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
+        else:
+            built[name] = PhongMode(sensor, background=background.astype(np.uint8), device=device)
+    return Models(fitted, background, prior, built, device, options)
+
+
+def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """8-bit images (N, H, W, 3) of balls pressed at ``circles`` (N, 3) [px] with the imprint ``slopes``."""
+    grid, images = make_grid(sensor.gelpad, GRID_PITCH), []
+    for k in range(len(circles)):
+        surface = press_surface(sensor, grid, circles[k : k + 1], shots.radius[k : k + 1], slopes)
+        rgb = mode.render(surface).rgb
+        assert rgb is not None
+        images.append(rgb[0])
+    return np.array(images)
+
+
+def mode_times(models: Models, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, repeats: int = 9) -> dict[str, float]:
+    """Median time [ms] of every mode for one image, everything compiled, the image on the host."""
+    grid = make_grid(sensor.gelpad, GRID_PITCH)
+    surface = press_surface(sensor, grid, circles[:1], shots.radius[:1], models.fitted.state.slopes)
+    times = {}
+    for name, mode in models.modes.items():
+        taken = []
+        for _ in range(repeats + 2):
+            began = time.perf_counter()
+            mode.render(surface)
+            taken.append(time.perf_counter() - began)
+        times[name] = 1e3 * float(np.median(taken[2:]))
+    return times

@@ -1,0 +1,287 @@
+"""FOTS' marker motion on the device: dilation, shear and twist of the contact, for all markers of all environments at once.
+
+Zhao, Qian, Duan and Luo, FOTS, RA-L 2024 (arXiv 2404.19217), in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
+contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
+
+    dilate   Δd_d = g Σ_i a Δh_i (M' − C_i) exp(−λ_d ‖M' − C_i‖²)    M' = M + Δd_s + Δd_t
+    shear    Δd_s = Σ_c w_c min(Δs_c, Δs_max)                        e_c = exp(−λ_s ‖M − G_c‖²)
+    twist    Δd_t = Σ_c w_c (R(min(Δθ_c, Δθ_max)) − 1)(M − G_c)      e_c = exp(−λ_t ‖M − G_c‖²)
+
+Both sides of a difference are taken on the same skin: G_c is where the skin under the contact's centre was at rest, that centre less the
+drag; the dilation, whose contact points are where they are now, sees the marker as it was dragged. w_c = e_c / max(1, Σ e_c): the
+published factor for one contact, and no more than one motion in all where contacts are close. a is the area of a sample and g the gain
+[1/m³] that the published sum over pixels hides in its unit of length.
+
+With ``FotsConstants.punch`` shear and twist are those around a disc that sticks to a half-space (Johnson, Contact Mechanics, 1985, §3.6
+and 3.9; Reissner and Sagoci 1944), faded by the pad's finite thickness. With x = M − G_c, x̂ its direction, A the disc's radius, r ≥ A its
+distance from G_c (``_outside`` has both for an ellipse), t = A / r and g(t) = t √(1 − t²):
+
+    shear    Δd_s = (2/π) F [(asin t − κ g) Δs + 2 κ g x̂ (x̂ · Δs)]      e_c = (2/π) F asin t      F = exp(−(r − A) / ℓ)
+    twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
+
+On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
+of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄: by Coulomb, where 8 G A Δs / (2 − ν) reaches
+μ P, with P = K h̄ π A² of a layer of foundation modulus K; so c = π μ K (2 − ν) / (8 G). Force F and couple M together stay on or within
+an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for sliding manipulation, IJRR 15(6),
+1996); beyond it the contact slips along the ellipsoid's normal. So what is left of Δs and Δθ, in which F and M are linear, is
+
+    Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
+
+(closest point, in elastic energy, as of ideal plasticity; b is the ratio of F_max Δs_max to M_max Δθ_max on incompressible rubber).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.optics.runtime import load_mitsuba, no_collection
+from raytac.specs.marker_motion import PunchSpec
+
+__all__ = ["TWIST_SLIP", "FotsConstants", "FotsKernel"]
+
+_NEGLIGIBLE = 16.0
+"""A Gaussian's exponent beyond which it is left out: e⁻¹⁶ is what float32 cannot add to 1."""
+_ROW = 12
+"""Floats a contact, which three packet gathers bring: active, G, Δs, Δθ, T_xx, T_xy, T_yy, h̄ and two that nobody reads here."""
+_PACKET = 4
+"""Samples that one gather brings."""
+TWIST_SLIP = 3 * math.pi / 16
+"""Way at the edge of a contact when it spins over the shear when it slides, both as far as it would stick: of a ball on incompressible
+rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so 9π/32 / (2 − ν)."""
+
+_LIMIT_STEPS = 3
+"""Newton steps of ``_limited``: to float32's rounding at any shear and twist (a test compares with bisection)."""
+
+
+@dataclass(frozen=True)
+class FotsConstants:
+    """λ [1/m²], gain [1/m³] and caps ([m], [rad]) of ``raytac.specs.MarkerMotionSpec``."""
+
+    dilate_gain: float
+    dilate_lambda: float
+    shear_lambda: float
+    shear_max: float
+    twist_lambda: float
+    twist_max: float
+    punch: PunchSpec | None = None
+    """In place of λ and caps of shear and twist."""
+
+
+class FotsKernel:
+    """Marker displacements from contact samples and contacts; recorded once for each number of environments, markers and contacts."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
+        """``x`` (nx,), ``y`` (ny,) [m]: where the contact is sampled, evenly spaced.
+
+        Raises:
+            BackendError: Dr.Jit cannot run on ``device``.
+        """
+        self.mi, self.device = load_mitsuba(device)
+        self.nx, self.ny = len(x), len(y)
+        self._packets = -(-self.nx // _PACKET)
+        self._origin = float(x[0]), float(y[0])
+        self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
+        self._frozen: dict[tuple[int, int, int, bool], Any] = {}
+        self._markers: tuple[np.ndarray, np.ndarray, Any] | None = None
+        self._numbers: tuple[FotsConstants, Any] | None = None
+
+    def displacement(
+        self,
+        markers: np.ndarray,
+        depth: np.ndarray,
+        boxes: np.ndarray,
+        contacts: np.ndarray,
+        constants: FotsConstants,
+    ) -> np.ndarray:
+        """Displacement [m] of markers at rest, shape (B, M, 2), float32.
+
+        Args:
+            markers: x, y at rest [m], (B, M, 2).
+            depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
+            boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
+            contacts: (B, K, 12): active or not, centre [m] (2), shear [m] (2), twist [rad], ellipse [m²] (3), mean indentation [m],
+                and two columns more that do not matter here, as ``raytac.markers.contacts.Contacts.table`` has them.
+            constants: of the pad.
+        """
+        mi = self.mi
+        batch, count = markers.shape[:2]
+        given = contacts.shape[1]
+        k = 1 << (given - 1).bit_length()
+        # Contacts, boxes and depths in one array: one upload, all of it whole packets. Whole numbers as small as a grid's are exact in
+        # float32.
+        box, sample = batch * k * _ROW, batch * (k * _ROW + _PACKET)
+        frame = np.zeros(sample + batch * self.ny * self._packets * _PACKET, dtype=np.float32)
+        frame[:box].reshape(batch, k, _ROW)[:, :given] = contacts
+        frame[box:sample].reshape(batch, _PACKET)[:] = boxes
+        frame[sample:].reshape(batch, self.ny, -1)[..., : self.nx] = depth
+        inputs = self._on_device(markers), mi.Float(frame), self._constants(constants)
+        is_punch = constants.punch is not None
+        key = batch, count, k, is_punch
+        if key not in self._frozen:
+            # All inputs are arrays in memory: there is nothing to make opaque.
+            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays), auto_opaque=False)
+        with no_collection():
+            moved = self._frozen[key](*inputs)
+        return moved.numpy().reshape(batch, count, 2).copy()
+
+    def _on_device(self, markers: np.ndarray) -> Any:
+        """Places at rest hardly ever change, so the upload is kept; a view that nobody may write is known again without a look."""
+        kept = self._markers
+        if kept is not None and markers is kept[0] and not markers.flags.writeable:
+            return kept[2]
+        if kept is None or kept[1].shape != markers.shape or not np.array_equal(kept[1], markers):
+            uploaded = self.mi.Float(np.ascontiguousarray(markers, dtype=np.float32).ravel())
+            self._markers = markers, np.array(markers), uploaded
+        else:
+            self._markers = markers, kept[1], kept[2]
+        return self._markers[2]
+
+    def _constants(self, constants: FotsConstants) -> Any:
+        if self._numbers is None or self._numbers[0] != constants:
+            c, p = constants, constants.punch
+            drag = [p.anisotropy, p.reach, p.slip] if p else [c.shear_lambda, c.shear_max, c.twist_lambda, c.twist_max]
+            values = [c.dilate_gain, c.dilate_lambda, *drag]
+            self._numbers = constants, self.mi.Float(np.array(values, dtype=np.float32))
+        return self._numbers[1]
+
+    def _sums(self, batch: int, count: int, k: int, is_punch: bool, xy: Any, frame: Any, constants: Any) -> Any:
+        """``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, packets, 4), one after the other."""
+        mi = self.mi
+        i = dr.arange(mi.UInt32, batch * count)
+        env = i // count
+        place = dr.gather(mi.Point2f, xy, i)
+        gain, ld, *others = (dr.gather(mi.Float, constants, n) for n in range(dr.width(constants)))
+        drag = _drag(mi, env, place, frame, k, others, _stuck if is_punch else _gaussian)
+        box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // _PACKET + env)
+        first = mi.Int32(env) * (self.ny * self._packets) + batch * (k * _ROW // _PACKET + 1)
+        dilate = self._dilate(place + drag, frame, box, first, ld) * (gain * self._pitch[0] * self._pitch[1])
+        return dr.ravel(dilate + drag)
+
+    def _dilate(self, place: Any, frame: Any, box: Any, first: Any, ld: Any) -> Any:
+        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker.
+
+        ``first``: the packet of ``frame`` with which the samples of the marker's pad begin. Beyond the box samples are 0, so whole packets
+        do no harm.
+        """
+        mi, (x0, y0), (dx, dy) = self.mi, self._origin, self._pitch
+        reach = dr.sqrt(_NEGLIGIBLE / ld)
+        c0, c1, r0, r1 = (mi.Int32(edge) for edge in box)
+        c0, c1 = (
+            dr.maximum(c0, mi.Int32(dr.ceil((place.x - reach - x0) / dx))),
+            dr.minimum(c1, mi.Int32((place.x + reach - x0) / dx) + 1),
+        )
+        r0, r1 = (
+            dr.maximum(r0, mi.Int32(dr.ceil((place.y - reach - y0) / dy))),
+            dr.minimum(r1, mi.Int32((place.y + reach - y0) / dy) + 1),
+        )
+        r1 = dr.select(c0 < c1, r1, r0)
+        p0, p1 = c0 // _PACKET, (c1 - 1) // _PACKET
+
+        def inside(p: Any, r: Any, sx: Any, sy: Any) -> Any:
+            return r < r1
+
+        def add(p: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
+            depths = dr.gather(mi.Vector4f, frame, first + r * self._packets + p)
+            ex, ey = place.x - (x0 + mi.Float(p * _PACKET) * dx), place.y - (y0 + mi.Float(r) * dy)
+            total, along = mi.Float(0), mi.Float(0)
+            for h in depths:
+                w = h * dr.exp(-ld * (ex * ex + ey * ey))
+                total, along, ex = total + w, along + w * ex, ex - dx
+            wrap = p >= p1
+            return dr.select(wrap, p0, p + 1), dr.select(wrap, r + 1, r), sx + along, sy + total * ey
+
+        start = (mi.Int32(p0), mi.Int32(r0), mi.Float(0), mi.Float(0))
+        _, _, sx, sy = dr.while_loop(start, inside, add, label="dilate")
+        return mi.Vector2f(sx, sy)
+
+
+def _drag(mi: Any, env: Any, place: Any, contacts: Any, k: int, constants: list[Any], follow: Callable[..., Any]) -> Any:
+    """Shear and twist of all contacts of a marker's pad; ``follow`` gives those of one."""
+
+    def more(n: Any, *sums: Any) -> Any:
+        return n < k
+
+    def add(n: Any, es: Any, shear: Any, et: Any, twist: Any) -> tuple[Any, ...]:
+        row = [dr.gather(mi.Vector4f, contacts, _ROW // 4 * (env * k + n) + part) for part in range(_ROW // 4)]
+        ws, sheared, wt, turned = follow(mi, place, row, *constants)
+        return n + 1, es + ws, shear + sheared, et + wt, twist + turned
+
+    start = (mi.UInt32(0), mi.Float(0), mi.Vector2f(0), mi.Float(0), mi.Vector2f(0))
+    _, es, shear, et, twist = dr.while_loop(start, more, add, label="drag")
+    return shear / dr.maximum(1, es) + twist / dr.maximum(1, et)
+
+
+def _gaussian(mi: Any, place: Any, row: list[Any], ls: Any, smax: Any, lt: Any, tmax: Any) -> tuple[Any, Any, Any, Any]:
+    """(e, Δd) of the shear and of the twist of one contact, as published."""
+    a, b, _ = row
+    way = _at_most(mi.Vector2f(a.w, b.x), smax)
+    out = place - (mi.Point2f(a.y, a.z) - way)
+    r2 = dr.squared_norm(out)
+    ws, wt = a.x * dr.exp(-ls * r2), a.x * dr.exp(-lt * r2)
+    return ws, ws * way, wt, wt * _turned(mi, out, dr.clip(b.y, -tmax, tmax))
+
+
+def _stuck(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip: Any) -> tuple[Any, Any, Any, Any]:
+    """(e, Δd) of the shear and of the twist of one contact, of a disc that sticks."""
+    a, b, c = row
+    radius = dr.sqrt(dr.sqrt(dr.maximum(b.z * c.x - b.w * b.w, 1e-24)))
+    most = slip * c.y * radius
+    way, turn = _limited(mi.Vector2f(a.w, b.x), b.y, most, TWIST_SLIP * slip * c.y)
+    out = place - (mi.Point2f(a.y, a.z) - way)
+    beyond = _outside(out, b.z, b.w, c.x)
+    r2 = radius * radius + beyond
+    root = dr.sqrt(beyond)
+    asin, g = dr.atan2(radius, root), radius * root / r2
+    share = 2 / math.pi * a.x
+    fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
+    along = dr.dot(out, way) / dr.maximum(dr.squared_norm(out), 1e-18) * out
+    sheared = share * fade * ((asin - kappa * g) * way + 2 * kappa * g * along)
+    wt = share * (asin - g)
+    return share * fade * asin, sheared, wt, wt * _turned(mi, out, turn)
+
+
+def _limited(way: Any, turn: Any, most: Any, widest: Any) -> tuple[Any, Any]:
+    """The shear and the twist that are left where the contact slips, of those that the object has made.
+
+    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be.
+    """
+    ratio = 1 / TWIST_SLIP**2
+    x0, y0 = dr.norm(way) / dr.maximum(most, 1e-12), dr.abs(turn) / dr.maximum(widest, 1e-12)
+    gamma = dr.maximum(dr.maximum(x0 - 1, (y0 - 1) / ratio), 0)
+    for _ in range(_LIMIT_STEPS):
+        p, q = 1 + gamma, 1 + ratio * gamma
+        x2, y2 = dr.square(x0 / p), dr.square(y0 / q)
+        n = dr.sqrt(x2 + y2)
+        gamma += n * n * dr.maximum(n - 1, 0) / dr.maximum(x2 / p + ratio * y2 / q, 1e-12)
+    return way / (1 + gamma), turn / (1 + ratio * gamma)
+
+
+def _outside(out: Any, xx: Any, xy: Any, yy: Any) -> Any:
+    """r² − A² of a place ``out`` from the centre of the ellipse xᵀ T⁻¹ x = 1 with A² = √det T; 0 inside.
+
+    The λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the place, which are the equipotentials of an elliptic disc:
+    ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
+    """
+    b = dr.squared_norm(out) - xx - yy
+    c = xx * yy - xy * xy - (yy * out.x * out.x - 2 * xy * out.x * out.y + xx * out.y * out.y)
+    root = dr.sqrt(dr.maximum(b * b - 4 * c, 0))
+    # The same root twice, without cancellation on either side of b = 0.
+    beyond = dr.select(b > 0, 0.5 * (b + root), -2 * c / dr.maximum(root - b, 1e-18))
+    return dr.select(c < 0, beyond, 0)
+
+
+def _at_most(way: Any, most: Any) -> Any:
+    return way * dr.minimum(1, most / dr.maximum(dr.norm(way), 1e-12))
+
+
+def _turned(mi: Any, out: Any, angle: Any) -> Any:
+    """(R − 1) ``out``."""
+    s, half = dr.sin(angle), dr.sin(0.5 * angle)
+    less = -2 * half * half  # cos − 1 without cancellation
+    return mi.Vector2f(less * out.x - s * out.y, s * out.x + less * out.y)

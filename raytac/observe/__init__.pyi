@@ -1,0 +1,11 @@
+from .device_images import DeviceImages as DeviceImages
+from .observer import TactileObserver as TactileObserver
+from .randomization import Randomization as Randomization
+from .randomization import randomised_bodies as randomised_bodies
+from .randomization import randomised_sensor as randomised_sensor
+from .settings import MODALITIES as MODALITIES
+from .settings import SCALES as SCALES
+from .settings import ObservationSettings as ObservationSettings
+from .spaces import ArraySpec as ArraySpec
+from .spaces import gymnasium_space as gymnasium_space
+from .tensors import as_tensors as as_tensors

@@ -1,0 +1,11 @@
+from .base import INTEGRATORS as INTEGRATORS
+from .base import OPTICAL_OUTPUTS as OPTICAL_OUTPUTS
+from .base import OpticalMode as OpticalMode
+from .base import OpticsImages as OpticsImages
+from .image.mlp import MlpMode as MlpMode
+from .image.phong import PhongMode as PhongMode
+from .runtime import load_mitsuba as load_mitsuba
+from .taxim.bake.bake import baked_table as baked_table
+from .taxim.bake.settings import BakeSettings as BakeSettings
+from .taxim.mode import TaximMode as TaximMode
+from .trace.fast_tracer import RayTracer as RayTracer

@@ -1,0 +1,106 @@
+"""The optical mode ``mlp``: colour by a small network from slope and place (``mlp_weights``), fitted to presses of a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import PadGrid
+from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
+from raytac.optics.taxim.mode import resized
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["MlpMode"]
+
+_VIEW_TOLERANCE = 0.01
+"""By which share the view may differ from that of the sensor that a network was fitted to."""
+
+
+@dataclass(frozen=True)
+class MlpArrays:
+    """Device arrays of a frame: the image at rest less what the network says of it, 4 floats a pixel."""
+
+    rest: Any
+
+
+class MlpMode(ImageMode):
+    """The optical mode ``mlp``: one sensor, one network, one resolution; batches of surfaces in, images out."""
+
+    label = "mlp"
+    needs_contact = True
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        calibration: str | Path | MlpWeights | None = None,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+    ) -> None:
+        """Load the network; kernels are compiled at the first image.
+
+        Args:
+            sensor: camera and pad.
+            calibration: the network, its file, or the folder of ``raytac calibrate … --model mlp``. There is none by default.
+            resolution: (width, height) [px]; None is the sensor's own.
+            outputs: any of ``rgb``, ``normals``, ``depth``.
+            device: ``auto``, ``cpu`` or ``cuda``.
+
+        Raises:
+            InputError: no network, one of a sensor that sees another piece of its pad, or a value out of its choices.
+            CalibrationError: a file that is missing or malformed.
+            BackendError: Dr.Jit cannot run on ``device``.
+        """
+        if calibration is None:
+            rule = "must name a network, as `raytac calibrate DATASET --model mlp` writes it (optics_options={'calibration': …})"
+            raise InputError("calibration", value=calibration, rule=rule)
+        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
+        self.weights = calibration if isinstance(calibration, MlpWeights) else load_mlp(calibration)
+        _check_view(self.weights, sensor)
+        self._view = view_slope(sensor)
+
+    def _place(self, ops: Any, column: Any, row: Any) -> tuple[Any, Any]:
+        width, height = self.camera.resolution
+        return (column + 0.5) * (2 / width) - 1, (row + 0.5) * (2 / height) - 1
+
+    def _build(self, grid: PadGrid) -> MlpArrays:
+        width, height = self.camera.resolution
+        row, column = np.mgrid[:height, :width].astype(np.float32)
+        u, v = self._place(np, column, row)
+        flat = forward(np, self.weights, inputs(np, 0 * u, 0 * u, 0 * u, u, v, self._view))
+        rest = resized(self.weights.background, (width, height)) - LEVELS * np.stack(flat, axis=-1)
+        padded = np.concatenate([rest, np.zeros_like(rest[..., :1])], axis=-1).astype(np.float32)
+        return MlpArrays(self.mi.Float(np.ascontiguousarray(padded).ravel()))
+
+    def _levels(self, seen: ImageHeights, inputs_: MlpArrays) -> tuple[list[Any], Any]:
+        mi = self.mi
+        sx, sy, _ = seen.slopes(mi, seen.moved)
+        _, p, column, row = seen.pixel(mi)
+        u, v = self._place(dr, mi.Float(column), mi.Float(row))
+        change = forward(dr, self.weights, inputs(dr, sx, sy, mi.Float(seen.contact), u, v, self._view))
+        rest = dr.gather(mi.Vector4f, inputs_.rest, p)
+        return [LEVELS * c + rest[k] for k, c in enumerate(change)], mi.UInt8(0)
+
+    def _floats_per_pixel(self) -> float:
+        return 4
+
+
+def _check_view(weights: MlpWeights, sensor: SensorSpec) -> None:
+    """Places are inputs of a network, so it holds for its own view alone."""
+    if weights.view is None:
+        return
+    own = view_size(sensor)
+    if max(abs(a / b - 1) for a, b in zip(own, weights.view, strict=True)) > _VIEW_TOLERANCE:
+        theirs, mine = (f"{1e3 * w:.2f} mm x {1e3 * h:.2f} mm" for w, h in (weights.view, own))
+        name = weights.provenance.get("sensor", "unknown")
+        rule = (
+            f"was fitted to the sensor {name!r}, which sees {theirs}: {sensor.name!r} sees {mine} and needs a network of its own"
+        )
+        raise InputError("calibration", value="mlp", rule=rule)

@@ -1,0 +1,170 @@
+"""A small network from slope and place to colour: its inputs, its arithmetic, its file.
+
+Zhao, Qian, Duan and Luo, FOTS (RA-L 2024), map normal and position to colour by a network of three hidden layers of 32; Si et al.,
+DiffTactile (ICLR 2024), give theirs positions in a frequency code and the direction of view. Here the inputs are
+
+    3 (n_x, n_y, 1 − n_z), 0.3 (u, v), 0.03 (sin, cos) of π u, π v, 2 π u and 2 π v, 0.3 (x, y) of the unit view direction, c,
+
+with n the normal of the surface −displacement, u, v in [−1, 1] over the image and c = 1 where the object touches, else 0 (in neither
+paper: the apex of a press and the skirt around it have slopes alike but not colours). The factors hold a network back from learning
+places by heart where presses are few. Between layers stands ReLU, and the output is the difference from the image at rest over
+``LEVELS``. What it says of a pixel that has not moved is taken off, so that the image at rest is the background exactly.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from raytac.errors import CalibrationError
+from raytac.optics.taxim.restricted_pickle import check_file_numbers, npz_arrays, npz_names
+from raytac.specs.sensor import SensorSpec
+
+__all__ = [
+    "FORMAT",
+    "INPUTS",
+    "LEVELS",
+    "VERSION",
+    "MlpWeights",
+    "forward",
+    "inputs",
+    "load_mlp",
+    "save_mlp",
+    "view_size",
+    "view_slope",
+]
+
+FORMAT, VERSION = "raytac mlp", 1
+"""What a file says that it is. The version goes up whenever inputs, arithmetic or arrays change what they mean."""
+INPUTS = 16
+LEVELS = 100.0
+"""Levels that an output of 1 stands for."""
+_LARGEST = 256
+"""Widest layer that a file may hold."""
+
+
+@dataclass(frozen=True)
+class MlpWeights:
+    """Matrices (out, in) and offsets (out,) of every layer, and the image at rest [levels], (H, W, 3) float32."""
+
+    matrices: tuple[np.ndarray, ...]
+    offsets: tuple[np.ndarray, ...]
+    background: np.ndarray
+    provenance: dict[str, str] = field(default_factory=dict)
+    """``sensor`` names the sensor that it was fitted to."""
+    view: tuple[float, float] | None = None
+    """Width and height of the pad in that sensor's view [m]; None where it is not known."""
+
+
+def view_size(sensor: SensorSpec) -> tuple[float, float]:
+    """Width and height of the pad in a sensor's view [m]."""
+    width, height = (n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
+    return width, height
+
+
+def view_slope(sensor: SensorSpec) -> tuple[float, float]:
+    """dx/dz and dy/dz of the rays at the image's right and bottom border."""
+    camera = sensor.camera
+    distance = -camera.position[2]
+    return tuple(0.5 * n * p / distance for n, p in zip(camera.resolution, camera.pixel_pitch, strict=True))  # type: ignore[return-value]
+
+
+def inputs(ops: Any, slope_x: Any, slope_y: Any, touched: Any, u: Any, v: Any, view: tuple[float, float]) -> list[Any]:
+    """The network's ``INPUTS`` arrays of slopes of the displacement, c (0. or 1.) and places u, v; ``ops`` is NumPy or Dr.Jit."""
+    nz = 1 / ops.sqrt(slope_x * slope_x + slope_y * slope_y + 1)
+    tx, ty = view[0] * u, view[1] * v
+    wz = 1 / ops.sqrt(tx * tx + ty * ty + 1)
+    codes = [f(k * np.pi * w) for k in (1, 2) for w in (u, v) for f in (ops.sin, ops.cos)]
+    normal = [3 * slope_x * nz, 3 * slope_y * nz, 3 * (1 - nz)]
+    return [*normal, *(0.3 * w for w in (u, v)), *(0.03 * c for c in codes), 0.3 * tx * wz, 0.3 * ty * wz, touched]
+
+
+def forward(ops: Any, weights: MlpWeights, x: list[Any]) -> list[Any]:
+    """Three outputs of the network for ``INPUTS`` arrays."""
+    last = len(weights.matrices) - 1
+    for k, (matrix, offset) in enumerate(zip(weights.matrices, weights.offsets, strict=True)):
+        rows = [sum((float(w) * a for w, a in zip(row, x, strict=True)), float(b)) for row, b in zip(matrix, offset, strict=True)]
+        x = rows if k == last else [ops.maximum(a, 0.0) for a in rows]
+    return x
+
+
+def save_mlp(weights: MlpWeights, path: Path) -> None:
+    """Write the network as an ``.npz``."""
+    arrays: dict[str, Any] = {f"matrix_{k}": m.astype(np.float32) for k, m in enumerate(weights.matrices)}
+    arrays |= {f"offset_{k}": b.astype(np.float32) for k, b in enumerate(weights.offsets)}
+    if weights.view is not None:
+        arrays["view"] = np.array(weights.view)
+    arrays |= {"format": FORMAT, "version": np.int64(VERSION), "provenance": json.dumps(weights.provenance)}
+    np.savez(path, background=weights.background.astype(np.float32), **arrays)
+
+
+def load_mlp(path: str | Path) -> MlpWeights:
+    """A network that ``save_mlp`` wrote; ``path`` may be the folder of ``raytac calibrate``, with ``mlp.npz`` in it.
+
+    Raises:
+        CalibrationError: a file that is missing, damaged, of another version, or holds other arrays.
+    """
+    path = Path(path)
+    path = path / "mlp.npz" if path.is_dir() else path
+    if not path.is_file():
+        raise CalibrationError("must be a file mlp.npz, or a folder that holds one", file=path)
+    _check_version(path)
+    count = sum(name.startswith("matrix_") for name in npz_names(path))
+    if not 1 <= count <= 16:
+        raise CalibrationError("must hold 1 to 16 layers, matrix_0 and on", file=path, value=count)
+    arrays = npz_arrays(path, ("background", *(f"{kind}_{k}" for kind in ("matrix", "offset") for k in range(count))))
+    width, matrices, offsets = INPUTS, [], []
+    for k in range(count):
+        shape = arrays[f"matrix_{k}"].shape
+        rows = 3 if k == count - 1 else (shape[0] if shape else 0)
+        if not 1 <= rows <= _LARGEST:
+            raise CalibrationError(f"must have 1 to {_LARGEST} rows", file=path, key=f"matrix_{k}", value=shape)
+        matrices.append(check_file_numbers(path, f"matrix_{k}", arrays[f"matrix_{k}"], (rows, width)))
+        offsets.append(check_file_numbers(path, f"offset_{k}", arrays[f"offset_{k}"], (rows,)))
+        width = rows
+    background = arrays["background"]
+    if background.ndim != 3 or background.shape[2] != 3 or min(background.shape[:2]) < 3:
+        raise CalibrationError("must have shape (H, W, 3)", file=path, key="background", value=background.shape)
+    check_file_numbers(path, "background", background, background.shape)
+    return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), _provenance(path), _view(path))
+
+
+def _check_version(path: Path) -> None:
+    names = npz_names(path)
+    told = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
+    found = {name: str(array.reshape(())) if array.size == 1 else f"{array.dtype} {array.shape}" for name, array in told.items()}
+    if not found and "matrix_0" in names:
+        found = {"format": FORMAT, "version": "0, of before files said it"}
+    for key, expected in (("format", FORMAT), ("version", str(VERSION))):
+        if found.get(key) != expected:
+            rule = (
+                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it anew"
+            )
+            raise CalibrationError(rule, file=path, key=key, value=found.get(key, "missing"))
+
+
+def _provenance(path: Path) -> dict[str, str]:
+    """What the file says of itself; it may say nothing."""
+    if "provenance" not in npz_names(path):
+        return {}
+    text = npz_arrays(path, ("provenance",))["provenance"]
+    try:
+        found = json.loads(str(text)) if text.dtype.kind == "U" and text.shape == () else None
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(value, str) for value in found.values()):
+        raise CalibrationError("must be a JSON object of texts", file=path, key="provenance", value=str(text)[:80])
+    return found
+
+
+def _view(path: Path) -> tuple[float, float] | None:
+    if "view" not in npz_names(path):
+        return None
+    width, height = check_file_numbers(path, "view", npz_arrays(path, ("view",))["view"], (2,)).tolist()
+    if min(width, height) <= 0:
+        raise CalibrationError("must be two lengths > 0 [m]", file=path, key="view", value=(width, height))
+    return width, height

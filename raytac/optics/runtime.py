@@ -1,0 +1,157 @@
+"""Choose Mitsuba's variant once per process; the only place that imports Mitsuba first."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+
+from raytac.device import llvm_library, resolve_device
+from raytac.errors import BackendError, InputError
+
+__all__ = ["ROUNDING", "VARIANTS", "check_batch", "largest_batch", "load_mitsuba", "no_collection", "peak_bytes"]
+
+
+VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
+
+
+def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
+    """Import Mitsuba with the variant for ``device`` (``auto``, ``cpu``, ``cuda``).
+
+    Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first, and
+    ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
+
+    Raises:
+        BackendError: no LLVM library (CPU), no CUDA that works, or a process that already uses the other variant.
+    """
+    resolved = resolve_device(device)
+    if resolved == "cpu":
+        _require_llvm()
+    import mitsuba as mi
+
+    name = _started(mi, device, resolved)
+    from raytac.optics.trace import led_plugin as led
+
+    led.register(mi)
+    return mi, name
+
+
+def _started(mi: Any, device: str, name: str) -> str:
+    """The device whose variant is set in ``mi``: ``name``, or another one that ``device = "auto"`` may fall back to."""
+    # A variant that could be set and did not trace is still set, and nothing renders with it.
+    current = None if mi.variant() == getattr(mi, "raytac_failed_variant", None) else mi.variant()
+    active = next((known for known, variant in VARIANTS.items() if variant == current), None)
+    if active is not None and device == "auto":
+        return active
+    if current not in (None, VARIANTS[name]):
+        raise BackendError(
+            f"this process already renders with {mi.variant()}, so {VARIANTS[name]} (device {name!r}) cannot be used; "
+            "keep one device per process"
+        )
+    if active is not None:
+        return name
+    failure = _try_variant(mi, VARIANTS[name], trace=name == "cuda")
+    if failure and name == "cuda" and device == "auto":
+        warnings.warn(
+            f"CUDA does not trace here, so the CPU does: {failure} (`raytac doctor` tells more)", RuntimeWarning, stacklevel=4
+        )
+        _require_llvm()
+        name, failure = "cpu", _try_variant(mi, VARIANTS["cpu"])
+    if failure:
+        raise BackendError(f"Mitsuba variant {VARIANTS[name]} does not work here: {failure}; run `raytac doctor`")
+    return name
+
+
+def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
+    """Set the variant, trace one ray if asked, and return why that failed, or nothing; a failure is noted in ``mi``.
+
+    A CUDA whose libraries load may still not trace: no kernel image for the card, no OptiX in a container, a driver that is too old.
+    """
+    failure = ""
+    try:
+        mi.set_variant(variant)
+        if trace:
+            scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+            if not scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]:
+                failure = "a ray missed what it must hit"
+    except (ImportError, RuntimeError) as error:
+        failure = " ".join(str(error).split()) or type(error).__name__
+    if failure:
+        mi.raytac_failed_variant = variant
+    elif getattr(mi, "raytac_failed_variant", None) == variant:
+        mi.raytac_failed_variant = None
+    return failure
+
+
+def _require_llvm() -> None:
+    if llvm_library() is None:
+        raise BackendError(
+            "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
+            "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
+            "`raytac doctor` tells what was tried"
+        )
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Keep Python's garbage collector from running inside the block, where Dr.Jit may record kernels.
+
+    An array made from NumPy memory on the CPU returns it by a host callback when it is freed. If the collector frees one while a frozen
+    function is recorded, Dr.Jit 1.5 aborts the process ("enqueue_host_func(): this function cannot be recorded!"). Only reference
+    cycles wait for the collector, and optical modes that are thrown away are such: they hold the recordings of their own methods.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+ROUNDING = 2
+"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
+_LARGEST_ARRAY = 2**32 - 1
+"""Dr.Jit indexes with 32 bits."""
+
+
+def largest_batch(memory: int, per_env: int, values_per_env: int) -> int:
+    """Most environments that one call may render.
+
+    ``memory`` of the device and ``per_env`` that an environment takes at most [byte]; ``values_per_env``: length of its longest array.
+    """
+    return min(memory // per_env, _LARGEST_ARRAY // values_per_env)
+
+
+def check_batch(envs: int, most: int, *, per_env: int, memory: int, device: str) -> None:
+    """Refuse a batch that would not fit, before Dr.Jit ends the process over it.
+
+    Raises:
+        InputError: more than ``most`` environments; the message gives ``per_env`` and ``memory`` [byte].
+    """
+    if envs > most:
+        rule = (
+            f"must be at most {most}: an environment takes {per_env / 1e6:.1f} MB, this {device} has {memory / 1e9:.1f} GB "
+            "and an array at most 2^32 values; render in parts"
+        )
+        raise InputError("number of environments", value=envs, rule=rule)
+
+
+def peak_bytes(call: Callable[[], object], device: str) -> int:
+    """Most bytes that Dr.Jit's arrays took during ``call`` beyond those that it held before; 0 if ``call`` uses no Dr.Jit.
+
+    The allocator's cache is emptied first, so that memory kept from earlier work does not hide what the call needs; that makes the next
+    calls slower. Acceleration structures of the ray tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
+    """
+    backend = dr.JitBackend.CUDA if device == "cuda" else dr.JitBackend.LLVM
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(backend)
+    call()
+    dr.sync_thread()
+    return dr.detail.malloc_watermark(backend) - before

@@ -1,0 +1,198 @@
+"""A Taxim table from our own ray tracer: the virtual calibration.
+
+A real calibration presses a ball some fifty times and finds its outline by hand. Here the surface is known, so every pixel that a press
+moved is a sample: its slope, from the front step that the table mode itself uses, names the bin; its place and its difference from the
+image at rest are what the bin's polynomial is fitted to, for touched pixels and for those around them apart (docs/taxim-table.md, *Baked
+from the ray tracer*).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+
+from raytac.gel.surface import GelSurface
+from raytac.optics.taxim.bake.fit import BinFit, BinSums
+from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.shadow import ShadowSums
+from raytac.optics.taxim.bake.views import Calibration, Views
+from raytac.optics.taxim.cache import cached, keep, table_folder
+from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["PLAIN", "Baked", "bake", "bake_shadow", "bake_table", "baked_table", "calibrate"]
+
+MOVED = 5e-6
+"""Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
+
+PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+"""The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
+
+
+@dataclass(frozen=True)
+class Baked:
+    """A table and how well the bins of its sheet for touched pixels were sampled."""
+
+    table: PolyTable
+    fit: BinFit
+    images: int
+    """Images that were rendered for it, those of the shadows included."""
+    calibration: Calibration
+    """The ray tracer that it was baked from, and its images at rest."""
+
+
+def bake_table(
+    sensor: SensorSpec,
+    *,
+    device: str = "auto",
+    seed: int = 0,
+    resolution: tuple[int, int] | None = None,
+    settings: BakeSettings | None = None,
+    progress: bool = False,
+) -> PolyTable:
+    """Calibrate a table on the ray tracer; ``bake`` says how the bins were sampled, ``baked_table`` keeps the result on disk."""
+    return bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress).table
+
+
+def baked_table(
+    sensor: SensorSpec,
+    *,
+    device: str = "auto",
+    seed: int = 0,
+    resolution: tuple[int, int] | None = None,
+    settings: BakeSettings | None = None,
+    progress: bool = True,
+) -> PolyTable:
+    """The table of ``bake_table``, baked once and kept on disk under a digest of sensor, lights, settings and code.
+
+    It is kept in the user's cache, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
+    nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may come from the
+    other device, whose images differ by rounding.
+
+    Raises:
+        InputError: a value out of its choices.
+        BackendError: the table is not cached, and the ray tracer cannot run on ``device``.
+    """
+    settings = BakeSettings() if settings is None else settings
+    folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
+    table = cached(folder)
+    if table is None:
+        if progress:
+            where = "" if folder is None else f" and kept in {folder.parent}"
+            print(f"raytac: no table of {sensor.name} yet, so it is baked once{where}", file=sys.stderr)
+        table = bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress)
+        if keep(table, folder):
+            table = cached(folder) or table  # what later processes will read, to the last bit
+    return table
+
+
+def bake(
+    sensor: SensorSpec,
+    *,
+    device: str = "auto",
+    seed: int = 0,
+    resolution: tuple[int, int] | None = None,
+    settings: BakeSettings | None = None,
+    progress: bool = False,
+) -> Baked:
+    """Calibrate a table on the ray tracer ``fast`` with this sensor's own optics.
+
+    The same arguments give the same table on one device.
+
+    Args:
+        sensor: geometry, lights and camera.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        seed: where the sequence of presses starts, and of the fit of the case's light.
+        resolution: (width, height) of the calibration images [px]; None is the sensor's own.
+        settings: numbers and ranges of presses; None is the default.
+        progress: show a progress bar.
+
+    Raises:
+        InputError: a value out of its choices.
+        BackendError: the ray tracer cannot run on ``device``.
+    """
+    return calibrate(
+        Calibration(sensor, device=device, resolution=resolution, seed=seed), settings=settings, seed=seed, progress=progress
+    )
+
+
+def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: int = 0, progress: bool = False) -> Baked:
+    """``bake`` with a ray tracer that is set up already."""
+    from tqdm import tqdm
+
+    settings = BakeSettings() if settings is None else settings
+    sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
+    pins = settings.pins if sensor.optics.shadows else 0
+    images = settings.images + 6 * pins
+    with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
+        touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
+        for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
+            add_samples(touched, views, at.rest_image, views.contact)
+            add_samples(around, views, at.rest_image, ~views.contact)
+            bar.update(len(views.rgb))
+        fit, surround, together = (
+            sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in (touched, around, touched.plus(around))
+        )
+        shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if pins else None
+    width, height = camera.resolution
+    table = PolyTable(
+        gradients=fit.gradients,
+        covered=fit.covered,
+        surround=surround.gradients,
+        one_sheet=together.gradients,
+        background=at.rest_image.astype(np.float32),
+        pixel_pitch=at.pitch,
+        shadow=shadow,
+        slopes_of="displacement",
+        rest_image=at.rest_image,
+        constants=PLAIN,
+        provenance={
+            "source": "baked from the ray tracer",
+            "sensor": sensor.name,
+            "mode": at.tracer.label,
+            "exposure": f"{at.tracer.sensor.response.gain:g}",
+            "settings": repr(settings),
+            "seed": str(seed),
+            "resolution": f"{width}x{height}",
+            "fill": "nearest covered magnitude of the same direction, else the nearest direction",
+        },
+    )
+    return Baked(table, fit, images, at)
+
+
+def bake_shadow(
+    at: Calibration,
+    *,
+    settings: BakeSettings | None = None,
+    seed: int = 0,
+    tick: Callable[[int], object] = lambda count: None,
+) -> ShadowTable:
+    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is told how many images were rendered, six a pin in all."""
+    settings = BakeSettings() if settings is None else settings
+    _, deepest = settings.depth_range(at.sensor.gelpad.thickness)
+    shades = ShadowSums(2 * PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)
+    for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
+        shades.add(views, cast, at.rest_image)
+        tick(3 * len(views.rgb))
+    return shades.table()
+
+
+def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
+    """Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little."""
+    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
+    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
+    return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
+
+
+def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray) -> None:
+    """Every pixel of ``own`` (B, H, W) that moved, of all environments of ``views``."""
+    for b in range(len(views.rgb)):
+        row, column = np.nonzero((views.moved[b] > MOVED) & own[b])
+        at = b, row, column
+        i, j = slope_bins(views.slope_x[at].astype(np.float64), views.slope_y[at].astype(np.float64), sums.n_bins)
+        sums.add(i, j, column, row, views.rgb[at].astype(np.float32) - rest_image[row, column])

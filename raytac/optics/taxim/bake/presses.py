@@ -1,0 +1,114 @@
+"""The presses of the virtual calibration: balls all over the pad, with the gel around them or bare.
+
+A real calibration (Taxim's, some fifty presses of one ball) has steep slopes where the ball is and none elsewhere. Here the balls
+differ in size and depth and follow a sequence that fills the space of place × size × depth evenly, so that every slope and direction
+comes up all over the view. Most press with the gel around them giving way (``raytac.gel.pyramid``), as all presses of the rigid pad do;
+the others are *bare* caps, which reach slopes that the surround would round off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from raytac.gel.pyramid import ElasticSurround
+from raytac.gel.surface import GelSurface, PadGrid, rest_height
+from raytac.optics.camera import Pinhole
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.shapes.part import Part, primitive
+from raytac.shapes.underside import object_height
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["ball_presses", "even_sequence", "pin_presses", "pressed", "view_half"]
+
+_GAP = 1.5e-3
+"""Least distance between the rims of two balls in one image [m]: the widest Gaussian of the surround is 0.9 mm."""
+_PIN_HALF_LENGTH = 2e-3
+_TRIES = 24
+"""Points of the sequence that an image may use up to place its balls."""
+
+
+def even_sequence(dimensions: int, start: np.ndarray) -> Iterator[np.ndarray]:
+    """Points in the unit cube, each (dimensions,), that fill it evenly at any length: xₙ = frac(start + n α).
+
+    α_k = g^−k with g the positive root of g^(d+1) = g + 1 (M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018;
+    for d = 1 the golden ratio).
+    """
+    g = 1.5
+    for _ in range(64):
+        g = (1 + g) ** (1 / (dimensions + 1))
+    alpha = g ** -np.arange(1.0, dimensions + 1)
+    n = 0
+    while True:
+        n += 1
+        yield (start + n * alpha) % 1.0
+
+
+def view_half(camera: Pinhole) -> np.ndarray:
+    """Half the extent (x, y) [m] of what the camera sees of the plane z = 0, the smaller side if the axis is off centre."""
+    return np.array([min(-nodes[0], nodes[-1]) for nodes in camera.pixel_centres_on_plane()])
+
+
+def pressed(grid: PadGrid, parts: list[Part], surround: ElasticSurround | None) -> GelSurface:
+    """Surface of one environment under parts placed in the pad frame; without ``surround`` the bare overlap."""
+    under = object_height(parts, np.eye(4)[None], grid.x, grid.y, below=float(grid.rest.max()))
+    if surround is not None:
+        return surround.surface(under)
+    height = np.minimum(under, grid.rest).astype(np.float32)
+    return GelSurface(grid, height, under < grid.rest, np.full((1, 2), np.nan))
+
+
+def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
+    """``settings.images`` surfaces, one environment each, with up to ``settings.balls`` balls apart from each other.
+
+    Radii are spread evenly in their logarithm, depths below the resting surface under the ball's centre evenly; a ball is never pressed
+    beyond its equator, and its contact lies wholly in view.
+    """
+    points = even_sequence(5, np.random.default_rng(seed).uniform(size=5))
+    surround = ElasticSurround(grid)
+    half = view_half(camera)
+    (small, large), (shallow, deep) = settings.radius, settings.depth_range(gelpad.thickness)
+    for _ in range(settings.images):
+        balls: list[tuple[np.ndarray, float]] = []
+        parts: list[Part] = []
+        bare = 0.0
+        for u in (next(points) for _ in range(_TRIES)):
+            radius = small * (large / small) ** u[2]
+            depth = min(shallow + (deep - shallow) * u[3], radius)
+            reach = np.sqrt(radius**2 - (radius - depth) ** 2)
+            centre = (2 * u[:2] - 1) * np.maximum(half - reach, 0.0)
+            if any(np.hypot(*(centre - other)) < reach + size + _GAP for other, size in balls):
+                continue
+            balls.append((centre, reach))
+            parts.append(_ball(gelpad, centre, radius, depth))
+            bare = u[4]
+            if len(balls) == settings.balls:
+                break
+        yield pressed(grid, parts, None if bare < settings.bare_share else surround)
+
+
+def _ball(gelpad: GelpadSpec, centre: np.ndarray, radius: float, depth: float) -> Part:
+    place = np.eye(4)
+    place[:2, 3] = centre
+    place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + radius - depth
+    return primitive("sphere", (radius,), place)
+
+
+def pin_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
+    """``settings.pins`` surfaces, each with one flat-ended pin, whose depths rise in equal steps; with the gel around it.
+
+    Radii (evenly in their logarithm) and places follow the even sequence; the pin lies wholly in view.
+    """
+    points = even_sequence(3, np.random.default_rng([seed, 1]).uniform(size=3))
+    surround = ElasticSurround(grid)
+    half = view_half(camera)
+    (thin, thick), (_, deep) = settings.pin_radius, settings.depth_range(gelpad.thickness)
+    for k in range(settings.pins):
+        u = next(points)
+        radius, depth = thin * (thick / thin) ** u[2], deep * (k + 1) / settings.pins
+        centre = (2 * u[:2] - 1) * np.maximum(half - radius, 0.0)
+        place = np.eye(4)
+        place[:2, 3] = centre
+        place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + _PIN_HALF_LENGTH - depth
+        yield pressed(grid, [primitive("cylinder", (radius, _PIN_HALF_LENGTH), place)], surround)

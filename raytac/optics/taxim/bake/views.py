@@ -1,0 +1,99 @@
+"""The camera's view of calibration presses: what the ray tracer shows of them and where they slope."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
+from raytac.optics.image.base import see_heights
+from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["Calibration", "Views"]
+
+_BATCH = {"cpu": 8, "cuda": 32}
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the camera sees of a batch of presses, and where; all NumPy, first axis B."""
+
+    rgb: np.ndarray
+    """(B, H, W, 3) uint8."""
+    slope_x: np.ndarray
+    """∂(rest − z)/∂x, (B, H, W) float32."""
+    slope_y: np.ndarray
+    moved: np.ndarray
+    """rest − z [m], (B, H, W) float32."""
+    contact: np.ndarray
+    """(B, H, W) bool."""
+
+
+class Calibration:
+    """The ray tracer of one sensor set up for calibration presses."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        device: str = "auto",
+        resolution: tuple[int, int] | None = None,
+        seed: int = 0,
+        flat_field: np.ndarray | None = None,
+    ) -> None:
+        """``flat_field`` and errors as of ``RayTracer``."""
+        self.sensor = sensor
+        options: dict[str, Any] = {"resolution": resolution, "outputs": ("rgb",), "device": device, "flat_field": flat_field}
+        self.tracer = RayTracer(sensor, seed=seed, **options)
+        # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
+        options["bounce"] = False
+        self._direct = [RayTracer(self.tracer.sensor, shadows=shadows, **options) for shadows in (True, False)]
+        self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
+        """Size of an image pixel on the plane z = 0 along x and y [m]."""
+        self.grid: PadGrid = make_grid(sensor.gelpad, grid_pitch(self.pitch))
+        """Nodes of the presses, as fine as the image."""
+        rest = GelSurface.at_rest(self.grid)
+        rgb = self.tracer.render(rest).rgb
+        assert rgb is not None
+        self.rest_image: np.ndarray = rgb[0]
+        """(H, W, 3) uint8."""
+        self._rest = self.tracer.mi.Float(rest.height.ravel())
+
+    def views(self, presses: Iterable[GelSurface]) -> Iterator[Views]:
+        """Render ``presses`` (one environment each, on ``grid``) in batches and see their slopes as the table mode does."""
+        for surface in self._batches(presses):
+            yield self._view(surface)
+
+    def shadow_views(self, presses: Iterable[GelSurface]) -> Iterator[tuple[Views, np.ndarray]]:
+        """As ``views``, with what cast shadows add to direct light [levels], (B, H, W, 3) int16, negative in a shadow."""
+        for surface in self._batches(presses):
+            with_shadows, without = (tracer.render(surface).rgb for tracer in self._direct)
+            assert with_shadows is not None and without is not None
+            yield self._view(surface), with_shadows.astype(np.int16) - without
+
+    def _batches(self, presses: Iterable[GelSurface]) -> Iterator[GelSurface]:
+        presses = iter(presses)
+        while some := list(islice(presses, _BATCH[self.tracer.device])):
+            height, contact, centre = (
+                np.concatenate([getattr(s, a) for s in some]) for a in ("height", "contact", "contact_centre")
+            )
+            yield GelSurface(self.grid, height, contact, centre)
+
+    def _view(self, surface: GelSurface) -> Views:
+        tracer, mi = self.tracer, self.tracer.mi
+        rgb = tracer.render(surface).rgb
+        assert rgb is not None
+        heights = mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+        contact = mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+        seen = see_heights(mi, tracer.layout, tracer.camera, self.pitch, self._rest, heights, contact)
+        dr.eval(seen.height, seen.moved, seen.contact)
+        slope_x, slope_y, _ = seen.slopes(mi, seen.moved)
+        dr.eval(slope_x, slope_y)
+        x, y, moved, touched = (np.array(v).reshape(rgb.shape[:3]) for v in (slope_x, slope_y, seen.moved, seen.contact))
+        return Views(rgb, x, y, moved * np.float32(self.pitch[0]), touched.astype(bool))

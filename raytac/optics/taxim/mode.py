@@ -1,0 +1,223 @@
+"""The Taxim table as an optical mode: a polynomial by slope bin, optional shadows from a table, plus the image at rest.
+
+Si and Yuan, Taxim, RA-L 2022, sections III-B and III-C; semantics of their released simulator (docs/taxim-table.md lists what is kept
+as it is, oddities included, and what differs). Deformation is not in here: the physics gives the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import chosen_shadows
+from raytac.optics.exposure import SATURATED, saturated_share
+from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.taxim.shadow import ShadowArrays, ShadowCaster
+from raytac.optics.taxim.table import PolyTable
+from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["TableArrays", "TableShader", "TaximMode"]
+
+_ASPECT_TOLERANCE = 0.01
+_UNCOVERED = 2
+"""Flag of a pixel in contact whose bin no calibration sample reached."""
+
+
+@dataclass(frozen=True)
+class TableArrays:
+    """Device arrays of a table: what a recorded frame reads besides the surface."""
+
+    bins: Any
+    """20 floats a bin: 6 coefficients of each channel, whether it is covered, and one unused; all bins of ``surround`` follow."""
+    background: Any
+    """4 floats a pixel, the last unused."""
+    shadow: ShadowArrays | None
+
+
+class TableShader:
+    """Shades height images by a table at one resolution; knows no camera and no pad."""
+
+    def __init__(self, mi: Any, table: PolyTable, resolution: tuple[int, int], pitch: float, *, shadow: bool) -> None:
+        """``resolution`` (width, height) [px] may differ from the table's; ``pitch`` is that of an image pixel along x [m]."""
+        self.mi, self.table, self.resolution = mi, table, resolution
+        self.scale = (table.resolution[0] / resolution[0], table.resolution[1] / resolution[1])
+        """Calibration pixels per image pixel along x and y."""
+        background = resized(table.background, resolution)
+        self._caster = None
+        arrays = None
+        if shadow:
+            if table.shadow is None:
+                raise InputError("shadows", value=True, rule="this table has no shadows", choices=(False,))
+            self._caster = ShadowCaster(mi, table.shadow, table.constants, resolution, self.scale, pitch)
+            arrays = self._caster.arrays()
+            background = self._caster.blur_background(background)
+        self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(_padded(background)), arrays)
+
+    def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
+        """Three channels of B·H·W levels, and flags of every pixel (UInt8): 1 in contact, ``_UNCOVERED`` more in an uncovered bin.
+
+        The flags are one unused value where coverage is not known.
+        """
+        mi, table = self.mi, self.table
+        displaced = table.slopes_of == "displacement"
+        of = seen.moved if displaced else seen.height
+        sx, sy, near = seen.slopes(mi, of)
+        _, p, column, row = seen.pixel(mi)
+        n = table.n_bins
+        # A flat place has direction 0; atan2(0, 0) says so on every device that Dr.Jit knows, but is not promised to.
+        flat = (sx == 0) & (sy == 0)
+        direction = dr.select(flat, 0, dr.atan2(sy, dr.select(flat, 1, sx)))
+        magnitude = dr.atan(dr.sqrt(sx * sx + sy * sy))
+        i = dr.minimum(mi.UInt32(magnitude * ((n - 1) / (0.5 * np.pi))), n - 1)
+        j = dr.minimum(mi.UInt32(dr.maximum(direction + np.pi, 0) * ((n - 1) / (2 * np.pi))), n - 1)
+        which = i * n + j
+        if table.surround is not None:
+            which += dr.select(seen.contact == 0, mi.UInt32(n * n), 0)
+        x = (mi.Float(column) + 0.5) * self.scale[0] - 0.5
+        y = (mi.Float(row) + 0.5) * self.scale[1] - 0.5
+
+        def binned() -> tuple[Any, ...]:
+            packet = [dr.gather(mi.Vector4f, inputs.bins, which * 5 + k) for k in range(5)]
+            c = [packet[k][m] for k in range(5) for m in range(4)]
+            basis = (x * x, y * y, x * y, x, y, mi.Float(1))
+            return *(sum((c[6 * k + m] * basis[m] for m in range(6)), mi.Float(0)) for k in range(3)), c[18]
+
+        if displaced:
+            still = (of == 0) & (near[0] == 0) & (near[1] == 0) & (near[2] == 0) & (near[3] == 0)
+            looked_up = ~still if seen.contact is None else ~still | (seen.contact != 0)
+            # A branch: packets are dear, and most pads are at rest in most places.
+            *change, covered = dr.if_stmt((), looked_up, binned, lambda: (mi.Float(0),) * 4, label="bins")
+            change = [dr.select(still, 0, d) for d in change]
+        else:
+            *change, covered = binned()
+        flags = mi.UInt8(0)
+        if table.covered is not None and seen.contact is not None:
+            flags = seen.contact | dr.select((seen.contact != 0) & (covered == 0), mi.UInt8(_UNCOVERED), 0)
+        if self._caster is not None and inputs.shadow is not None:
+            change = self._caster.cast(seen, of, direction, change, inputs.shadow)
+        packed = dr.gather(mi.Vector4f, inputs.background, p)
+        return [d + packed[k] for k, d in enumerate(change)], flags
+
+
+class TaximMode(ImageMode):
+    """The optical mode ``taxim``: one sensor, one table, one resolution; batches of surfaces in, images out."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        *,
+        calibration: str | Path | PolyTable | None = None,
+        shadows: bool | None = None,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+    ) -> None:
+        """Load the table; kernels are compiled at the first image.
+
+        Args:
+            sensor: camera and pad; its lights matter only where ``calibration`` is None.
+            calibration: a table, a calibration folder (``raytac.optics.taxim.folder``), or None for the table baked from this sensor's
+                own ray tracer, which is baked now unless that was done before. The table's image is laid over the whole image.
+            shadows: cast shadows; None is as the sensor says, where the table has them.
+            resolution: (width, height) [px]; None is the sensor's own.
+            outputs: any of ``rgb``, ``normals``, ``depth``.
+            device: ``auto``, ``cpu`` or ``cuda``.
+
+        Raises:
+            InputError: a value out of its choices, or an image of another shape than the table's.
+            CalibrationError: a file of the calibration folder is missing or malformed.
+            BackendError: Dr.Jit cannot run on ``device``.
+        """
+        self.label = "taxim"
+        casts = chosen_shadows(sensor, shadows)
+        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
+        # Without being asked, a table without shadows casts none; one that is asked to is baked with them, whatever the sensor says.
+        baked_of = replace(sensor, optics=replace(sensor.optics, shadows=sensor.optics.shadows or casts))
+        self.table, self._is_own = _table(calibration, baked_of, self.device), calibration is None
+        self.shadows = casts and (shadows is not None or self.table.shadow is not None)
+        self.label = "taxim-shadow" if self.shadows else "taxim"
+        width, height = self.camera.resolution
+        columns, rows = self.table.resolution
+        ratio = (columns / rows) / (width / height)
+        if abs(ratio - 1) > _ASPECT_TOLERANCE:
+            rule = f"must have the aspect ratio of the table's image, {columns}x{rows}, within {100 * _ASPECT_TOLERANCE:.0f} %"
+            raise InputError("resolution", value=f"{width}x{height}", rule=rule)
+        self.needs_contact = self.shadows or self.table.covered is not None or self.table.surround is not None
+        self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadows)
+
+    @property
+    def view_ratio(self) -> tuple[float, float]:
+        """Width and height in view of the sensor over those of the table's image: 1 where they show the same piece of the pad."""
+        sizes = zip(self.pitch, self.camera.resolution, self.table.pixel_pitch, self.table.resolution, strict=True)
+        x, y = (p * n / (q * m) for p, n, q, m in sizes)
+        return x, y
+
+    def _build(self, grid: PadGrid) -> TableArrays:
+        if self._is_own and saturated_share(self.table.background.round().clip(0, 255)) > SATURATED:
+            RayTracer(self.sensor, device=self.device).render(GelSurface.at_rest(grid))  # which warns of it
+        return self._shader.inputs
+
+    def _levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
+        return self._shader.levels(seen, inputs)
+
+    def _floats_per_pixel(self) -> float:
+        # With shadows: least values (3), the packed image before and after each of four blurs (20), the contact grown by rows (1/4).
+        return 23.25 if self.shadows else 0
+
+    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        if self.table.covered is None:
+            return None
+        # Image by image: counting along an axis takes ten times as long.
+        per_image = flags.reshape(len(failed), -1)
+        touched = np.array([np.count_nonzero(one) for one in per_image != 0], float)
+        uncovered = np.array([np.count_nonzero(one) for one in per_image >= _UNCOVERED])
+        return np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=(touched > 0) & ~failed)
+
+
+def resized(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) float32 resampled to ``resolution`` (width, height), pixel areas aligned; the image itself if it has that size.
+
+    Linear where it grows, a triangle over the covered pixels where it shrinks.
+    """
+    if (image.shape[1], image.shape[0]) == resolution:
+        return np.asarray(image, dtype=np.float32)
+    from PIL import Image
+
+    channels = [Image.fromarray(np.ascontiguousarray(image[..., c], dtype=np.float32)) for c in range(3)]
+    return np.stack([np.asarray(one.resize(resolution, Image.Resampling.BILINEAR)) for one in channels], axis=-1)
+
+
+def _table(calibration: object, sensor: SensorSpec, device: str) -> PolyTable:
+    if isinstance(calibration, PolyTable):
+        return calibration
+    if isinstance(calibration, (str, Path)):
+        from raytac.optics.taxim.folder import load_calibration
+
+        return load_calibration(calibration)
+    if calibration is not None:
+        rule = f"must be a PolyTable, a calibration folder or None, not {type(calibration).__name__}"
+        raise InputError("calibration", value=calibration, rule=rule)
+    from raytac.optics.taxim.bake.bake import baked_table
+
+    return baked_table(sensor, device=device)
+
+
+def _packed_bins(table: PolyTable) -> np.ndarray:
+    n = table.n_bins
+    sheets = [table.gradients] if table.surround is None else [table.gradients, table.surround]
+    packed = np.zeros((len(sheets), n, n, 20), dtype=np.float32)
+    for own, sheet in zip(packed, sheets, strict=True):
+        own[..., :18] = np.moveaxis(sheet, 0, 2).reshape(n, n, 18)
+        own[..., 18] = 1 if table.covered is None else table.covered
+    return packed.ravel()
+
+
+def _padded(image: np.ndarray) -> np.ndarray:
+    return np.pad(np.asarray(image, dtype=np.float32), ((0, 0), (0, 0), (0, 1))).ravel()

@@ -1,0 +1,222 @@
+"""Inter-reflection for the ``fast`` integrator: two smooth fields in place of paths.
+
+Light that reaches the coat after at least one reflection comes from two places, and each has a cheap, deterministic model:
+
+1. **From the case** (walls, floor, and all that they got from the coat): it hardly changes when a small part of the pad moves by a
+   millimetre. ``CaseLight`` path-traces it once per sensor at rest and fits the irradiance E(x, y, n) by a polynomial: cubic in the
+   place on the pad, linear in the normal.
+2. **From the coat to itself**, on the flanks of an imprint, where one slope lights another. ``BounceField`` computes the coat's direct
+   radiosity B on a coarse grid and gathers it once over the neighbourhood (radiosity with one bounce, Goral et al. 1984):
+   V(p) = Σ_j B_j / π · max(0, cos θ_j) ΔA_j / r² · ω_j as a vector, so that a pixel's own normal gives E = max(0, n · V).
+
+Left out: occlusion between coat patches, second and later bounces within the coat, the change of the case's light with the imprint, and
+the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s). docs/optics.md states the error that remains.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.optics.trace.direct import PixelSample
+from raytac.optics.trace.height_field import CoatField, CoatLayout
+from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.reference import OFFSET, connect, trace
+from raytac.optics.trace.scene import UNIT, SensorScene
+
+__all__ = ["BounceField", "CaseLight"]
+
+SAMPLES = 1 << 18
+"""Paths that the fit of the case's light uses."""
+DEGREE = 3
+"""Polynomial degree over the pad."""
+PATCH = 0.4e-3
+"""Pitch of the coarse grid [m]."""
+REACH = 7
+"""Radius of the neighbourhood that lights a patch [patches]."""
+TILT = 1.2
+"""Largest tangent of a normal's tilt in the fit."""
+
+
+def _monomials(u: Any, v: Any) -> list[Any]:
+    return [u**i * v**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+
+
+@dataclass(frozen=True)
+class CaseLight:
+    """Irradiance from the case as a polynomial: ``coefficients`` (3·G, terms, 4) over monomials in x, y and (1, n_x, n_y, n_z)."""
+
+    coefficients: np.ndarray
+    half: tuple[float, float]
+
+    @classmethod
+    def fit(cls, scene: SensorScene, lamps: list[Lamp], groups: list[int], seed: int = 0, samples: int = SAMPLES) -> CaseLight:
+        """Path-trace from random points of the coat at rest into its hemisphere and fit by least squares.
+
+        Directions are cosine-distributed about random normals, so a path's π L estimates E; directions into the pad's plane count as
+        dark here, because ``BounceField`` brings the coat's own light.
+        """
+        mi, grid = scene.mi, scene.grid
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, samples)
+        place, tilt, square = sampler.next_2d(), sampler.next_2d(), sampler.next_2d()
+        half = float(grid.x[-1]), float(grid.y[-1])
+        u, v = 2 * place.x - 1, 2 * place.y - 1
+        disk = mi.warp.square_to_uniform_disk(tilt) * TILT
+        n = dr.normalize(mi.Vector3f(disk.x, disk.y, -1))
+        d = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(square))
+        x, y = UNIT * u * half[0], UNIT * v * half[1]
+        p = mi.Point3f(x, y, scene.height_at(x, y) - 20 * OFFSET)
+        incoming = trace(mi, scene, sampler, mi.Ray3f(p, d), lamps, groups, -1, seen=False)
+        irradiance = [dr.select(d.z < 0, r * dr.pi, 0) for r in incoming]
+        for lamp, group in zip(lamps, groups, strict=True):
+            w, arriving = connect(mi, scene, sampler, p, n, lamp, True)
+            for c in range(3):
+                irradiance[3 * group + c] += arriving[c] * dr.dot(w, n)
+        basis = [m * c for m in _monomials(u, v) for c in (mi.Float(1), n.x, n.y, n.z)]
+        # All in one kernel: each conversion below would otherwise evaluate its own channel, and with it trace every path again.
+        dr.eval(irradiance, basis)
+        design = np.stack([np.array(b + dr.zeros(mi.Float, samples)) for b in basis], axis=1).astype(np.float64)
+        target = np.stack([np.array(e) for e in irradiance], axis=1)
+        solution, *_ = np.linalg.lstsq(design, target, rcond=None)
+        terms = len(basis) // 4
+        return cls(solution.T.reshape(len(irradiance), terms, 4).astype(np.float32), half)
+
+    def on(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """(e, v_x, v_y, v_z) of E(n) = e + n · v at the places x, y [m], shape (channels, N, 4), float32."""
+        monomials = np.stack(_monomials(x / self.half[0], y / self.half[1]), axis=-1)
+        return np.einsum("nm,cmk->cnk", monomials, self.coefficients).astype(np.float32)
+
+
+def patch_counts(layout: CoatLayout) -> tuple[int, int]:
+    """Nodes along x and y of the coarse grid over the pad."""
+    nx, ny = (max(2, round((n - 1) * d / PATCH) + 1) for n, d in ((layout.nx, layout.dx), (layout.ny, layout.dy)))
+    return nx, ny
+
+
+@dataclass(frozen=True)
+class BounceField:
+    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, made anew each frame.
+
+    (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal.
+    """
+
+    layout: CoatLayout
+    nx: int
+    ny: int
+    dx: float
+    dy: float
+    case: list[Any]
+    """Packed (e, v_x, v_y, v_z) of every node, one array a channel."""
+    offset_x: Any
+    offset_y: Any
+
+    @classmethod
+    def build(cls, mi: Any, layout: CoatLayout, case: CaseLight) -> BounceField:
+        """Lay the grid over the pad and evaluate the case's light on it."""
+        nx, ny = patch_counts(layout)
+        dx, dy = (layout.nx - 1) * layout.dx / (nx - 1), (layout.ny - 1) * layout.dy / (ny - 1)
+        x, y = np.meshgrid(layout.x0 + dx * np.arange(nx), layout.y0 + dy * np.arange(ny))
+        k = np.arange(-REACH, REACH + 1)
+        ox, oy = (a.ravel() for a in np.meshgrid(k, k))
+        near = (ox**2 + oy**2 <= REACH**2) & ((ox != 0) | (oy != 0))
+        return cls(
+            layout=layout,
+            nx=nx,
+            ny=ny,
+            dx=dx,
+            dy=dy,
+            case=[mi.Float(c.ravel()) for c in case.on(x.ravel(), y.ravel())],
+            offset_x=mi.Int32(ox[near].astype(np.int32)),
+            offset_y=mi.Int32(oy[near].astype(np.int32)),
+        )
+
+    @staticmethod
+    def memory_per_env(layout: CoatLayout, channels: int) -> int:
+        """Bytes that the grid takes while it is filled: packed results of each channel, patches, their light by layer, heights."""
+        return math.prod(patch_counts(layout)) * (16 * channels + 16 + 16 * (channels // 3) + 4)
+
+    def _node(self, i: Any) -> tuple[Any, Any, Any]:
+        """(env, ix, iy) of patch index ``i``."""
+        return i // (self.nx * self.ny), i % self.nx, (i // self.nx) % self.ny
+
+    def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
+        """Fill the grid for the coat ``field``: ``radiosity`` gives B [radiance · sr] of each channel at a sample of the coat.
+
+        Returns one packed (e, v_x, v_y, v_z) array a channel, length 4 · B · nodes.
+        """
+        channels, offsets = len(self.case), dr.width(self.offset_x)
+        i = dr.arange(mi.UInt32, envs * (self.nx * self.ny))
+        env, ix, iy = self._node(i)
+        x, y = self.layout.x0 + self.dx * mi.Float(ix), self.layout.y0 + self.dy * mi.Float(iy)
+        z = mi.Float(0)
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                z += field.z(env, x + a * self.dx / 3, y + b * self.dy / 3) / 9
+        dr.eval(z)
+        left, right = dr.select(ix > 0, i - 1, i), dr.select(ix < self.nx - 1, i + 1, i)
+        up, down = dr.select(iy > 0, i - self.nx, i), dr.select(iy < self.ny - 1, i + self.nx, i)
+        zx = (dr.gather(mi.Float, z, right) - dr.gather(mi.Float, z, left)) / (mi.Float(right - left) * self.dx)
+        zy = (dr.gather(mi.Float, z, down) - dr.gather(mi.Float, z, up)) / (mi.Float((down - up) // self.nx) * self.dy)
+        n = dr.normalize(mi.Normal3f(zx, zy, -1))
+        p = mi.Point3f(x, y, z)
+        to_camera = mi.Vector3f(0, 0, -1)
+        b = radiosity(PixelSample(env, p, n, to_camera))
+        patches = dr.ravel(mi.Vector4f(z, n.x, n.y, n.z))
+        # Four channels a packet, so that one gather brings the colours of a layer.
+        packets = [dr.ravel(mi.Vector4f(*b[k : k + 3], 0)) for k in range(0, channels, 3)]
+        dr.eval(patches, packets)
+        area = self.dx * self.dy / np.pi
+
+        def more(k: Any, v: list[Any]) -> Any:
+            return k < offsets
+
+        def add(k: Any, v: list[Any]) -> tuple[Any, list[Any]]:
+            ox, oy = dr.gather(mi.Int32, self.offset_x, k), dr.gather(mi.Int32, self.offset_y, k)
+            jx, jy = mi.Int32(ix) + ox, mi.Int32(iy) + oy
+            ok = (jx >= 0) & (jx < self.nx) & (jy >= 0) & (jy < self.ny)
+            j = mi.UInt32((mi.Int32(env) * self.ny + jy) * self.nx + jx)
+            q = dr.gather(mi.Vector4f, patches, j, ok)
+            d = mi.Vector3f(mi.Float(ox) * self.dx, mi.Float(oy) * self.dy, q.x - z)
+            r2 = dr.maximum(dr.squared_norm(d), 1e-12)
+            cos_i = dr.dot(n, d)
+            cos_j = -(q.y * d.x + q.z * d.y + q.w * d.z)
+            # ΔA_j is the patch's area on the slope: its footprint over |n_z|.
+            weight = dr.select(ok & (cos_i > 0) & (cos_j > 0), area * cos_j / (-q.w * r2 * r2), 0)
+            out = list(v)
+            for g, packet in enumerate(packets):
+                light = dr.gather(mi.Vector4f, packet, j, ok)
+                for c in range(3):
+                    out[3 * g + c] = out[3 * g + c] + d * (weight * light[c])
+            return k + 1, out
+
+        start = (mi.UInt32(0), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in range(channels)])
+        _, gathered = dr.while_loop(start, more, add, label="coat bounce")
+        node = i - env * (self.nx * self.ny)
+        result = []
+        for base, v in zip(self.case, gathered, strict=True):
+            e = dr.gather(mi.Vector4f, base, node)
+            result.append(dr.ravel(mi.Vector4f(e.x, e.y + v.x, e.z + v.y, e.w + v.z)))
+        dr.eval(result)
+        return result
+
+    def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample) -> list[Any]:
+        """E [radiance · sr] of every channel at the points and normals of ``seen``."""
+        p, n = seen.p, seen.n
+        fx = dr.clip((p.x - self.layout.x0) / self.dx, 0, self.nx - 1.001)
+        fy = dr.clip((p.y - self.layout.y0) / self.dy, 0, self.ny - 1.001)
+        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
+        wx, wy = fx - mi.Float(ix), fy - mi.Float(iy)
+        i = (seen.env * self.ny + iy) * self.nx + ix
+        out = []
+        for grid in grids:
+            a, b = dr.gather(mi.Vector4f, grid, i), dr.gather(mi.Vector4f, grid, i + 1)
+            c, d = dr.gather(mi.Vector4f, grid, i + self.nx), dr.gather(mi.Vector4f, grid, i + self.nx + 1)
+            e = dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+            out.append(dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0))
+        return out

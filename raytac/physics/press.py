@@ -1,0 +1,220 @@
+"""What the environments of one press scene do each in their own way: where, how turned, how deep and how far sideways."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from raytac.checks import MOST_ENVIRONMENTS, check_numbers, check_whole
+from raytac.errors import InputError, MeshError, SpecError
+from raytac.physics.base import ContactState
+from raytac.physics.objects import object_parts
+from raytac.se3 import rotation_of
+from raytac.shapes.part import Part
+from raytac.specs.press import PressScene, StageSpec
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = [
+    "CLEARANCE",
+    "MOST_STEPS",
+    "PressTargets",
+    "about_z",
+    "check_trajectory",
+    "peak_state",
+    "per_environment",
+    "scene_parts",
+]
+
+
+class PressTargets:
+    """Targets of B environments; a number that is not finite marks its environment as ``lost``: it fails from the start.
+
+    Attributes:
+        offsets: added to the object's x, y [m], (B, 2).
+        rotations: ``pad_from_object`` at zero twist, (B, 3, 3); that of the scene in an environment that is lost.
+        depths: of every indent to a depth in place of the scene's [m], (B,); None leaves the scene's.
+        lost: (B,), bool.
+    """
+
+    def __init__(
+        self,
+        scene: PressScene,
+        num_envs: int,
+        *,
+        offsets: np.ndarray | None = None,
+        depths: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+        shears: np.ndarray | None = None,
+        twists: np.ndarray | None = None,
+    ) -> None:
+        """Check shapes.
+
+        Args:
+            scene: gives the object's own rotation, which comes first.
+            num_envs: number of environments B, at least 1.
+            offsets: added to the object's x, y [m], (B, 2); None is none.
+            depths: of every indent to a depth [m], (B,); None leaves the scene's, as for the next three.
+            rotations: turn of the object about its origin, axes of the pad frame, wxyz, of any length, (B, 4).
+            shears: target of every ``shear`` stage along x, y [m], (B, 2).
+            twists: target of every ``twist`` stage [rad], (B,).
+
+        Raises:
+            InputError: ``num_envs`` below 1, an argument of another shape, or a quaternion of zeros.
+        """
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
+        self.offsets = per_environment("offsets", offsets, (num_envs, 2))
+        self.depths = None if depths is None else per_environment("depths", depths, (num_envs,))
+        self._shears = None if shears is None else per_environment("shears", shears, (num_envs, 2))
+        self._twists = None if twists is None else per_environment("twists", twists, (num_envs,))
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
+        if rotations is not None:
+            turns = per_environment("rotations", rotations, (num_envs, 4))
+        given = [a for a in (self.offsets, self.depths, self._shears, self._twists, turns) if a is not None]
+        self.lost = ~np.all([np.isfinite(a.reshape(num_envs, -1)).all(axis=1) for a in given], axis=0)
+        turns = np.where(self.lost[:, None], [1.0, 0.0, 0.0, 0.0], turns)
+        zero = ~turns.any(axis=1)
+        if zero.any():
+            rule = f"must not be all 0, in environment {int(zero.argmax())}"
+            raise InputError("rotations", value=turns[zero.argmax()].tolist(), rule=rule)
+        at_rest = np.asarray(scene.object.quaternion, float)
+        self._scene, self._turns = scene, turns
+        own = rotation_of(at_rest / np.linalg.norm(at_rest))
+        self.rotations = own[None].repeat(num_envs, axis=0)
+        if rotations is not None:
+            self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ own
+
+    def stage(self, stage: StageSpec, b: int) -> StageSpec:
+        """A stage as environment ``b`` runs it; the scene's own in an environment that is lost."""
+        if self.lost[b]:
+            return stage
+        if stage.kind == "indent" and stage.depth is not None and self.depths is not None:
+            return replace(stage, depth=float(self.depths[b]))
+        if stage.kind == "shear" and self._shears is not None:
+            return replace(stage, shear=(float(self._shears[b, 0]), float(self._shears[b, 1])))
+        if stage.kind == "twist" and self._twists is not None:
+            return replace(stage, twist=float(self._twists[b]))
+        return stage
+
+    def depth(self, stage: StageSpec) -> np.ndarray:
+        """Where an indent to a depth ends [m], (B,); 0 in an environment that is lost."""
+        return self._sound(np.full(len(self.lost), stage.depth) if self.depths is None else self.depths)
+
+    def shear(self, stage: StageSpec) -> np.ndarray:
+        """Where a shear ends [m], (B, 2)."""
+        return self._sound(np.tile(stage.shear, (len(self.lost), 1)) if self._shears is None else self._shears)
+
+    def twist(self, stage: StageSpec) -> np.ndarray:
+        """Where a twist ends [rad], (B,)."""
+        return self._sound(np.full(len(self.lost), stage.twist) if self._twists is None else self._twists)
+
+    def start_error(self, b: int, error: InputError) -> InputError | SpecError:
+        """``error`` of environment ``b`` at its start, under what it does in its own way, or else the scene's file and key."""
+        own = self._own(b, ())
+        if own is not None:
+            return InputError(own[0], value=own[1], rule=f"in environment {b}, at the start: {error.rule}")
+        place = [float(f"{v * 1e3:.6g}") for v in self._scene.object.position[:2]]
+        return SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place)
+
+    def stage_error(self, index: int, stage: StageSpec, b: int, error: InputError) -> InputError | SpecError:
+        """``error`` of environment ``b`` in a stage, under what it does in its own way, or else the scene's file and key.
+
+        Args:
+            index: the stage's number in the scene, −1 if it is none of the scene's: then ``error`` stays as it is, if nothing is its own.
+            stage: as environment ``b`` runs it.
+            error: of a place (its ``rule`` is a sentence), or of a force or depth (its ``name`` is "force" or "depth [mm]", its rule lacks
+                the subject).
+        """
+        trajectory = self._scene.trajectory
+        behind = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
+        own = self._own(b, [one.kind for one in reversed(behind)])
+        noun, unit = error.name.split()[0], {"force": "N", "depth [mm]": "mm"}.get(error.name)
+        kept = f"the {noun} kept here, {error.value:.4g} {unit}, " if unit and stage.kind != "indent" else ""
+        if error.name == "depth [mm]" and stage.kind == "indent" and self.depths is not None:
+            own = "depths [mm]", error.value
+        if own is not None:
+            subject = kept or (f"the {noun}, {error.value:.4g} {unit}, " if unit and own[0] != "depths [mm]" else "")
+            where = f"trajectory[{index}]" if index >= 0 else f"a further {stage.kind}"
+            return InputError(own[0], value=own[1], rule=f"in environment {b}, in {where}: {subject}{error.rule}")
+        if index < 0:
+            return error
+        if stage.kind == "shear":
+            name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
+        elif stage.kind == "twist":
+            name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
+        else:
+            name, value = {"depth [mm]": "depth_mm"}.get(error.name, "force_n"), error.value
+        return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
+
+    def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
+        """Name and value of what of its own took environment ``b`` where it is: in stages of ``kinds``, last first, then at the start."""
+        given = {"shear": ("shears", self._shears), "twist": ("twists", self._twists)}
+        for name, values in (given[kind] for kind in kinds if kind in given):
+            if values is not None:
+                return name, values[b].tolist()
+        if self.offsets[b].any():
+            return "offsets", self.offsets[b].tolist()
+        return ("rotations", self._turns[b].tolist()) if self._turns[b, 1:].any() else None
+
+    def _sound(self, values: np.ndarray) -> np.ndarray:
+        return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)
+
+
+CLEARANCE = 1e-3
+"""Height above first touch [m] at which an object waits before the press and after a release."""
+MOST_STEPS = 1_000_000
+"""States that a stage can be asked for."""
+_State = TypeVar("_State", bound=ContactState)
+
+
+def scene_parts(scene: PressScene) -> tuple[Part, ...]:
+    """Parts of the scene's object; raises ``SpecError`` with the scene's file and key."""
+    try:
+        return object_parts(scene.object)
+    except MeshError:  # names its own file
+        raise
+    except SpecError as error:
+        raise SpecError(error.rule, file=scene.source, key=error.key, value=error.value, choices=error.choices) from error
+
+
+def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part], depths: np.ndarray | None) -> None:
+    """Refuse stages that no pad of this thickness can follow.
+
+    Raises:
+        SpecError: names the scene's file and key.
+        InputError: ``depths`` [m] deeper than the pad.
+    """
+    thickness = gelpad.thickness
+    within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
+    if scene.trajectory and not parts:
+        rule = "a scene without object must have no trajectory"
+        raise SpecError(rule, file=scene.source, key="object.kind", value=scene.object.kind)
+    for index, stage in enumerate(scene.trajectory):
+        key = f"trajectory[{index}]"
+        if stage.depth is not None and not 0.0 < stage.depth < thickness:
+            raise SpecError(within, file=scene.source, key=f"{key}.depth_mm", value=stage.depth * 1e3)
+    if depths is not None:
+        bad = depths[np.isfinite(depths) & ~((depths > 0.0) & (depths < thickness))]
+        if len(bad):
+            raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
+
+
+def peak_state(scene: PressScene, states: Iterable[_State]) -> _State:
+    """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
+    for state in states:
+        if state.stage == scene.peak_stage and state.fraction == 1.0:
+            return state
+    raise InputError("states", value=scene.peak_stage, rule="hold no state at the end of the scene's peak stage")
+
+
+def per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """``values`` as an array, zeros for None; raises ``InputError`` for another shape, or what is no number."""
+    return np.zeros(shape) if values is None else check_numbers(name, values, shape)
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Rotation by ``angle`` [rad] about z, (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,200 @@
+"""Force against depth for any indenter on the bonded gel layer: the law that MuJoCo's contact is made to follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import PadGrid, rest_height
+from raytac.shapes.part import Part
+from raytac.shapes.underside import object_bounds, object_height
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["FirstTouch", "LoadLaw", "first_touch", "first_touch_z", "gap_at_touch", "layer_stiffening", "reduced_modulus"]
+
+
+_TABLE = 512
+_DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
+"""Depths of the table over the pad's thickness."""
+
+
+def reduced_modulus(gelpad: GelpadSpec) -> float:
+    """E* = E / (1 − ν²) [Pa] of the gel under a rigid indenter."""
+    return gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2)
+
+
+def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
+    """How many times stiffer the bonded layer is than a half-space under a contact of ``radius`` [m].
+
+    From the sphere on a bonded layer, F = F_Hertz Σ c_n χⁿ with χ = √(Rδ) / h (Dimitriadis et al., Biophysical Journal 82, 2002,
+    2798): c₁ = −2α/π, c₂ = 4α²/π², c₃ = −(8/π³)(α³ + 4π²β/15), c₄ = (16α/π⁴)(α³ + 3π²β/5), α and β as below. Its incremental
+    stiffness is 2E*a Σ (1 + n/3) c_n (a/h)ⁿ at a = √(Rδ), and that sum is returned. The series holds for contacts up to about the
+    layer's thickness; beyond, it is held below the stiffness of a layer squeezed without lateral motion, 1 + (π/2)(M/E*)(a/h)
+    with M = E(1 − ν)/((1 + ν)(1 − 2ν)).
+    """
+    nu, ratio = gelpad.poisson_ratio, np.asarray(radius, float) / gelpad.thickness
+    α = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1.0 - nu)
+    β = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1.0 - nu)
+    series = (
+        1.0,
+        -2.0 * α / np.pi,
+        4.0 * α**2 / np.pi**2,
+        -8.0 / np.pi**3 * (α**3 + 4.0 * np.pi**2 / 15.0 * β),
+        16.0 * α / np.pi**4 * (α**3 + 3.0 * np.pi**2 / 5.0 * β),
+    )
+    stiffening = np.zeros_like(ratio)
+    for n in range(len(series) - 1, -1, -1):  # Horner's scheme: powers are dear
+        stiffening = stiffening * ratio + series[n] * (1.0 + n / 3.0)
+    confined = gelpad.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return np.minimum(stiffening, 1.0 + 0.5 * np.pi * confined / reduced_modulus(gelpad) * ratio)
+
+
+class LoadLaw:
+    """Normal force, contact radius and tangential stiffness against depth, from the gap between object and resting gel.
+
+    The incremental stiffness of a contact of area A is dF/dδ = 2 E* √(A/π), exact for every axisymmetric indenter on a half-space
+    (Pharr, Oliver & Brotzen, J. Mater. Res. 7, 1992, 613) and within a few percent for other compact ones; here it is multiplied
+    by ``layer_stiffening``. The area at depth δ is taken as that where the gap is below δ/2. This is exact for a paraboloid
+    (πRδ, so Hertz's law on a half-space) and for a flat punch; a cone comes out with π/4 of Sneddon's force. Separate contacts
+    count as one of the same area. F is strictly increasing in δ and 0 at δ <= 0.
+    """
+
+    def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
+        """``gap`` [m]: distance along z from the resting gel to the object at first touch, any shape, >= 0, ``inf`` where there
+        is none; ``cell_area`` [m²] of one node; ``deepest`` [m]: where there is gel for, at most the pad's thickness."""
+        self._gelpad = gelpad
+        self.deepest = min(deepest, gelpad.thickness)
+        """Greatest depth that a press may have [m]."""
+        self.depth = gelpad.thickness * _DEPTHS
+        """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
+        near = np.sort(gap[gap < 0.5 * gelpad.thickness], axis=None)
+        # Count half a node where the gap reaches the limit, so that the area grows continuously from 0 instead of in steps.
+        counts = np.interp(0.5 * self.depth, near, np.arange(len(near)) + 0.5) if len(near) else np.zeros(_TABLE)
+        self.radius = np.sqrt(np.maximum(counts, 0.5) * cell_area / np.pi)
+        """Contact radius of the table [m]: that of a disc of the contact's area."""
+        stiffness = 2.0 * reduced_modulus(gelpad) * self.radius * layer_stiffening(self.radius, gelpad)
+        steps = 0.5 * (stiffness[1:] + stiffness[:-1]) * np.diff(self.depth)
+        self.table = np.concatenate([[0.0], np.cumsum(steps)])
+        """Normal force of the table [N]."""
+
+    @property
+    def greatest(self) -> float:
+        """Force at the greatest depth [N]."""
+        return self.force(self.deepest)
+
+    def force(self, depth: float) -> float:
+        """Normal force [N] at ``depth`` [m]; 0 out of contact."""
+        return float(np.interp(depth, self.depth, self.table))
+
+    def depth_at(self, force: float) -> float:
+        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is deeper than ``deepest``."""
+        if force > self.greatest:
+            rule = f"would press deeper than the pad is there: at most {self.greatest:.4g} N, {self.deepest * 1e3:.4g} mm deep"
+            raise InputError("force", value=force, rule=rule)
+        return float(np.interp(force, self.table, self.depth))
+
+    @property
+    def thickness(self) -> float:
+        return self._gelpad.thickness
+
+    def secant_stiffness(self, depth: float) -> float:
+        """F / δ [N/m]; at δ <= 0 that of the first entry of the table."""
+        if depth <= self.depth[1]:
+            return float(self.table[1] / self.depth[1])
+        return self.force(depth) / depth
+
+    def contact_radius(self, depth: float) -> float:
+        """Radius [m] of the disc of the contact's area at ``depth`` [m]; 0 out of contact."""
+        return float(np.interp(depth, self.depth, self.radius)) if depth > 0.0 else 0.0
+
+    def shear_stiffness(self, depth: float) -> float:
+        """Tangential force per displacement [N/m]: 8Ga/(2 − ν) of a half-space (Mindlin) plus GA/h of a sheared layer."""
+        a, shear = self.contact_radius(depth), self._shear_modulus
+        return 8.0 * shear * a / (2.0 - self._gelpad.poisson_ratio) + shear * np.pi * a**2 / self.thickness
+
+    def twist_stiffness(self, depth: float) -> float:
+        """Torque per angle [N m/rad]: 16Ga³/3 of a half-space (Reissner and Sagoci) plus GJ/h of a twisted layer."""
+        a, shear = self.contact_radius(depth), self._shear_modulus
+        return 16.0 / 3.0 * shear * a**3 + shear * 0.5 * np.pi * a**4 / self.thickness
+
+    @property
+    def _shear_modulus(self) -> float:
+        return 0.5 * self._gelpad.youngs_modulus / (1.0 + self._gelpad.poisson_ratio)
+
+
+_ZOOMS, _FINE = 4, 17
+
+
+class FirstTouch(NamedTuple):
+    """Where an object first touches the pad."""
+
+    z: float
+    """Height of the object's origin [m], pad frame."""
+    gap: np.ndarray
+    """What ``gap_at_touch`` gives there, (Ny, Nx) [m]."""
+    deepest: float
+    """Travel from there [m] that takes the object's lowest point over the pad to the bonded face: the thickness at the centre of the pad,
+    less on the flanks of the dome."""
+
+
+def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> FirstTouch:
+    """First touch of an object that comes down along −z.
+
+    ``pose`` (4, 4): rotation and x, y of the object in the pad frame; its z is ignored. The touch is at the node of ``grid`` with
+    the least distance between object and gel, refined by zooming in on it (a factor 8, four times), so that the result does not
+    depend on the pitch beyond features that fall between nodes; the lowest point is refined likewise. Raises ``InputError`` if no part is
+    above the pad.
+    """
+    if not parts:
+        raise InputError("parts", value=(), rule="an object without parts cannot touch")
+    above = pose.copy()
+    above[2, 3] = 0.0
+
+    def underside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return object_height(parts, above[None], x, y)[0]
+
+    def gap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return underside(x, y) - rest_height(gelpad, x[None, :], y[:, None])
+
+    gaps = gap(grid.x, grid.y)
+    least = _least(gap, gaps, grid)
+    if not np.isfinite(least):
+        low, high = object_bounds(parts, above)
+        span = f"x {low[0]:.4g}…{high[0]:.4g}, y {low[1]:.4g}…{high[1]:.4g} m"
+        rule = f"no part of the object, which spans {span}, is above a node of the pad"
+        raise InputError("position", value=tuple(above[:2, 3].tolist()), rule=rule)
+    lowest = _least(underside, gaps + grid.rest, grid)
+    return FirstTouch(-least, np.maximum(gaps - least, 0.0), gelpad.thickness + lowest - least)
+
+
+def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> float:
+    """The height alone."""
+    return first_touch(parts, pose, gelpad, grid).z
+
+
+def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.ndarray:
+    """Distance [m] along z from the resting gel to the object at each node, (Ny, Nx), for a pose at first touch; >= 0."""
+    return np.maximum(object_height(parts, pose[None], grid.x, grid.y)[0] - grid.rest, 0.0)
+
+
+def _least(of: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: PadGrid) -> float:
+    """Least value of a function over the pad, which has ``values`` on the grid's nodes: that node is zoomed in on."""
+    x, y, least = grid.x, grid.y, np.inf
+    for zoom in range(_ZOOMS + 1):
+        if zoom:
+            values = of(x, y)
+        j, i = np.unravel_index(np.argmin(values), values.shape)
+        least = min(least, float(values[j, i]))
+        if not np.isfinite(least):
+            break
+        x, y = _around(x, int(i), grid.x), _around(y, int(j), grid.y)
+    return least
+
+
+def _around(nodes: np.ndarray, index: int, pad: np.ndarray) -> np.ndarray:
+    """Finer nodes over the two cells beside one node, kept on the pad."""
+    step = nodes[1] - nodes[0]
+    return np.linspace(max(nodes[index] - step, pad[0]), min(nodes[index] + step, pad[-1]), _FINE)

@@ -1,0 +1,189 @@
+"""How the coat of a pad's mesh gives way to small forces: linear elasticity on the very tetrahedra of the solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from raytac.physics.soft.mesh import PadMesh
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["coat_compliance"]
+
+_SAME_PLACE = 1e-9
+"""Vertices nearer than this are mirror images [m]."""
+_SAME = 1e-9
+"""Relative difference of two stiffnesses that rounding explains."""
+
+
+def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False, along: tuple[int, ...] = (2,)) -> np.ndarray:
+    """Displacement along x, y, z of each coat vertex [m] that 1 N on each gives, shape (A, 3, V, V); small strain, float64.
+
+    Entry (a, c, i, j): component c of vertex i, force on vertex j along the axis ``along[a]`` (0, 1, 2: x, y, z).
+
+    Linear tetrahedra with the gelpad's E and ν, as the solver's neo-Hookean gel has them at small strain, held where the mesh is
+    bonded. ``rollers``: the sides of the pad do not move outwards either (and may slide), as if the pad went on as its own mirror
+    image. The unknowns are eliminated layer by layer from the back (block Gaussian elimination of a block tridiagonal matrix;
+    a layer is what lies equally many edges from the coat). A mesh that is its own mirror image is split into its symmetric
+    and antisymmetric halves first, which is exact and makes the layers half as large for each mirror.
+    """
+    stiffness = _stiffness(mesh.tets.vertices, mesh.tets.tets, gelpad)
+    held = np.zeros((len(mesh.tets.vertices), 3), bool)
+    held[mesh.bonded] = True
+    if rollers:
+        for axis in (0, 1):
+            at = mesh.tets.vertices[:, axis]
+            held[(at <= at.min() + _SAME_PLACE) | (at >= at.max() - _SAME_PLACE), axis] = True
+    layer = _layers(mesh)
+    found = np.zeros((len(along), 3, *(len(mesh.coat_vertices),) * 2))
+    on_coat = np.full(len(mesh.tets.vertices), -1)
+    on_coat[mesh.coat_vertices] = np.arange(len(mesh.coat_vertices))
+    for basis in _halves(mesh, stiffness, held):
+        found += _condensed(stiffness, basis, layer, on_coat, along)
+    for one, axis in zip(found, along, strict=True):
+        one[axis] = 0.5 * (one[axis] + one[axis].T)
+    return found
+
+
+@dataclass(frozen=True)
+class _Sparse:
+    """Entries of a sparse matrix; the same place may occur several times and then adds up."""
+
+    row: np.ndarray
+    column: np.ndarray
+    value: np.ndarray
+    shape: tuple[int, int]
+
+    def times(self, vector: np.ndarray) -> np.ndarray:
+        return np.bincount(self.row, self.value * vector[self.column], self.shape[0])
+
+
+def _stiffness(vertices: np.ndarray, tets: np.ndarray, gelpad: GelpadSpec) -> _Sparse:
+    """Stiffness of linear tetrahedra [N/m] over 3 n unknowns (x, y, z of each vertex in turn)."""
+    young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
+    lame, shear = young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), 0.5 * young / (1.0 + nu)
+    corners = vertices[tets]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    inverse = np.linalg.inv(edges)
+    slope = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # of the four hat functions, (T, 4, 3)
+    outer = slope[:, :, None, :, None] * slope[:, None, :, None, :]
+    block = lame * outer + shear * np.swapaxes(outer, 3, 4)
+    block += shear * np.einsum("tac,tbc->tab", slope, slope)[..., None, None] * np.eye(3)
+    block *= (np.abs(np.linalg.det(edges)) / 6.0)[:, None, None, None, None]
+    unknown = 3 * tets[:, :, None] + np.arange(3)
+    row = np.broadcast_to(unknown[:, :, None, :, None], block.shape).ravel()
+    column = np.broadcast_to(unknown[:, None, :, None, :], block.shape).ravel()
+    n = 3 * len(vertices)
+    place, back = np.unique(row.astype(np.int64) * n + column, return_inverse=True)
+    return _Sparse(place // n, place % n, np.bincount(back, block.ravel()), (n, n))
+
+
+def _layers(mesh: PadMesh) -> np.ndarray:
+    """How many edges each vertex is away from the coat, shape (n,)."""
+    tets = mesh.tets.tets
+    layer = np.full(len(mesh.tets.vertices), -1)
+    layer[mesh.coat_vertices] = 0
+    depth = 0
+    while (layer < 0).any():
+        touched = np.unique(tets[(layer[tets] == depth).any(axis=1)])
+        new = touched[layer[touched] < 0]
+        if len(new) == 0:
+            break
+        depth += 1
+        layer[new] = depth
+    return layer
+
+
+def _halves(mesh: PadMesh, stiffness: _Sparse, held: np.ndarray) -> list[_Sparse]:
+    """Orthonormal bases, one for each kind of symmetry, of the unknowns that are free; columns are sparse, rows are unknowns."""
+    vertices = mesh.tets.vertices
+    n = len(vertices)
+    mirrors = []
+    for axis in (0, 1):
+        image = _mirror_image(vertices, axis)
+        if image is None:
+            continue
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0)
+        where = (3 * image[:, None] + np.arange(3)).ravel()
+        signs = np.tile(sign, n)
+        probe = np.cos(np.arange(3 * n) ** 2 % 1009)
+        one, two = stiffness.times(signs * probe[where]), signs * stiffness.times(probe)[where]
+        if np.abs(one - two).max() <= _SAME * np.abs(one).max() and np.array_equal(held.ravel()[where], held.ravel()):
+            mirrors.append((where, signs))
+    free = np.flatnonzero(~held.ravel())
+    bases = []
+    for parities in product((1.0, -1.0), repeat=len(mirrors)):
+        row, value = free[:, None], np.ones((len(free), 1))
+        for (where, signs), parity in zip(mirrors, parities, strict=True):
+            row, value = np.hstack([row, where[row]]), np.hstack([value, parity * signs[row] * value])
+        # Unknowns that are their own image add up or cancel; an orbit is kept once, by its lowest unknown.
+        order = np.argsort(row, axis=1, kind="stable")
+        row, value = np.take_along_axis(row, order, 1), np.take_along_axis(value, order, 1)
+        row_of, column_of, values = [], [], []
+        keep = row[:, 0] == free
+        row, value = row[keep], value[keep]
+        total = np.stack([np.where(row == row[:, k : k + 1], value, 0.0).sum(axis=1) for k in range(row.shape[1])], axis=1)
+        first = np.hstack([np.ones((len(row), 1), bool), row[:, 1:] != row[:, :-1]])
+        total = np.where(first, total, 0.0)
+        norm = np.linalg.norm(total, axis=1)
+        alive = norm > 0.5
+        row, total = row[alive], total[alive] / norm[alive, None]
+        for k in range(row.shape[1]):
+            there = total[:, k] != 0.0
+            row_of.append(row[there, k])
+            column_of.append(np.flatnonzero(there))
+            values.append(total[there, k])
+        bases.append(_Sparse(np.concatenate(row_of), np.concatenate(column_of), np.concatenate(values), (3 * n, len(row))))
+    return bases
+
+
+def _mirror_image(vertices: np.ndarray, axis: int) -> np.ndarray | None:
+    """Vertex that each vertex is the mirror image of, shape (n,); None if some have none."""
+    mirrored = vertices * np.where(np.arange(3) == axis, -1.0, 1.0)
+    here, there = (np.lexsort(np.round(v / _SAME_PLACE).astype(np.int64).T) for v in (vertices, mirrored))
+    if np.abs(vertices[here] - mirrored[there]).max() > _SAME_PLACE:
+        return None
+    image = np.empty(len(vertices), int)
+    image[there] = here
+    return image
+
+
+def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: np.ndarray, along: tuple[int, ...]) -> np.ndarray:
+    """Share of one half in the coat's compliance, (A, 3, V, V)."""
+    by_row = np.argsort(basis.row, kind="stable")
+    row, column, value = basis.row[by_row], basis.column[by_row], basis.value[by_row]
+    n = stiffness.shape[0]
+    # Within one half every unknown occurs in at most one column.
+    column_of, weight = np.full(n, -1), np.zeros(n)
+    column_of[row], weight[row] = column, value
+    left, right = column_of[stiffness.row], column_of[stiffness.column]
+    used = (left >= 0) & (right >= 0)
+    left, right = left[used], right[used]
+    entry = stiffness.value[used] * weight[stiffness.row[used]] * weight[stiffness.column[used]]
+    depth_of = np.empty(basis.shape[1], int)
+    depth_of[column] = layer[row // 3]
+    place = np.empty(basis.shape[1], int)
+    sizes = np.bincount(depth_of)
+    for depth, size in enumerate(sizes):
+        place[depth_of == depth] = np.arange(size)
+
+    def block(upper: int, lower: int) -> np.ndarray:
+        here = (depth_of[left] == upper) & (depth_of[right] == lower)
+        at = place[left[here]] * sizes[lower] + place[right[here]]
+        return np.bincount(at, entry[here], sizes[upper] * sizes[lower]).reshape(sizes[upper], sizes[lower])
+
+    inverse = np.zeros((0, 0))
+    for depth in range(len(sizes) - 1, -1, -1):
+        here = block(depth, depth)
+        if inverse.size:
+            coupling = block(depth, depth + 1)
+            here -= coupling @ inverse @ coupling.T
+        inverse = np.linalg.inv(here)
+    spread = np.zeros((3, len(np.flatnonzero(on_coat >= 0)), sizes[0]))
+    for axis in range(3):
+        top = np.flatnonzero((column_of >= 0) & (np.arange(n) % 3 == axis) & (on_coat[np.arange(n) // 3] >= 0))
+        spread[axis, on_coat[top // 3], place[column_of[top]]] = weight[top]
+    answers = [inverse @ spread[axis].T for axis in along]
+    return np.stack([[side @ answer for side in spread] for answer in answers])

@@ -1,0 +1,138 @@
+"""The gelpad as tetrahedra: graded towards the contact face and the middle, with mirrored cells that do not lock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import ipc
+from raytac.errors import InputError
+from raytac.gel.coat_mesh import CoatMesh
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["PAD_LEVELS", "PadLevel", "PadMesh", "pad_mesh", "pad_stiffness"]
+
+
+@dataclass(frozen=True)
+class PadLevel:
+    """How finely a pad is cut."""
+
+    cell: float
+    """Mean length of a cell along x and y [m]; the count on each axis is the even number that comes closest."""
+    layers: int
+    spread: float
+    """Length of the outermost cell over that of the innermost, along x and y."""
+    layer_spread: float
+    """Height of the lowest layer over that of the uppermost."""
+    d_hat: float
+    """Distance below which object and coat repel [m]."""
+
+
+PAD_LEVELS = {
+    "coarse": PadLevel(1.6e-3, 3, 2.5, 2.0, 5e-5),
+    "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
+    "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
+}
+"""Names that ``pad=`` accepts; docs/soft-pad.md states the height error of each."""
+
+
+@dataclass(frozen=True)
+class PadMesh:
+    """A pad that can be simulated, pad frame."""
+
+    tets: ipc.TetMesh
+    coat: CoatMesh
+    coat_vertices: np.ndarray
+    """Vertex of ``tets`` under each vertex of ``coat``, shape (V,)."""
+    bonded: np.ndarray
+    """Vertices of ``tets`` that are fixed to the case."""
+    d_hat: float
+    """Distance below which object and coat repel [m]."""
+
+    def __post_init__(self) -> None:
+        if len(self.bonded) == 0:
+            rule = "must name at least one vertex: a pad that nothing holds would be pushed away"
+            raise InputError("bonded", value=[], rule=rule)
+        if len(self.bonded) == len(self.tets.vertices):
+            raise InputError("bonded", value=f"all {len(self.bonded)} vertices", rule="must leave vertices that can move")
+
+
+def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
+    """Cut the gelpad into tetrahedra, six a cell of a grid that follows the dome.
+
+    Cells are mirror images of their neighbours (``ipc.box_mesh``): cut all the same way they would lock where the gel is nearly
+    incompressible (docs/soft-pad.md has the figures).
+
+    Args:
+        gelpad: size, thickness, dome, and what is bonded to the case: the back, or the back and the sides.
+        level: a name of ``PAD_LEVELS``, or a level of one's own.
+
+    Raises:
+        InputError: an unknown level, or one that leaves less than two cells along an axis.
+    """
+    if isinstance(level, str):
+        if level not in PAD_LEVELS:
+            raise InputError("pad", value=level, rule="must be a known level", choices=PAD_LEVELS)
+        level = PAD_LEVELS[level]
+    x, y = (_lines(size, level) for size in gelpad.size)
+    z = -ipc.graded(gelpad.thickness, level.layers, level.layer_spread ** (1.0 / max(level.layers - 1, 1)))[::-1]
+    tets = ipc.box_mesh(x, y, z, cut="mirrored")
+    vertices = tets.vertices.copy()
+    vertices[:, 2] -= gelpad.sag(vertices[:, 0], vertices[:, 1]) * (1.0 + vertices[:, 2] / gelpad.thickness)
+    per_layer = len(x) * len(y)
+    coat_vertices = np.arange(len(vertices) - per_layer, len(vertices))
+    at_back = np.arange(len(vertices)) < per_layer
+    at_side = (np.abs(vertices[:, :2]) >= 0.5 * np.asarray(gelpad.size) * (1.0 - 1e-12)).any(axis=1)
+    bonded = np.flatnonzero(at_back | at_side if gelpad.bonded == "back_and_sides" else at_back)
+    coat = CoatMesh(vertices[coat_vertices], _coat_faces(tets.tets, coat_vertices[0], vertices), x, y)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat)
+
+
+def _lines(size: float, level: PadLevel) -> np.ndarray:
+    """Grid lines across the pad [m], symmetric, finest in the middle; an even number of cells."""
+    half = round(0.5 * size / level.cell)
+    if half < 1:
+        raise InputError("pad", value=level, rule=f"must leave at least two cells over the pad's {size} m")
+    ends = ipc.graded(0.5 * size, half, level.spread ** (1.0 / max(half - 1, 1)))
+    return np.concatenate([-ends[:0:-1], ends])
+
+
+def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarray:
+    """Triangles of the uppermost layer in its own vertex numbers, counter-clockwise seen from +z; shape (F, 3)."""
+    faces = tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    faces = faces[(faces >= first).all(axis=1)]
+    a, b, c = (vertices[faces[:, k], :2] for k in range(3))
+    down = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]) < 0.0
+    faces[down] = faces[down][:, ::-1]
+    return (faces - first).astype(np.int32)
+
+
+_SHEAR_MARGIN = 1.2
+"""The tangential bound is the tightest, and a coarse mesh has more than the continuum."""
+
+
+def pad_stiffness(gelpad: GelpadSpec, area: float) -> np.ndarray:
+    """Bound (6, 6) of dF/dx of a contact of ``area`` [m²] that moves as one, pad axes, about its centre: [N/m], [N m/rad], diagonal.
+
+    The sum of two limits of a rigid flat punch of the same area, a = √(area/π), on a bonded layer of thickness t: one much wider than the
+    layer (all strain confined: modulus M = E (1 − ν) / ((1 + ν)(1 − 2ν)), shear modulus G over the height t) and one much narrower
+    (half-space; K. L. Johnson, *Contact Mechanics*, 1985, for normal, tangential and twisting displacement; a rocking punch).
+
+    ======== ====================== ===============
+    motion   narrow                 wide
+    ======== ====================== ===============
+    normal   2 a E / (1 − ν²)       M A / t
+    tangent  8 a G / (2 − ν)        G A / t
+    rocking  4/3 a³ E / (1 − ν²)    M π a⁴ / (4 t)
+    twist    16/3 G a³              G π a⁴ / (2 t)
+    ======== ====================== ===============
+    """
+    e, nu, t = gelpad.youngs_modulus, gelpad.poisson_ratio, gelpad.thickness
+    shear, confined, plane = e / (2.0 * (1.0 + nu)), e * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu)), e / (1.0 - nu**2)
+    a = float(np.sqrt(area / np.pi))
+    normal = 2.0 * a * plane + confined * area / t
+    tangent = _SHEAR_MARGIN * (8.0 * a * shear / (2.0 - nu) + shear * area / t)
+    rocking = 4.0 / 3.0 * a**3 * plane + confined * np.pi * a**4 / (4.0 * t)
+    twist = _SHEAR_MARGIN * (16.0 / 3.0 * shear * a**3 + shear * np.pi * a**4 / (2.0 * t))
+    return np.diag([tangent, tangent, normal, rocking, rocking, twist])

@@ -1,0 +1,107 @@
+"""Where a press has the object and the case: poses of a batch from first touch, depth, shear and twist."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import PadGrid
+from raytac.physics.press import PressTargets, about_z
+from raytac.physics.rigid.load_law import LoadLaw, first_touch_z, gap_at_touch
+from raytac.shapes.part import Part
+from raytac.specs.press import PressScene
+from raytac.specs.sensor import GelpadSpec
+
+__all__ = ["SoftPlaces"]
+
+
+class SoftPlaces:
+    """Places of one scene's object over one pad, for B environments with their own offsets."""
+
+    def __init__(
+        self, scene: PressScene, parts: Sequence[Part], gelpad: GelpadSpec, grid: PadGrid, targets: PressTargets
+    ) -> None:
+        """Environments that are lost are put at the pad's middle.
+
+        Raises:
+            SpecError: an object that does not start over the pad, or is sheared or twisted off it; names the scene's file and key.
+            InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
+        """
+        self._targets, self._parts, self._gelpad, self._grid = targets, parts, gelpad, grid
+        self._rotations = targets.rotations
+        self._touches: dict[bytes, float] = {}
+        start = np.asarray(scene.object.position[:2])
+        places = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
+        self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(places.tolist())])
+        """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
+        self._check_ways(scene)
+
+    def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
+        poses = np.tile(np.eye(4), (len(height), 1, 1))
+        for b, angle in enumerate(twist):
+            poses[b, :3, :3] = about_z(angle) @ self._rotations[b]
+        poses[:, :3, 3] = self.origin
+        poses[:, :2, 3] += shear
+        poses[:, 2, 3] += height
+        return poses
+
+    def case(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """``world_from_pad`` (B, 4, 4) of a case that moves: the object stays where it is at first touch, as in ``PressRig``."""
+        poses = np.tile(np.eye(4), (len(height), 1, 1))
+        for b, angle in enumerate(twist):
+            turn = about_z(-angle)
+            poses[b, :3, :3] = turn
+            poses[b, :3, 3] = self.origin[b] - turn @ (np.array([*shear[b], height[b]]) + self.origin[b])
+        return poses
+
+    def lift(self, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """How much lower than at the start the pad is first touched after a shear and twist [m], shape (B,)."""
+        return np.array(
+            [
+                at[2] - self._touch(b, at[0] + way[0], at[1] + way[1], angle)
+                for b, (at, way, angle) in enumerate(zip(self.origin, shear, twist, strict=True))
+            ]
+        )
+
+    def stiffness(self, b: int, twist: float, force: float) -> float:
+        """Force over depth [N/m] that the bonded layer's law expects at ``force`` [N]: a start for a search."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
+        law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
+        return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
+
+    def _first(self, b: int, x: float, y: float) -> np.ndarray:
+        try:
+            return np.array([x, y, self._touch(b, x, y, 0.0)])
+        except InputError as error:
+            raise self._targets.start_error(b, error) from error
+
+    def _check_ways(self, scene: PressScene) -> None:
+        """Refuse shears and twists that end off the pad."""
+        targets, shear, twist = self._targets, np.zeros((len(self.origin), 2)), np.zeros(len(self.origin))
+        for index, stage in enumerate(scene.trajectory):
+            if stage.kind not in ("shear", "twist"):
+                continue
+            if stage.kind == "shear":
+                shear = targets.shear(stage)
+            else:
+                twist = targets.twist(stage)
+            for b in np.flatnonzero(~targets.lost).tolist():
+                x, y = self.origin[b, :2] + shear[b]
+                try:
+                    self._touch(b, x, y, twist[b])
+                except InputError as error:
+                    raise targets.stage_error(index, targets.stage(stage, b), b, error) from error
+
+    def _touch(self, b: int, x: float, y: float, twist: float) -> float:
+        """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
+        pose = np.eye(4)
+        pose[:3, :3] = about_z(twist) @ self._rotations[b]
+        pose[:2, 3] = x, y
+        key = pose.tobytes()
+        if key not in self._touches:
+            self._touches[key] = first_touch_z(self._parts, pose, self._gelpad, self._grid)
+        return self._touches[key]

@@ -1,0 +1,178 @@
+"""Write a comparison: report.html, pareto.png, a sheet of images a scene, results.parquet and metrics.json."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+from raytac.io.folder import result_folder
+from raytac.io.metrics import write_metrics
+from raytac.report.compare.metrics import compare_metrics, equal_errors, resolutions, select, summaries
+from raytac.report.compare.modes import FAMILIES
+from raytac.report.compare.run import REGIONS, Comparison
+from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
+
+__all__ = ["FILES", "report_html", "write_comparison", "write_parquet"]
+
+FILES = ("report.html", "pareto.png", "results.parquet", "metrics.json")
+"""Files of every comparison, besides ``sheet_<scene>_<resolution>.png``, ``rows/`` and ``references/``."""
+TEMPLATE = "compare_report.html.j2"
+
+
+def write_comparison(comparison: Comparison, out: Path, wall_s: float) -> list[Path]:
+    """Write all files of the report into ``out`` at once; those of an earlier run are replaced, sheets of other scenes removed.
+
+    Returns the files written. ``wall_s`` is the time of this run.
+    """
+    from raytac.report.compare.figures import write_pareto, write_sheet_of_scene
+
+    earlier = [path.name for path in out.glob("sheet_*.png")] if out.is_dir() else []
+    with result_folder(out, (*FILES, *earlier)) as folder:
+        write_pareto(comparison, folder / "pareto.png")
+        sheets = []
+        for scene, resolution in comparison.references:
+            path = folder / f"sheet_{scene}_{resolution}.png"
+            write_sheet_of_scene(comparison, scene, resolution, path)
+            sheets.append((scene, resolution, path))
+        page = report_html(comparison, folder / "pareto.png", sheets)
+        (folder / "report.html").write_text(page, encoding="utf-8")
+        write_parquet(comparison, folder / "results.parquet")
+        write_metrics(folder / "metrics.json", compare_metrics(comparison) | {"wall_s": wall_s})
+        names = sorted(path.name for path in folder.iterdir())
+    return [out / name for name in names]
+
+
+def write_parquet(comparison: Comparison, path: Path) -> None:
+    """One row per scene, resolution and mode; machine and versions are in the schema's metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = list(dict.fromkeys(name for row in comparison.rows for name in row.figures))
+    fields = [pa.field(name, _column_type(pa, [row.figures.get(name) for row in comparison.rows])) for name in columns]
+    facts = {key: str(value) for key, value in comparison.facts.items()}
+    schema = pa.schema(fields, metadata=facts)
+    pq.write_table(pa.Table.from_pylist([row.figures for row in comparison.rows], schema=schema), str(path))
+
+
+def _column_type(pa: Any, values: list[Any]) -> Any:
+    """Type of a column that may have nulls; a column of nulls alone is a float."""
+    there = [value for value in values if value is not None]
+    for kind, arrow in ((bool, pa.bool_()), (str, pa.string()), (int, pa.int64())):
+        if there and all(isinstance(value, kind) for value in there):
+            return arrow
+    return pa.float64()
+
+
+def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, str, Path]]) -> str:
+    """The page, with its pictures inside; ``sheets`` are (scene, resolution, PNG)."""
+    import jinja2
+
+    rows, settings = comparison.rows, comparison.settings
+    found = summaries(rows)
+    templates = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=templates, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    flip = any(row.figures["frame_flip"] is not None for row in rows)
+    fast = [row.figures for row in rows]
+    noise = list({(f["scene"], f["resolution"]): f for f in fast if f["noise_frame_rmse"] is not None}.values())
+    scenes = ", ".join(Path(scene).stem for scene in settings.scenes)
+    lead = (
+        f"Every optical mode of raytac rendered the same gel surfaces ({scenes}) of the sensor {_sensor(comparison)} in one run on "
+        f"{comparison.device}: how far is each from the converged reference, and what does a frame cost?"
+    )
+    return environment.get_template(TEMPLATE).render(
+        title="Speed against error of the optical modes",
+        lead=lead,
+        quick=settings.quick,
+        pareto=_embedded(pareto),
+        tables=[
+            {
+                "resolution": resolution.replace("x", " × "),
+                "scenes": f"over {scenes}",
+                "summaries": [s for s in found if s.resolution == resolution],
+            }
+            for resolution in resolutions(rows)
+        ],
+        batch=next((s.batch for s in found), 0),
+        flip=flip,
+        errors_wide=4 if flip else 3,
+        any_at_noise=any(s.at_noise for s in found),
+        noise=noise,
+        reference_spp=f"{settings.reference_spp:,}",
+        equal=equal_errors(rows),
+        families=FAMILIES,
+        left_out=comparison.left_out,
+        physics=comparison.physics,
+        markers=comparison.markers,
+        sheets=[{"scene": scene, "resolution": size.replace("x", " × "), "png": _embedded(path)} for scene, size, path in sheets],
+        groups=[
+            {
+                "scene": scene,
+                "resolution": size.replace("x", " × "),
+                "rows": [row.figures for row in chosen],
+                "notes": [(row.figures["label"], row.figures["note"]) for row in chosen if row.figures["note"]],
+            }
+            for scene, size in comparison.references
+            for chosen in [select(rows, scene=scene, resolution=size)]
+        ],
+        regions=REGIONS,
+        terms=_terms(comparison),
+        facts=sorted(comparison.facts.items()),
+    )
+
+
+def _sensor(comparison: Comparison) -> str:
+    return str(comparison.rows[0].figures["sensor"]) if comparison.rows else comparison.settings.sensor
+
+
+def _embedded(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def _terms(comparison: Comparison) -> list[tuple[str, str]]:
+    """Definitions, as in docs/comparison.md."""
+    settings = comparison.settings
+    batch = next((row.figures["batch"] for row in comparison.rows), 0)
+    terms = [
+        (
+            "frame",
+            "From a new gel surface in host memory to the 8-bit image in host memory. Surfaces differ from frame to frame: the press at "
+            "70 to 100 % of its indentation.",
+        ),
+        (
+            "time",
+            f"Median of up to {settings.frames} warm frames, at least three, within {settings.budget_s:g} s; at batch {batch} the time of "
+            "a call over its environments. First image: building the mode and its first frame; kernels may come from a cache on disk.",
+        ),
+        (
+            "reference",
+            f"The path tracer `reference` at {settings.reference_spp:,} samples a pixel without limit of depth, in two independent halves.",
+        ),
+        (
+            "images",
+            "8-bit RGB after the sensor's response (gamma included), as a camera delivers them. All figures are taken on these values.",
+        ),
+        ("MAE, RMSE", "Mean absolute and root mean square difference over pixels and channels, in levels of 255."),
+        ("PSNR", "20 log10(255 / RMSE) [dB]."),
+        (
+            "SSIM",
+            "Wang et al. 2004: Gaussian window of 11 pixels (sigma 1.5), K1 = 0.01, K2 = 0.03, L = 255, population covariance, each "
+            "channel by itself, then the mean; pixels within 5 of the edge are left out.",
+        ),
+    ]
+    if has_flip():
+        text = f"LDR-FLIP (Andersson et al. 2020) at {FLIP_PPD:.2f} pixels per degree, values read as sRGB; mean over pixels."
+        terms.append(("FLIP", text))
+    else:
+        terms.append(("FLIP", "Left out: the package flip-evaluator is not installed."))
+    return [
+        *terms,
+        ("contact", "Pixels in which the camera sees gel that the object touches."),
+        ("shadow ring", f"Pixels outside the contact and at most {1e3 * RING_WIDTH:g} mm from it, measured on the gel plane."),
+        ("box", "Bounding box of the contact."),
+        (
+            "memory",
+            "Peak of Dr.Jit's arrays during a frame of one environment, and what each further one adds at the batch above; acceleration "
+            "structures of the ray tracer are not counted.",
+        ),
+    ]

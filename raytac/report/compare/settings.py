@@ -1,0 +1,100 @@
+"""What ``raytac compare`` compares, and what it refuses before anything is computed."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from raytac.errors import BackendError, InputError
+from raytac.markers.fots import marker_motion_of
+from raytac.physics.soft.availability import check_solver
+from raytac.report.image_error import SSIM_BORDER
+from raytac.sensor import LARGEST_SIDE
+from raytac.specs import PADS, load_press, load_sensor, validate_press
+
+__all__ = ["SPP", "CompareSettings"]
+
+SPP = (1, 4, 16, 64)
+"""Samples a pixel of the sampled modes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings:
+    """What to compare."""
+
+    sensor: str = "gelsight_mini"
+    scenes: tuple[str, ...] = ("sphere", "coin", "pins")
+    resolutions: tuple[tuple[int, int], ...] = ((320, 240),)
+    """(width, height) of the images [px]."""
+    device: str = "auto"
+    seed: int = 0
+    reference_spp: int = 1024
+    """Samples a pixel of the reference, half of them in each of its halves."""
+    spp: tuple[int, ...] = SPP
+    """Samples a pixel at which the sampled modes are measured."""
+    batch: int | None = None
+    """Environments of the batched timing; None is ``compare.BATCH`` of the device."""
+    frames: int = 60
+    """Timed frames a figure, fewer for a mode that would need more than ``budget_s``."""
+    budget_s: float = 10.0
+    """Longest time for one timing [s], as far as three frames allow."""
+    quick: bool = False
+    """Fewer modes."""
+    pad: str | None = None
+    """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
+    markers: bool = False
+    """Measure the marker models against surface tracking too, on the simulated pad of level ``pad``, else ``marker_error.PAD``."""
+
+    def quickened(self) -> CompareSettings:
+        """The first scene at 80 x 60 pixels with few samples, frames and modes."""
+        small = {"scenes": self.scenes[:1], "resolutions": ((80, 60),), "reference_spp": 32, "spp": (1, 4), "batch": 2}
+        return replace(self, **small, frames=3, budget_s=0.5, quick=True)
+
+    def check(self) -> None:
+        """Refuse what cannot be run, before anything is computed or written.
+
+        Raises:
+            InputError: a number or a resolution out of range, two scenes of one name, or a sensor without the marker motion that
+                ``markers`` needs.
+            SpecError: an unknown sensor or scene, or a file that breaks a rule.
+            BackendError: a package of the ``report`` extra is missing, or the solver's where ``pad`` or ``markers`` need it.
+        """
+        for name, value, lowest in (
+            ("reference spp", self.reference_spp, 2),
+            ("frames", self.frames, 3),
+            ("batch", 2 if self.batch is None else self.batch, 2),
+            ("spp", min(self.spp, default=0), 1),
+        ):
+            if value < lowest:
+                raise InputError(name, value=value, rule=f"must be at least {lowest}")
+        if self.pad is not None and self.pad not in PADS:
+            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
+        if not self.budget_s > 0:
+            raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
+        if not 0 <= self.seed < 2**32:
+            raise InputError("seed", value=self.seed, rule="must be a whole number in [0, 2^32)")
+        for size in self.resolutions:
+            if min(size) <= 2 * SSIM_BORDER or max(size) > LARGEST_SIDE:
+                rule = f"must have sides from {2 * SSIM_BORDER + 1} (the window of SSIM) to {LARGEST_SIDE} pixels"
+                raise InputError("resolution", value=f"{size[0]}x{size[1]}", rule=rule)
+        if not self.resolutions or not self.scenes:
+            raise InputError("scenes, resolutions", value=(self.scenes, self.resolutions), rule="must name at least one each")
+        stems = [Path(scene).stem for scene in self.scenes]
+        if len(set(stems)) < len(stems):
+            raise InputError("scenes", value=self.scenes, rule="must have different names, since rows are named after them")
+        spec = load_sensor(self.sensor)
+        if self.markers:
+            marker_motion_of(spec)
+        for scene in self.scenes:
+            validate_press(spec, load_press(scene))
+        missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
+        if missing:
+            raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
+        if self.uses_solver:
+            check_solver("a comparison with pad or markers")
+
+    @property
+    def uses_solver(self) -> bool:
+        """Whether anything is pressed into the simulated pad."""
+        return self.markers or self.pad is not None

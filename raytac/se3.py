@@ -1,0 +1,144 @@
+"""Rotations and rigid transforms of a batch: matrices, quaternions, rotation vectors, and checks of poses that users give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from raytac.errors import InputError
+
+__all__ = [
+    "batch_of",
+    "between",
+    "inverse",
+    "nearest_rotation",
+    "quaternion",
+    "quaternions",
+    "rigid_poses",
+    "rotation_of",
+    "rotation_vector",
+    "rotations",
+    "turn_angle",
+]
+
+
+def rotation_of(quaternion: ArrayLike) -> np.ndarray:
+    """Rotation matrices (…, 3, 3) of unit quaternions wxyz (…, 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, float), -1, 0)
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    rows = (
+        (ww + xx - yy - zz, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), ww - xx + yy - zz, 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), ww - xx - yy + zz),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternions(poses: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz of poses (B, 4, 4), shape (B, 4)."""
+    return quaternion(poses[:, :3, :3])
+
+
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """log R (…, 3) [rad] of rotation matrices (…, 3, 3), at most π long."""
+    q = quaternion(rotation)
+    q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
+    sine = np.sqrt(np.square(q[..., 1:]).sum(axis=-1, keepdims=True))
+    # θ / sin(θ/2), 2 where there is no turn
+    factor = np.where(sine > 0.0, 2.0 * np.arctan2(sine, q[..., :1]) / np.where(sine > 0.0, sine, 1.0), 2.0)
+    return factor * q[..., 1:]
+
+
+def quaternion(r: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz (…, 4) of rotation matrices (…, 3, 3).
+
+    The component is rooted that is greatest (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so that
+    they are as accurate at no turn as at half a turn.
+    """
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    x, y, z = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    xy, yz, zx = r[..., 0, 1] + r[..., 1, 0], r[..., 1, 2] + r[..., 2, 1], r[..., 2, 0] + r[..., 0, 2]
+    # Row k is the quaternion (w, x, y, z) times four times its k-th component.
+    rows = (
+        (1.0 + xx + yy + zz, x, y, z),
+        (x, 1.0 + xx - yy - zz, xy, zx),
+        (y, xy, 1.0 - xx + yy - zz, yz),
+        (z, zx, yz, 1.0 - xx - yy + zz),
+    )
+    products = np.stack([entry for row in rows for entry in row], axis=-1).reshape(*x.shape, 4, 4)
+    greatest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    q = np.take_along_axis(products, greatest[..., None, None], axis=-2)[..., 0, :]
+    return q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
+
+
+def inverse(poses: np.ndarray) -> np.ndarray:
+    """Inverses of rigid transforms (…, 4, 4)."""
+    found = np.zeros_like(poses)
+    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
+    found[..., :3, :3] = turned
+    found[..., :3, 3] = -(turned @ poses[..., :3, 3, None])[..., 0]
+    found[..., 3, 3] = 1.0
+    return found
+
+
+def turn_angle(rotations: np.ndarray) -> np.ndarray:
+    """Angles [rad] in [0, π] of rotation matrices (…, 3, 3), accurate for small turns too."""
+    antisymmetric = rotations - np.swapaxes(rotations, -1, -2)
+    sine = 0.5 * np.sqrt(0.5 * (antisymmetric**2).sum(axis=(-1, -2)))
+    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
+
+
+def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+    """Poses (B, 4, 4) a ``share`` of the way: positions along the line, rotations along the shorter arc (slerp)."""
+    if share <= 0.0 or share >= 1.0:
+        return (start if share <= 0.0 else end).copy()
+    a, b = quaternions(start), quaternions(end)
+    cosine = (a * b).sum(axis=1, keepdims=True)
+    b = np.where(cosine < 0.0, -b, b)
+    half = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    small = half < 1e-6
+    sine = np.where(small, 1.0, np.sin(half))
+    q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
+    found = np.tile(np.eye(4), (len(start), 1, 1))
+    found[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
+    found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
+    return found
+
+
+def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
+    """The rotations closest to matrices (…, 3, 3) in the Frobenius norm: the orthogonal factors of their polar decompositions."""
+    u, _, v = np.linalg.svd(matrices)
+    mirrored = np.linalg.det(u @ v) < 0.0
+    u[mirrored, :, 2] *= -1.0
+    return u @ v
+
+
+def rotations(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3) [rad] (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    half = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 − cos a)/a²
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross
+
+
+def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
+    """Environments that poses with a first axis speak of; 1 if none has one."""
+    given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
+    given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
+    return given[0][0] if given else 1
+
+
+def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = None) -> np.ndarray:
+    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis; raises ``InputError``."""
+    array = np.asarray(values, float)
+    shape = (4, 4) if count is None else (count, 4, 4)
+    if array.shape not in (shape, (batch, *shape)):
+        raise InputError(what, value=array.shape, rule=f"must have shape {shape} or {(batch, *shape)}")
+    off = np.abs(np.swapaxes(array[..., :3, :3], -1, -2) @ array[..., :3, :3] - np.eye(3)).max(initial=0.0)
+    if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
+        raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
+    return np.broadcast_to(array, (batch, *shape)).copy()

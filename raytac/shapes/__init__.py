@@ -1,0 +1,5 @@
+"""Shapes of objects: primitives, meshes and reliefs as parts, their undersides and their surfaces."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

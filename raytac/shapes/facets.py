@@ -1,0 +1,43 @@
+"""How finely curved parts and reliefs are cut into facets, for a solver that collides triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.shapes.part import Part
+
+__all__ = ["SAG", "around", "coarse_relief", "grid_facets"]
+
+SAG = 2e-6
+"""How far a facet may lie inside a curved part [m]: far below what a pad's own triangles miss."""
+_FEWEST, _MOST = 16, 256
+"""Facets around a circle."""
+_RELIEF_SPACING = 0.2e-3
+"""Spacing of a relief's facets [m]: below the cells of the finest pad, since the map's own would be half a million."""
+_RELIEF_SHARE = 0.04
+"""Most that this spacing may be of a relief's half width: a small coin's rim is 0.15 radii wide."""
+
+
+def around(radius: float, sag: float) -> int:
+    """Facets around a circle [m], a multiple of 4 so that the polygon is symmetric as the circle is."""
+    steps = np.pi / np.arccos(1.0 - min(sag / radius, 0.5))
+    return 4 * int(np.clip(np.ceil(steps / 4.0), _FEWEST // 4, _MOST // 4))
+
+
+def coarse_relief(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (n,) [m] along both axes and elevation (n, n) [m] of a relief's map, read at a wider spacing, with a margin of 0."""
+    assert part.elevation is not None
+    half_width, data = part.size[0], part.elevation
+    spacing = 2.0 * half_width / (len(data) - 1)
+    step = max(int(min(_RELIEF_SPACING, _RELIEF_SHARE * half_width) / spacing), 1)
+    taken = data[::step, ::step]
+    elevation = np.zeros((len(taken) + 2,) * 2)
+    elevation[1:-1, 1:-1] = taken
+    return step * spacing * (np.arange(len(elevation)) - 1) - half_width, elevation
+
+
+def grid_facets(n: int) -> np.ndarray:
+    """Triangles (2 (n − 1)², 3) of a grid of n × n nodes, rows along y, that look to −z."""
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (cut.ravel() for cut in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    return np.concatenate([np.stack([a, d, b], 1), np.stack([a, c, d], 1)])

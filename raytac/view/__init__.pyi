@@ -1,0 +1,2 @@
+from .press_session import PressSession as PressSession
+from .viewer import Viewer as Viewer

@@ -1,0 +1,4 @@
+from .scene_camera import SceneCamera as SceneCamera
+from .state import WorldState as WorldState
+from .variation import Variation as Variation
+from .world import TactileWorld as TactileWorld

@@ -1,0 +1,48 @@
+"""Public names: each package lists them, they are imported when first used, and documents and scripts use no others."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import raytac
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ["raytac", *(f"raytac.{module.name}" for module in pkgutil.iter_modules(raytac.__path__) if module.ispkg)]
+USERS = [
+    ROOT / "README.md",
+    *(path for folder in ("docs", "scenes", "lights") for path in sorted((ROOT / folder).rglob("*.md"))),
+    *(path for folder in ("experiments", "examples") for path in sorted((ROOT / folder).rglob("*.py"))),
+]
+DEEP = re.compile(r"^\s*(?:from|import) (raytac\.\w+\.[\w.]+)", re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_can_be_imported(name: str) -> None:
+    package = importlib.import_module(name)
+    assert package.__all__
+    assert [public for public in package.__all__ if not hasattr(package, public)] == []
+    with pytest.raises(AttributeError, match="no_such_name"):
+        getattr(package, "no_such_name")  # noqa: B009 (a type checker would refuse the attribute itself)
+
+
+def test_importing_the_package_loads_no_part_of_it() -> None:
+    code = "import sys, raytac; print(*sorted(m for m in sys.modules if m.startswith(('raytac.', 'numpy', 'mujoco', 'drjit', 'warp'))))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["raytac.installation"]
+
+
+@pytest.mark.parametrize("path", USERS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_documents_and_scripts_import_public_names_only(path: Path) -> None:
+    assert DEEP.findall(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_deep_import_would_be_seen() -> None:
+    assert DEEP.findall("    from raytac.gel.surface import GelSurface") == ["raytac.gel.surface"]
+    assert not DEEP.findall("from raytac.gel import GelSurface\nimport raytac.gel")
