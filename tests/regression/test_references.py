@@ -21,14 +21,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from raytac.frame import TactileFrame
+from raytac import TactileFrame, TactileSensor, load_press, load_sensor
 from raytac.io.png import read_png, write_png
-from raytac.optics.mlp_weights import INPUTS, MlpWeights
-from raytac.optics.table import PolyTable, ShadowTable
-from raytac.sensor import TactileSensor
-from raytac.sensor.contact_width import NarrowContactWarning
-from raytac.specs import load_press, load_sensor
-from raytac.specs.press import StageSpec
+from raytac.optics.image.mlp_weights import INPUTS, MlpWeights
+from raytac.optics.taxim.table import PolyTable, ShadowTable
+from raytac.physics.soft.contact_width import NarrowContactWarning
+from raytac.specs import StageSpec
 
 STORED = Path(__file__).parent
 SENSOR = "gelsight_mini"
