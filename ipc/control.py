@@ -444,29 +444,10 @@ def choose_good(d: Decisions):
     """Environments that failed go back to where the step began, their frames too."""
     env = wp.tid()
     d.good[env] = d.alive[env] * (1 - d.failed[env])
+    d.converged[env] = d.converged[env] * d.good[env]
     d.taken[env] = d.failed[env]
     if d.failed[env] != 0:
         d.share[env] = wp.float64(0.0)
-
-
-@wp.kernel
-def end_step(second: wp.int32, d: Decisions, second_order: wp.array(dtype=wp.int32)):
-    """Environments with a new state have a history from now on."""
-    env = wp.tid()
-    d.converged[env] = d.converged[env] * d.good[env]
-    if second != 0 and d.good[env] != 0:
-        second_order[env] = 1
-
-
-@wp.kernel
-def scale_inertia(dt: wp.float64, second: wp.int32, second_order: wp.array(dtype=wp.int32), scale: wp.array(dtype=wp.float64)):
-    """1/h², or 9/4 of it with a history (BDF2)."""
-    env = wp.tid()
-    if second == 0:
-        second_order[env] = 0
-    scale[env] = wp.float64(1.0) / (dt * dt)
-    if second_order[env] != 0:
-        scale[env] = scale[env] * (wp.float64(9.0) / wp.float64(4.0))
 
 
 class Control:

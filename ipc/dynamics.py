@@ -1,7 +1,6 @@
 """Frames, inertia and the way between nodes (unknowns, in their body's frame) and vertices (surface points, in the world).
 
-Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n + h v_n + h² a. BDF2 has x̃ = (4 x_n − x_{n−1})/3 +
-(8 v_n − 2 v_{n−1}) h/9 + (4/9) h² a and h² → (4/9) h²; then v_{n+1} = (3 x_{n+1} − 4 x_n + x_{n−1})/(2h).
+Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n + h v_n + h² a.
 Because a frame's rotation keeps lengths, the same energy holds in frame coordinates with ỹ = Rᵀ(x̃ − t): no fictitious forces, and a
 bonded vertex is a constant.
 """
@@ -135,9 +134,6 @@ def node_world(
 def predict(
     xw: wp.array2d(dtype=wp.vec3d),
     v: wp.array2d(dtype=wp.vec3d),
-    xw_before: wp.array2d(dtype=wp.vec3d),
-    v_before: wp.array2d(dtype=wp.vec3d),
-    second_order: wp.array(dtype=wp.int32),
     acceleration: wp.array(dtype=wp.vec3d),
     h: wp.float64,
     # outputs
@@ -145,16 +141,7 @@ def predict(
 ):
     """x̃ of the nodes, world frame."""
     env, i = wp.tid()
-    if second_order[env] != 0:
-        a, b = wp.float64(1.0) / wp.float64(3.0), wp.float64(2.0) / wp.float64(9.0)
-        four = wp.float64(4.0)
-        target[env, i] = (
-            a * (four * xw[env, i] - xw_before[env, i])
-            + (b * h) * (four * v[env, i] - v_before[env, i])
-            + (four / wp.float64(9.0) * h * h) * acceleration[env]
-        )
-    else:
-        target[env, i] = xw[env, i] + h * v[env, i] + h * h * acceleration[env]
+    target[env, i] = xw[env, i] + h * v[env, i] + h * h * acceleration[env]
 
 
 @wp.kernel
@@ -184,7 +171,7 @@ def node_gradient(
     col: wp.array(dtype=wp.int32),
     mass: wp.array(dtype=wp.float64),
     drag: wp.array(dtype=wp.float64),
-    inertia_scale: wp.array(dtype=wp.float64),
+    inertia_scale: wp.float64,
     vert_gradient: wp.array2d(dtype=wp.vec3d),
     R: wp.array2d(dtype=wp.mat33d),
     node_body: wp.array(dtype=wp.int32),
@@ -210,7 +197,7 @@ def node_gradient(
     for k in range(row_start[i], row_start[i + 1]):
         j = col[k]
         if mass[k] != wp.float64(0.0):
-            g += (mass[k] * inertia_scale[env]) * (y[env, j] - local_target[env, j]) + drag[k] * (y[env, j] - local_start[env, j])
+            g += (mass[k] * inertia_scale) * (y[env, j] - local_target[env, j]) + drag[k] * (y[env, j] - local_start[env, j])
     contact = wp.vec3d()
     for k in range(node_vert_start[i], node_vert_start[i + 1]):
         contact += node_vert_weight[k] * vert_gradient[env, node_vert[k]]
@@ -233,7 +220,7 @@ def inertia_change(
     col: wp.array(dtype=wp.int32),
     mass: wp.array(dtype=wp.float64),
     drag: wp.array(dtype=wp.float64),
-    inertia_scale: wp.array(dtype=wp.float64),
+    inertia_scale: wp.float64,
     active: wp.array(dtype=wp.int32),
     # outputs
     change: wp.array2d(dtype=wp.float64),
@@ -248,7 +235,7 @@ def inertia_change(
         j = col[k]
         if mass[k] != wp.float64(0.0):
             mean = half * (y0[env, j] + y1[env, j])
-            f += (mass[k] * inertia_scale[env]) * (mean - local_target[env, j]) + drag[k] * (mean - local_start[env, j])
+            f += (mass[k] * inertia_scale) * (mean - local_target[env, j]) + drag[k] * (mean - local_start[env, j])
     change[env, i] = wp.dot(y1[env, i] - y0[env, i], f)
 
 
@@ -256,23 +243,14 @@ def inertia_change(
 def new_velocity(
     xw_new: wp.array2d(dtype=wp.vec3d),
     xw: wp.array2d(dtype=wp.vec3d),
-    xw_before: wp.array2d(dtype=wp.vec3d),
-    second_order: wp.array(dtype=wp.int32),
     h: wp.float64,
     active: wp.array(dtype=wp.int32),
     # outputs
     v: wp.array2d(dtype=wp.vec3d),
-    v_before: wp.array2d(dtype=wp.vec3d),
 ):
     """Velocities at the end of the step, world frame."""
     env, i = wp.tid()
-    if active[env] == 0:
-        return
-    v_before[env, i] = v[env, i]
-    if second_order[env] != 0:
-        three, four, two = wp.float64(3.0), wp.float64(4.0), wp.float64(2.0)
-        v[env, i] = (three * xw_new[env, i] - four * xw[env, i] + xw_before[env, i]) / (two * h)
-    else:
+    if active[env] != 0:
         v[env, i] = (xw_new[env, i] - xw[env, i]) / h
 
 

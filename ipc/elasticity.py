@@ -248,7 +248,7 @@ def block_hessian(
     lam: wp.array(dtype=wp.float64),
     mass: wp.array(dtype=wp.float64),
     drag: wp.array(dtype=wp.float64),
-    inertia_scale: wp.array(dtype=wp.float64),
+    inertia_scale: wp.float64,
     el_F: wp.array2d(dtype=wp.mat33d),
     el_mck: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
@@ -264,7 +264,7 @@ def block_hessian(
         return
     k = upper[u, 0]
     one = wp.identity(n=3, dtype=wp.float64)
-    H = (mass[k] * inertia_scale[env] + drag[k]) * one
+    H = (mass[k] * inertia_scale + drag[k]) * one
     for s in range(part_start[k], part_start[k + 1]):
         e = part[s] / 16
         code = part[s] - 16 * e

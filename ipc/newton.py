@@ -128,7 +128,7 @@ class Newton:
         wp.capture_if(ctl.flags.done, self._end)
 
     def _begin(self) -> None:
-        pot, ctl, settings = self.potential, self.control, self.settings
+        pot, ctl = self.potential, self.control
         inputs = [pot.frame_q, pot.frame_p, pot.goal_q, pot.goal_p, pot.frame_moves]
         pot.launch(dynamics.compare_frames, self.batch, inputs, [ctl.decisions.share])
         ctl.launch(control.start_step, self._friction)
@@ -138,9 +138,6 @@ class Newton:
         wp.copy(pot.x_start, pot.x)
         wp.copy(pot.y_start, pot.y)
         pot.place_nodes(pot.xw)
-        second = int(settings.integrator == "bdf2")
-        inputs = [pot.dt, second, pot.second_order]
-        pot.launch(control.scale_inertia, self.batch, inputs, [pot.inertia_scale])
         pot.aim()
         pot.aim_inertia(pot.R, pot.t)
         pot.measure_reach()
@@ -283,16 +280,11 @@ class Newton:
     def _end(self) -> None:
         """Velocities, and frames where the next step begins; environments that failed go back to where they were."""
         pot, ctl = self.potential, self.control
-        d, dt = ctl.decisions, pot.dt
+        d = ctl.decisions
         with self._stage("end"):
             pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.taken], [pot.y])
             pot.place_nodes(pot.xw1)
-            inputs = [pot.xw1, pot.xw, pot.xw_before, pot.second_order, dt, d.good]
-            pot.launch(dynamics.new_velocity, pot.xw.shape, inputs, [pot.v, pot.v_before])
-            pot.launch(dynamics.take, pot.xw.shape, [pot.xw, d.good], [pot.xw_before])
-            pot.launch(dynamics.take, pot.xw.shape, [pot.xw1, d.good], [pot.xw])
-            second = int(self.settings.integrator == "bdf2")
-            pot.launch(control.end_step, self.batch, [second, d], [pot.second_order])
+            pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
             pot.set_frames(d.share, pot.R, pot.t)
             pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
             wp.copy(pot.frame_q, pot.now_q)

@@ -47,7 +47,7 @@ class RestPatches:
         if size > MAX_ENTRIES:
             rule = f"the inverse of its rest matrix would have {size} numbers, at most {MAX_ENTRIES}; cut it more coarsely"
             raise IpcError(f"{name!r} has {len(nodes)} free vertices, too many to tell how stiffly it is held: {rule}")
-        blocks = rest_blocks(layout, replace(settings, dt=_STATIC, integrator="euler"))
+        blocks = rest_blocks(layout, replace(settings, dt=_STATIC))
         try:
             self._inner = condense(layout, blocks, nodes, label)
         except np.linalg.LinAlgError as error:

@@ -88,8 +88,6 @@ class Potential:
 
         # State: node positions in their bodies' frames, world velocities, frames where they are and where they shall go.
         self.y, self.v = vectors(nodes), vectors(nodes)
-        self.xw, self.xw_before, self.v_before = vectors(nodes), vectors(nodes), vectors(nodes)
-        self.second_order = wp.zeros(batch, dtype=wp.int32, device=device)
         self.frame_q, self.goal_q, self.now_q = (wp.zeros((batch, frames), dtype=wp.quatd, device=device) for _ in range(3))
         self.frame_p, self.goal_p = vectors(frames), vectors(frames)
         self.R, self.R1, self.t, self.t1 = matrices(frames), matrices(frames), vectors(frames), vectors(frames)
@@ -100,11 +98,11 @@ class Potential:
         self.x, self.x1, self.dx, self.x_start, self.vert_gradient = (vectors(verts) for _ in range(5))
         self.y_start, self.y1, self.p, self.lift = (vectors(nodes) for _ in range(4))
         self.gradient, self.residual, self.right_side = (vectors(nodes) for _ in range(3))
-        self.target, self.local_target, self.local_start, self.xw1 = (vectors(nodes) for _ in range(4))
+        self.xw, self.xw1, self.target, self.local_target, self.local_start = (vectors(nodes) for _ in range(5))
         self.el_F, self.el_P, self.el_mck = matrices(elements), matrices(elements), vectors(elements)
         self.el_J, self.el_energy, self.el_change, self.el_J1 = (numbers(batch, elements) for _ in range(4))
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
-        self.inertia_scale, self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(5))
+        self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
@@ -127,6 +125,11 @@ class Potential:
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs or [], device=self.device)
+
+    @property
+    def inertia_scale(self) -> float:
+        """1/h² [1/s²]."""
+        return 1.0 / (self.dt * self.dt)
 
     @property
     def friction_eps(self) -> float:
@@ -166,8 +169,7 @@ class Potential:
 
     def aim(self) -> None:
         """x̃ from the start of the step."""
-        inputs = [self.xw, self.v, self.xw_before, self.v_before, self.second_order, self.acceleration, self.dt]
-        self.launch(dynamics.predict, self.xw.shape, inputs, [self.target])
+        self.launch(dynamics.predict, self.xw.shape, [self.xw, self.v, self.acceleration, self.dt], [self.target])
         if self.driven:
             self.launch(dynamics.aim_bodies, self.xw.shape, [self.goal_q, self.goal_p, *self.drive], [self.target])
 

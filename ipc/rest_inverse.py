@@ -254,7 +254,7 @@ class RestInverse:
 
     Args:
         layout: with a bonded body at least.
-        settings: time step and integrator.
+        settings: time step.
         batch: number of environments.
         lanes: threads that share the contact rows of an environment.
         device: Warp device.

@@ -33,11 +33,7 @@ def free_nodes(layout: Layout, body: int) -> Ints:
 
 
 def rest_blocks(layout: Layout, settings: Settings) -> Floats:
-    """Blocks of K_0 [N/m] in the pattern of the layout, shape (K, 3, 3); those of affine bodies mean nothing.
-
-    BDF2 weighs inertia by 9/4 (``ipc/dynamics.py``), except in first steps; its matrix stands for both, and is within that factor.
-    """
-    scale = (2.25 if settings.integrator == "bdf2" else 1.0) / settings.dt**2
+    """Blocks of K_0 [N/m] in the pattern of the layout, shape (K, 3, 3); those of affine bodies mean nothing."""
     log = (layout.model == 1)[:, None, None]
     mu, lam = layout.mu[:, None, None], layout.lam[:, None, None]
     m, k = np.where(log, 0.75 * mu, mu), np.where(log, mu / 8, 0.0)
@@ -52,7 +48,7 @@ def rest_blocks(layout: Layout, settings: Settings) -> Floats:
     which = np.repeat(np.arange(len(layout.col)), np.diff(layout.part_start))
     sums = [np.bincount(which, weights=parts[:, c], minlength=len(layout.col)) for c in range(9)]
     blocks = np.stack(sums, axis=1).reshape(-1, 3, 3)
-    inertia = scale * layout.mass
+    inertia = 1.0 / settings.dt**2 * layout.mass
     rows = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start))
     inertia[rows == layout.col] += layout.node_damping / settings.dt
     return blocks + inertia[:, None, None] * eye

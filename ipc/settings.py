@@ -18,7 +18,6 @@ class Settings:
     Attributes:
         dt: time step h [s].
         gravity: acceleration [m/s²], world frame.
-        integrator: ``"euler"`` (backward Euler) or ``"bdf2"`` (second order; its first step, and the one after a reset, is Euler).
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
         max_newton: Newton iterations a step; reaching it is reported, and the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
@@ -44,7 +43,6 @@ class Settings:
 
     dt: float = 0.01
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    integrator: Literal["euler", "bdf2"] = "euler"
     velocity_tolerance: float = 1e-4
     max_newton: int = 100
     d_hat: float | None = None
@@ -79,8 +77,6 @@ class Settings:
             raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
         if self.friction_relags < 0:
             raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
-        if self.integrator not in ("euler", "bdf2"):
-            raise IpcError(f"integrator = {self.integrator!r}: choose 'euler' or 'bdf2'")
         if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):
             raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'block_jacobi' or 'rest_inverse'")
         if self.broad_phase not in ("auto", "lists", "bvh"):

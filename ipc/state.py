@@ -21,21 +21,16 @@ class State:
 
     Attributes:
         y: node positions in their body's frame [m] (B, N, 3).
-        velocity, velocity_before: node velocities, world frame [m/s] (B, N, 3).
-        position_before: node positions one step earlier, world frame [m] (B, N, 3).
+        velocity: node velocities, world frame [m/s] (B, N, 3).
         frame_rotation, frame_position: frames of bodies, grips and aims, quaternion (w, x, y, z) (B, frames, 4) and [m] (B, frames, 3).
-        second_order: BDF2 has a history (B,).
         kappa: [Pa] (B,).
         failed: (B,).
     """
 
     y: Floats
     velocity: Floats
-    velocity_before: Floats
-    position_before: Floats
     frame_rotation: Floats
     frame_position: Floats
-    second_order: NDArray[np.int32]
     kappa: Floats
     failed: NDArray[np.bool_]
 
@@ -47,11 +42,8 @@ def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
     return State(
         y=nodes.copy(),
         velocity=np.zeros(nodes.shape),
-        velocity_before=np.zeros(nodes.shape),
-        position_before=np.zeros(nodes.shape),
         frame_rotation=np.broadcast_to(frames[:, 3:], (num_envs, len(frames), 4)).copy(),
         frame_position=np.broadcast_to(frames[:, :3], (num_envs, len(frames), 3)).copy(),
-        second_order=np.zeros(num_envs, np.int32),
         kappa=np.full(num_envs, kappa),
         failed=np.zeros(num_envs, bool),
     )
@@ -90,7 +82,6 @@ def teleported(
         turned = np.einsum("bij,nj->bni", rotation_matrix(state.frame_rotation[:, frame]), layout.aim_local[nodes])
         state.y[mask, nodes] = (turned + state.frame_position[:, frame, None])[mask]
     state.velocity[mask, nodes] = 0.0
-    state.second_order[mask] = 0
     return moved
 
 

@@ -121,10 +121,7 @@ class World:
         self._potential.acceleration.assign(np.ascontiguousarray(per_env(gravity, (3,), "gravity", self.num_envs)))
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
-        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame.
-
-        With BDF2 the next step of these environments is backward Euler.
-        """
+        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame."""
         body = self._index(name)
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
@@ -133,10 +130,6 @@ class World:
         v = host(self._potential.v).copy()
         v[mask, first:last] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
-        # The earlier states that BDF2 looks back to know nothing of this velocity.
-        history = host(self._potential.second_order).copy()
-        history[mask] = 0
-        self._potential.second_order.assign(history)
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
@@ -146,12 +139,10 @@ class World:
         On CUDA every new ``dt`` costs a recording; take few different ones.
 
         Raises:
-            IpcError: ``dt`` is not positive, or differs from ``settings.dt`` with BDF2, whose formulas want equal steps.
+            IpcError: if ``dt`` is not positive.
         """
         if dt is not None and not 0.0 < dt < np.inf:
             raise IpcError(f"dt = {dt}: it must be positive")
-        if dt is not None and dt != self.settings.dt and self.settings.integrator == "bdf2":
-            raise IpcError(f"dt = {dt}: with BDF2 every step is as long as settings.dt = {self.settings.dt}")
         pot, alive = self._potential, ~self._failed
         pot.set_dt(dt or self.settings.dt)
         if not self._told:
@@ -338,11 +329,8 @@ class World:
         return State(
             y=host(s.y).copy(),
             velocity=host(s.v).copy(),
-            velocity_before=host(s.v_before).copy(),
-            position_before=host(s.xw_before).copy(),
             frame_rotation=host(s.frame_q)[..., [3, 0, 1, 2]].copy(),
             frame_position=host(s.frame_p).copy(),
-            second_order=host(s.second_order).copy(),
             kappa=host(s.kappa).copy(),
             failed=self._failed.copy(),
         )
@@ -371,13 +359,10 @@ class World:
         for target, values in (
             (s.y, state.y),
             (s.v, state.velocity),
-            (s.v_before, state.velocity_before),
-            (s.xw_before, state.position_before),
             (s.frame_q, quaternions),
             (s.goal_q, quaternions),
             (s.frame_p, state.frame_position),
             (s.goal_p, state.frame_position),
-            (s.second_order, state.second_order),
             (s.kappa, state.kappa),
         ):
             merged = host(target).copy()

@@ -22,7 +22,8 @@ def make_potential(material: ipc.Material, mesh: ipc.TetMesh | None = None, bond
     """A solver of one cube of soft material, statics only."""
     body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=np.zeros(0, int) if bonded is None else bonded)
     layout = build_layout([body], 0.0, {}, [])
-    solver = Potential(layout, ipc.Settings(), 1, 0.01, 1.0, wp.get_device("cpu"))
+    statics = ipc.Settings(dt=np.inf)  # no inertia
+    solver = Potential(layout, statics, 1, 0.01, 1.0, wp.get_device("cpu"))
     solver.y.assign(layout.node_rest[None])
     identity = np.eye(3)[None, None]
     solver.R.assign(identity)

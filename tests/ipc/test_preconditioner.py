@@ -264,10 +264,9 @@ def press(preconditioner: str, steps: int = 4, max_contacts: int | None = None, 
     return world.positions("pad"), newton, linear
 
 
-@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
-def test_same_step_in_fewer_iterations(integrator: str) -> None:
-    one, newton, linear = press("block_jacobi", integrator=integrator)
-    other, newton2, linear2 = press("rest_inverse", integrator=integrator)
+def test_same_step_in_fewer_iterations() -> None:
+    one, newton, linear = press("block_jacobi")
+    other, newton2, linear2 = press("rest_inverse")
     assert np.abs(one - other).max() < 1e-8
     assert newton2 <= newton + 3
     assert linear2 < linear / 3, f"{linear} PCG iterations with block-Jacobi, {linear2} with the rest inverse"
