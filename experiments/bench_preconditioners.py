@@ -25,8 +25,8 @@ import warp as wp
 from bench_ipc_scenes import CELLS, D_HAT, DT, FRICTION, GAP, MATERIAL, PRESS, RADIUS, TRAVEL, ball_surface, press_pad
 
 import ipc
-from ipc import linear
-from ipc.rest_inverse import RestInverse
+from ipc.solver import linear
+from ipc.solver.preconditioners.rest_inverse import RestInverse
 from raytac.errors import RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics

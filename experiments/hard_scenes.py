@@ -26,7 +26,7 @@ from experiments.hard_shapes import (
     sheet,
     wedge,
 )
-from ipc.layout import rotation_matrix
+from ipc.bodies import rotation_matrix
 
 SOFT = ipc.Material(2e4, 0.4)
 """As soft for its size as a metre of 1 MPa: its own weight compresses a cube by 1 %."""

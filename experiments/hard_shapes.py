@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ipc
-from ipc.layout import rotation_matrix
+from ipc.bodies import rotation_matrix
 from ipc.meshes import surface_of
 
 SIZE = 0.02

@@ -29,7 +29,7 @@ class Settings:
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
-            part; ``ipc/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
+            part; ``ipc/solver/preconditioners/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
         broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``

@@ -1,16 +1,17 @@
-"""A snapshot of a world, and what moving a frame at once changes in it."""
+"""Snapshots of a world, frames that are moved at once, and values that a caller gives for every environment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies import AffineBody, Body
-from ipc.layout import Layout, rotation_matrix
+from ipc.bodies.body import AffineBody, Body
+from ipc.bodies.layout import Layout, rotation_matrix
+from ipc.errors import IpcError
 
-__all__ = ["State", "start_state", "teleported"]
+__all__ = ["State", "env_mask", "per_env", "start_state", "teleported", "unit_pose"]
 
 Floats = NDArray[np.float64]
 
@@ -108,3 +109,43 @@ def _quaternions(rotations: Floats) -> Floats:
     ]
     matrix = np.stack([np.stack([zero + e for e in row], axis=-1) for row in rows], axis=-2)
     return np.linalg.eigh(matrix)[1][..., -1]
+
+
+def per_env(values: ArrayLike, shape: tuple[int, ...], what: str, num_envs: int) -> NDArray:
+    """Finite values of a shape, the same for every environment or with the environment first; (B, \\*shape)."""
+    array = np.asarray(values, dtype=float)
+    if array.shape not in (shape, (num_envs, *shape)):
+        raise IpcError(f"{what} has shape {array.shape}: it must be {shape} or {(num_envs, *shape)}")
+    if not np.isfinite(array).all():
+        raise IpcError(f"{what} = {array}: it must be finite")
+    return np.broadcast_to(array, (num_envs, *shape))
+
+
+def unit_pose(position: ArrayLike | None, rotation: ArrayLike | None, num_envs: int) -> tuple[Floats | None, Floats | None]:
+    """Position (B, 3) and unit quaternion (w, x, y, z) (B, 4) of every environment, where given."""
+    p = None if position is None else per_env(position, (3,), "position", num_envs)
+    if rotation is None:
+        return p, None
+    q = per_env(rotation, (4,), "rotation", num_envs)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.allclose(length, 1, atol=1e-6):
+        raise IpcError(f"rotation = {rotation}: a quaternion (w, x, y, z) must have length 1")
+    return p, q / length
+
+
+def env_mask(envs: ArrayLike | None, num_envs: int) -> NDArray[np.bool_]:
+    """A mask (B,) from a mask, a list of environments, or None for all."""
+    if envs is None:
+        return np.ones(num_envs, bool)
+    chosen = np.asarray(envs)
+    if chosen.dtype == bool:
+        if chosen.shape != (num_envs,):
+            raise IpcError(f"envs is a mask of shape {chosen.shape}: it must be ({num_envs},)")
+        return chosen.copy()
+    if chosen.size and not np.issubdtype(chosen.dtype, np.integer):
+        raise IpcError(f"envs = {envs}: give a mask or whole numbers")
+    if chosen.size and (chosen.min() < 0 or chosen.max() >= num_envs):
+        raise IpcError(f"envs names environments {chosen.min()} to {chosen.max()}: there are {num_envs}")
+    mask = np.zeros(num_envs, bool)
+    mask[chosen.astype(int)] = True
+    return mask

@@ -8,18 +8,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from ipc.arguments import env_mask, per_env, unit_pose
-from ipc.bodies import AffineBody, Body, HalfSpace, SoftBody
+from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody
+from ipc.bodies.layout import build_layout, rotation_matrix
+from ipc.contact.overlap import check_overlap, find_overlap
 from ipc.errors import IpcError
-from ipc.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
-from ipc.layout import build_layout, rotation_matrix
-from ipc.newton import Newton
-from ipc.overlap import check_overlap, find_overlap
-from ipc.patch_motion import RestPatches
-from ipc.potential import Potential
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
-from ipc.state import State, start_state, teleported
+from ipc.solver.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
+from ipc.solver.newton import Newton
+from ipc.solver.patch_motion import RestPatches
+from ipc.solver.potential import Potential
+from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
 from ipc.warp_start import start_warp
 
 __all__ = ["State", "World"]

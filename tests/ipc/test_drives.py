@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc import dynamics
-from ipc.layout import rotation_matrix
+from ipc.bodies import rotation_matrix
+from ipc.solver import dynamics
 from tests.ipc.conftest import bonded_pad, small_pad
 
 LENGTH = 10e-3

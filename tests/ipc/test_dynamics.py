@@ -184,7 +184,7 @@ def test_affine_body_falls_turns_and_stays_rigid() -> None:
 def test_affine_mass_is_that_of_the_solid() -> None:
     """Centre of mass and second moments of a box from its surface alone."""
     size, density = np.array([0.04, 0.02, 0.03]), 700.0
-    from ipc.layout import build_layout
+    from ipc.bodies import build_layout
 
     layout = build_layout([ipc.AffineBody("box", ipc.box_surface((0.04, 0.02, 0.03)), ipc.Stiff(1e7, density))], 0.0, {}, [])
     mass, y = layout.mass.reshape(4, 4), layout.node_rest

@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc.pcg import Pcg
 from ipc.reduce import BLOCK
+from ipc.solver.pcg import Pcg
 from tests.ipc.conftest import bonded_pad, small_pad
 
 RADIUS = 4e-3
@@ -313,7 +313,7 @@ def test_blocks_of_threads_reach_all_lanes_of_rows(lanes: int) -> None:
 
 def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop for any preconditioner, given block-Jacobi, takes the iterations and gives the press of the kernel that knows it."""
-    from ipc import pcg
+    from ipc.solver import pcg
 
     ends, general = [], []
     way = pcg.Pcg._solve_on_cpu

@@ -1,0 +1,201 @@
+"""Additive continuous collision detection: the largest share of a step that keeps every pair apart.
+
+Li, Kaufman, Jiang 2021, "Codimensional Incremental Potential Contact", algorithm 1. After the mean displacement is taken out, no
+distance can shrink faster than l = max‖δ_A‖ + max‖δ_B‖ per unit of t, so t may always advance by d/l times a safety factor. The
+advance stops when the distance has fallen to ``slack`` of the one at the start.
+
+Distances are known to a few units in the last place of the coordinates (:mod:`ipc.contact.distance`), and positions are rounded once more
+when a step is taken. A step therefore never ends with a distance below ``RESOLUTION`` of the largest coordinate, where rounding could put
+surfaces through each other; a pair that is closer already may not come closer.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.broad_phase.lists import Candidates, Surface
+from ipc.contact.distance import edge_edge_coefficients, point_triangle_coefficients, separation
+
+__all__ = ["ccd_ee", "ccd_plane", "ccd_pt"]
+
+wp.set_module_options({"enable_backward": False})
+
+SAFETY = wp.constant(wp.float64(0.9))
+MAX_ADVANCES = wp.constant(500)
+RESOLUTION = wp.constant(wp.float64(1.0e-13))
+"""Least distance that a step may leave, over the largest coordinate; some hundred times what rounding moves a point."""
+
+
+@wp.func
+def pair_distance(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.float64:
+    if ee:
+        return wp.length(separation(edge_edge_coefficients(x0, x1, x2, x3), x0, x1, x2, x3))
+    return wp.length(separation(point_triangle_coefficients(x0, x1, x2, x3), x0, x1, x2, x3))
+
+
+@wp.func
+def additive_ccd(
+    ee: wp.bool,
+    x0: wp.vec3d,
+    x1: wp.vec3d,
+    x2: wp.vec3d,
+    x3: wp.vec3d,
+    d0: wp.vec3d,
+    d1: wp.vec3d,
+    d2: wp.vec3d,
+    d3: wp.vec3d,
+    slack: wp.float64,
+    floor: wp.float64,
+    least: wp.float64,
+    t_max: wp.float64,
+) -> wp.float64:
+    """The t in [0, t_max] to which the pair may go; t_max if its distance stays above ``slack`` of the one at t = 0.
+
+    Nor may it fall below ``floor`` [m]; a pair that is already there may hardly come closer. At t it is not below ``least`` [m]; a pair
+    that is already there is no closer than it was.
+    """
+    zero = wp.float64(0.0)
+    mean = wp.float64(0.25) * (d0 + d1 + d2 + d3)
+    s0, s1, s2, s3 = wp.length(d0 - mean), wp.length(d1 - mean), wp.length(d2 - mean), wp.length(d3 - mean)
+    speed = s0 + wp.max(wp.max(s1, s2), s3)
+    if ee:
+        speed = wp.max(s0, s1) + wp.max(s2, s3)
+    if speed == zero:
+        return t_max
+    start = pair_distance(ee, x0, x1, x2, x3)
+    most = wp.float64(0.999)
+    gap = wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
+    end = wp.max(gap, wp.min(least, start))
+    if start - end > speed * t_max:
+        return t_max
+    t, kept, d = zero, zero, start
+    for _ in range(MAX_ADVANCES):
+        # The next time at which the distance could have fallen to the gap; the safety factor covers rounding.
+        t_next = t + SAFETY * (d - gap) / speed + wp.float64(1.0e-15)
+        if t_next >= t_max:
+            if end == gap:
+                return t_max
+            t_next = t_max
+        before = d
+        d = pair_distance(ee, x0 + t_next * d0, x1 + t_next * d1, x2 + t_next * d2, x3 + t_next * d3)
+        if d > gap and d >= end:
+            kept = t_next
+        # A pair that parts goes on however small its advances are: they grow with the distance.
+        if t_next == t_max or d <= gap * wp.float64(1.001) or (t_next - t < wp.float64(1.0e-6) and d <= before):
+            return kept
+        t = t_next
+    return kept
+
+
+@wp.kernel
+def ccd_pt(
+    x: wp.array2d(dtype=wp.vec3d),
+    dx: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    alpha: wp.array(dtype=wp.float64),
+):
+    """Lowers alpha[env] to what the point-triangle pairs allow."""
+    env, i = wp.tid()
+    if active[env] == 0 or i >= candidates.pt_count[env]:
+        return
+    item = candidates.pt[env, i]
+    v, f = item[0], item[1]
+    f0, f1, f2 = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
+    bound = alpha[env]
+    t = additive_ccd(
+        False,
+        x[env, v],
+        x[env, f0],
+        x[env, f1],
+        x[env, f2],
+        dx[env, v],
+        dx[env, f0],
+        dx[env, f1],
+        dx[env, f2],
+        slack[env],
+        floor[env],
+        RESOLUTION * reach[env],
+        bound,
+    )
+    if t < bound:
+        wp.atomic_min(alpha, env, t)
+
+
+@wp.kernel
+def ccd_ee(
+    x: wp.array2d(dtype=wp.vec3d),
+    dx: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    alpha: wp.array(dtype=wp.float64),
+):
+    """Lowers alpha[env] to what the edge-edge pairs allow."""
+    env, i = wp.tid()
+    if active[env] == 0 or i >= candidates.ee_count[env]:
+        return
+    item = candidates.ee[env, i]
+    a0, a1 = surface.edges[item[0], 0], surface.edges[item[0], 1]
+    b0, b1 = surface.edges[item[1], 0], surface.edges[item[1], 1]
+    bound = alpha[env]
+    t = additive_ccd(
+        True,
+        x[env, a0],
+        x[env, a1],
+        x[env, b0],
+        x[env, b1],
+        dx[env, a0],
+        dx[env, a1],
+        dx[env, b0],
+        dx[env, b1],
+        slack[env],
+        floor[env],
+        RESOLUTION * reach[env],
+        bound,
+    )
+    if t < bound:
+        wp.atomic_min(alpha, env, t)
+
+
+@wp.kernel
+def ccd_plane(
+    x: wp.array2d(dtype=wp.vec3d),
+    dx: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    R0: wp.array2d(dtype=wp.mat33d),
+    t0: wp.array2d(dtype=wp.vec3d),
+    R1: wp.array2d(dtype=wp.mat33d),
+    t1: wp.array2d(dtype=wp.vec3d),
+    slack: wp.array(dtype=wp.float64),
+    floor: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    alpha: wp.array(dtype=wp.float64),
+):
+    """Lowers alpha[env] to what the half-spaces allow; they go from frame 0 to frame 1 meanwhile."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    v, body = surface.plane_vert[i], surface.plane_body[i]
+    A, B = R0[env, body], R1[env, body]
+    d0 = wp.dot(wp.vec3d(A[0, 2], A[1, 2], A[2, 2]), x[env, v] - t0[env, body])
+    d1 = wp.dot(wp.vec3d(B[0, 2], B[1, 2], B[2, 2]), x[env, v] + dx[env, v] - t1[env, body])
+    gap = wp.max(slack[env] * d0, wp.min(floor[env], wp.float64(0.999) * d0))
+    gap = wp.max(gap, wp.min(RESOLUTION * reach[env], d0))
+    if d1 < gap:
+        wp.atomic_min(alpha, env, (d0 - gap) / (d0 - d1))

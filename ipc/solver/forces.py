@@ -1,0 +1,165 @@
+"""Forces and motions that a solved step leaves, summed up by body and by pair of bodies; world frame, on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ipc.bodies.layout import Layout
+from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
+from ipc.solver.potential import Potential
+
+__all__ = ["bond_wrench", "contact_pairs", "host", "pair_forces", "plane_forces", "rigid_motion", "touching"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
+
+
+def host(array: wp.array) -> NDArray[Any]:
+    """An array of the device in NumPy: a view on the CPU, a copy from CUDA."""
+    return array.numpy()
+
+
+@dataclass(frozen=True)
+class _Forces:
+    """C forces between two primitives, those of all environments in one list: a vertex bears coef · force."""
+
+    env: Ints
+    pair: Ints
+    verts: Ints
+    """(C, 4), −1 unused."""
+    coef: Floats
+    """(C, 4)."""
+    force: Floats
+    """[N] (C, 3)."""
+
+    def side(self, layout: Layout) -> Floats:
+        """+1 where the first vertex is of the pair's first body, else −1, (C,): the force on that body is side · force."""
+        return np.where(layout.vert_body[self.verts[:, 0]] == layout.pairs[self.pair, 0], 1.0, -1.0)
+
+    def points(self, layout: Layout, x: Floats) -> Floats:
+        """Where they act on the pair's first body [m], (C, 3); ``x``: all vertices, (B, V, 3)."""
+        coef = self.side(layout)[:, None] * self.coef
+        weights = np.where((coef > 0.0) & (self.verts >= 0), coef, 0.0)
+        at = x[self.env[:, None], np.maximum(self.verts, 0)]
+        return np.einsum("cn,cni->ci", weights, at) / weights.sum(axis=1, keepdims=True)
+
+
+def _normal_forces(potential: Potential) -> _Forces:
+    """Of the contacts at the end of the step."""
+    contacts = potential.collision.contacts
+    pair = host(contacts.pair)
+    at = np.nonzero(np.arange(pair.shape[1]) < host(contacts.count)[:, None])
+    force = host(contacts.force)[at][:, None] * host(contacts.normal)[at]
+    return _Forces(at[0], pair[at], host(contacts.verts)[at], host(contacts.coef)[at], force)
+
+
+def _friction_forces(potential: Potential) -> _Forces:
+    """Of the lagged contacts: −μ λ f1(|u|) u / |u|, with u their sliding in the step (see ``ipc/contact/friction.py``)."""
+    lagged = potential.collision.lagged
+    pair = host(lagged.pair)
+    at = np.nonzero(np.arange(pair.shape[1]) < host(lagged.count)[:, None])
+    verts, coef, normal = host(lagged.verts)[at], host(lagged.coef)[at], host(lagged.normal)[at]
+    moved = host(potential.x) - host(potential.x_start)
+    u = np.einsum("cn,cni->ci", np.where(verts >= 0, coef, 0.0), moved[at[0][:, None], np.maximum(verts, 0)])
+    u -= (u * normal).sum(axis=1, keepdims=True) * normal
+    y, eps = np.linalg.norm(u, axis=1), potential.friction_eps
+    ratio = np.where(y >= eps, 1.0 / np.maximum(y, eps), (2.0 - y / eps) / eps)
+    return _Forces(at[0], pair[at], verts, coef, -(host(lagged.limit)[at] * ratio)[:, None] * u)
+
+
+def _all_forces(potential: Potential) -> list[_Forces]:
+    return [_normal_forces(potential), *([_friction_forces(potential)] if potential.collision.friction else [])]
+
+
+def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wrench:
+    """What a body's bonded ``nodes`` do to the frame that holds them, about its origin."""
+    R, t = host(potential.R)[:, body], host(potential.t)
+    forces = -np.einsum("bij,bnj->bni", R, host(potential.gradient)[:, nodes])
+    points = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None, body]
+    return Wrench(forces.sum(axis=1), np.cross(points - t[:, None, frame], forces).sum(axis=1))
+
+
+def plane_forces(layout: Layout, potential: Potential, body: int) -> tuple[Floats, Floats]:
+    """Points and forces on a half-space: the reactions of its contacts, friction included, (B, n, 3)."""
+    x = host(potential.x)
+    forces = np.zeros_like(x)
+    for found in _all_forces(potential):
+        mine = (found.verts[:, 1] < 0) & (layout.pairs[found.pair, 1] == body)
+        np.add.at(forces, (found.env[mine], found.verts[mine, 0]), -found.force[mine])
+    return x, forces
+
+
+def contact_pairs(layout: Layout, potential: Potential, env: int) -> ContactPairs:
+    """The contact pairs of one environment at the end of the last step."""
+    found = potential.collision.contacts
+    n = int(host(found.count)[env])
+    pairs = layout.pairs[host(found.pair)[env, :n]]
+    return ContactPairs(
+        bodies=tuple((layout.names[a], layout.names[b]) for a, b in pairs),
+        vertices=host(found.verts)[env, :n].copy(),
+        weights=host(found.coef)[env, :n].copy(),
+        normal=host(found.normal)[env, :n].copy(),
+        gap=host(found.gap)[env, :n].copy(),
+        force=host(found.force)[env, :n].copy(),
+    )
+
+
+def pair_forces(layout: Layout, potential: Potential) -> dict[tuple[str, str], PairForces]:
+    """What touches what, by names of the two bodies; pairs that nowhere touch are not in it."""
+    x = host(potential.x)
+    batch, forces = len(x), _all_forces(potential)
+    points, signs = [f.points(layout, x) for f in forces], [f.side(layout)[:, None] for f in forces]
+    answer = {}
+    for p in np.unique(forces[0].pair):
+        normal, middle, weight, wrench = np.zeros((batch, 3)), np.zeros((batch, 3)), np.zeros(batch), np.zeros((batch, 6))
+        for k, (found, at, sign) in enumerate(zip(forces, points, signs, strict=True)):
+            mine = found.pair == p
+            env, force = found.env[mine], (sign * found.force)[mine]
+            if k == 0:
+                size = np.linalg.norm(force, axis=1)
+                np.add.at(normal, env, force)
+                np.add.at(middle, env, size[:, None] * at[mine])
+                np.add.at(weight, env, size)
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    place = middle / weight[:, None]
+            arm = at[mine] - np.nan_to_num(place)[env]
+            np.add.at(wrench, env, np.concatenate([force, np.cross(arm, force)], axis=1))
+        answer[tuple(layout.names[b] for b in layout.pairs[p])] = PairForces(normal, place, wrench)
+    return answer
+
+
+def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion:
+    """Mass, centre, inertia and velocities of a body with nodes as if it moved as a whole."""
+    first, last = layout.node_start[body : body + 2]
+    row, end = layout.row_start[[first, last]]
+    rows = np.repeat(np.arange(last - first), np.diff(layout.row_start[first : last + 1]))
+    mass = np.zeros((last - first, last - first))
+    mass[rows, layout.col[row:end] - first] = layout.mass[row:end]
+    R, t, nodes = host(potential.R)[:, body], host(potential.t)[:, body], slice(first, last)
+    x = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None]
+    v, share = host(potential.v)[:, nodes], mass.sum(axis=0)
+    total = float(share.sum())
+    centre, velocity = (np.einsum("n,bni->bi", share / total, a) for a in (x, v))
+    arm = x - centre[:, None]
+    second = np.einsum("bni,nm,bmj->bij", arm, mass, arm)
+    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    momentum = np.cross(arm, np.einsum("nm,bmi->bni", mass, v - velocity[:, None])).sum(axis=1)
+    spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
+    return RigidMotion(total, centre, inertia, velocity, spin)
+
+
+def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:
+    """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+    found = potential.collision.contacts
+    pair = host(found.pair)
+    there = np.zeros((len(pair), len(layout.pairs)), bool)
+    env, k = np.nonzero(np.arange(pair.shape[1]) < host(found.count)[:, None])
+    there[env, pair[env, k]] = True
+    mine = np.flatnonzero((layout.pairs == body).any(axis=1) & there.any(axis=0))
+    other = layout.pairs[mine].sum(axis=1) - body
+    return {layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}

@@ -1,0 +1,315 @@
+"""Preconditioned conjugate gradients for a batch of systems, all at once, each with its own step lengths and its own end.
+
+On CUDA an iteration is six launches that can be recorded: sums are taken by blocks of threads, and every thread adds the few shares of
+its environment itself instead of waiting for a launch that does. Small systems, and all on a CPU, go to :mod:`ipc.solver.pcg_block`.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ipc.contact.normal import Contacts
+from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
+from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, add_row, block_row, multiply_blocks, multiply_rows
+from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
+
+__all__ = ["Pcg"]
+
+wp.set_module_options({"enable_backward": False})
+
+ROUNDS = 4
+"""Iterations between two looks at whether any environment still runs."""
+ONE_BLOCK_NODES = 3000
+"""Nodes up to which a system is left to one block of threads."""
+ONE_BLOCK_TOTAL = 600_000
+"""Nodes of all environments up to which it is: 304,000 were faster that way on an H200, 1,160,000 slower by a third."""
+
+
+@wp.kernel
+def dots(
+    r: wp.array2d(dtype=wp.vec3d),
+    z: wp.array2d(dtype=wp.vec3d),
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    rr: wp.array2d(dtype=wp.float64),
+    rz: wp.array2d(dtype=wp.float64),
+):
+    """Shares of r·r and r·z; blocks of threads (B, chunks, BLOCK)."""
+    env, c, lane = wp.tid()
+    a, b = wp.float64(0.0), wp.float64(0.0)
+    if running[env] != 0:
+        i = c * BLOCK + lane
+        while i < r.shape[1]:
+            a += wp.length_sq(r[env, i])
+            b += wp.dot(r[env, i], z[env, i])
+            i += rr.shape[1] * BLOCK
+    wp.tile_store(rr[env], wp.tile_sum(wp.tile(a)), offset=c)
+    wp.tile_store(rz[env], wp.tile_sum(wp.tile(b)), offset=c)
+
+
+@wp.kernel
+def start(
+    z: wp.array2d(dtype=wp.vec3d),
+    rr: wp.array2d(dtype=wp.float64),
+    rz: wp.array2d(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    s: Scalars,
+    p: wp.array2d(dtype=wp.vec3d),
+    running: wp.array(dtype=wp.int32),
+):
+    """p = z, and which environments have anything to solve."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        if i == 0:
+            running[env] = 0
+        return
+    p[env, i] = z[env, i]
+    if i == 0:
+        square = total_of(rr, env)
+        s.rr0[env] = square
+        s.rz[0, env] = total_of(rz, env)
+        s.iterations[env] = 0
+        s.negative[env] = 0
+        running[env] = 0
+        if square > wp.float64(0.0):
+            running[env] = 1
+
+
+@wp.kernel
+def update_iterate(
+    p: wp.array2d(dtype=wp.vec3d),
+    Ap: wp.array2d(dtype=wp.vec3d),
+    by_blocks: wp.array2d(dtype=wp.float64),
+    by_rows: wp.array2d(dtype=wp.float64),
+    parity: wp.int32,
+    # outputs
+    s: Scalars,
+    running: wp.array(dtype=wp.int32),
+    x: wp.array2d(dtype=wp.vec3d),
+    r: wp.array2d(dtype=wp.vec3d),
+):
+    """x += α p, r −= α H p with α = r·z / p·Hp; every thread of an environment finds the same α."""
+    env, i = wp.tid()
+    if running[env] == 0:
+        return
+    curvature = total_of(by_blocks, env) + total_of(by_rows, env)
+    if not (curvature > wp.float64(0.0)):
+        # Not positive (or not finite): the caller makes the matrix definite and solves again.
+        if i == 0:
+            s.negative[env] = 1
+            running[env] = 0
+        return
+    if i == 0:
+        s.iterations[env] = s.iterations[env] + 1
+    alpha = s.rz[parity, env] / curvature
+    x[env, i] = x[env, i] + alpha * p[env, i]
+    r[env, i] = r[env, i] - alpha * Ap[env, i]
+
+
+@wp.kernel
+def next_direction(
+    z: wp.array2d(dtype=wp.vec3d),
+    rr: wp.array2d(dtype=wp.float64),
+    rz: wp.array2d(dtype=wp.float64),
+    parity: wp.int32,
+    tolerance: wp.float64,
+    max_iterations: wp.int32,
+    # outputs
+    s: Scalars,
+    running: wp.array(dtype=wp.int32),
+    p: wp.array2d(dtype=wp.vec3d),
+):
+    """p = z + β p, unless ‖r‖ is small enough or the iterations are used up."""
+    env, i = wp.tid()
+    if running[env] == 0:
+        return
+    square = total_of(rr, env)
+    if not (square > tolerance * tolerance * s.rr0[env]) or s.iterations[env] >= max_iterations:
+        if i == 0:
+            running[env] = 0
+        return
+    new = total_of(rz, env)
+    p[env, i] = z[env, i] + (new / s.rz[parity, env]) * p[env, i]
+    if i == 0:
+        s.rz[1 - parity, env] = new
+
+
+@wp.func
+def product_in_order(
+    system: SystemView,
+    contacts: Contacts,
+    env: wp.int32,
+    p: wp.array2d(dtype=wp.vec3d),
+    Ap: wp.array2d(dtype=wp.vec3d),
+) -> wp.float64:
+    """Ap = H p of one environment; returns p·Ap."""
+    total = wp.float64(0.0)
+    for i in range(p.shape[1]):
+        f = wp.vec3d()
+        if system.free[i] != 0:
+            f = block_row(system, env, i, p)
+            total += wp.dot(p[env, i], f)
+        Ap[env, i] = f
+    for row in range(wp.min(contacts.row_count[env], contacts.row.shape[1])):
+        total += add_row(system, contacts, env, row, p, Ap)
+    return total
+
+
+@wp.kernel
+def multiply_in_order(
+    system: SystemView,
+    contacts: Contacts,
+    p: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    Ap: wp.array2d(dtype=wp.vec3d),
+    curvature: wp.array(dtype=wp.float64),
+):
+    """One thread an environment."""
+    env = wp.tid()
+    if active[env] != 0:
+        curvature[env] = product_in_order(system, contacts, env, p, Ap)
+
+
+class Pcg:
+    """Preconditioned conjugate gradients (Hestenes, Stiefel 1952).
+
+    Args:
+        batch: environments, B.
+        nodes: unknowns of each, N, three numbers each.
+        lanes: threads that share the contact rows of an environment.
+        device: Warp device.
+    """
+
+    def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
+        self.batch, self.nodes, self.lanes, self.device = batch, nodes, lanes, device
+        # With one lane the sums must not depend on the batch, and neither may the way they are made.
+        few = nodes <= ONE_BLOCK_NODES and (lanes == 1 or batch * nodes <= ONE_BLOCK_TOTAL)
+        self.one_block = few or not device.is_cuda
+        self._p, self._Ap, self._z = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(3))
+        self._by_blocks, self._rr, self._rz = (
+            wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
+        )
+        self._by_rows = wp.zeros((batch, -(-lanes // BLOCK)), dtype=wp.float64, device=device)
+        self._running = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._any = wp.zeros(1, dtype=wp.int32, device=device)
+        self.scalars = Scalars()
+        self.scalars.rz = wp.zeros((2, batch), dtype=wp.float64, device=device)
+        self.scalars.rr0 = wp.zeros(batch, dtype=wp.float64, device=device)
+        self.scalars.iterations = wp.zeros(batch, dtype=wp.int32, device=device)
+        self.scalars.negative = wp.zeros(batch, dtype=wp.int32, device=device)
+
+    def solve(
+        self,
+        system: SystemView,
+        contacts: Contacts,
+        preconditioner: Preconditioner,
+        residual: wp.array,
+        x: wp.array,
+        tolerance: float,
+        max_iterations: int,
+        active: wp.array,
+    ) -> None:
+        """Solve H x = residual for the active environments, from x = 0; ``scalars`` says how it went.
+
+        Args:
+            system, contacts: the matrix.
+            preconditioner: already updated.
+            residual: right-hand side (B, N); overwritten by what is left of it.
+            x: solution (B, N); must be zero for the active environments.
+            tolerance: on ‖r‖/‖r_0‖.
+            max_iterations: after these the solution so far stands (it is a descent direction).
+            active: mask (B,).
+        """
+        s, run, device, dim = self.scalars, self._running, self.device, residual.shape
+        if isinstance(preconditioner, BlockJacobi) and self.one_block:
+            threads = THREADS if device.is_cuda else 1
+            inputs = [
+                *(system, contacts, preconditioner.inverse, tolerance, max_iterations, threads, min(self.lanes, threads), active),
+                *(self._p, self._Ap),
+            ]
+            size, outputs = (self.batch, threads), [residual, x, s]
+            wp.launch(solve_in_one_block, dim=size, inputs=inputs, outputs=outputs, device=device, block_dim=THREADS)
+            return
+        if not device.is_cuda:
+            self._solve_on_cpu(system, contacts, preconditioner, residual, x, tolerance, max_iterations, active)
+            return
+        blocks, row_blocks = (*self._rr.shape, BLOCK), (*self._by_rows.shape, BLOCK)
+
+        def iterate() -> None:
+            for k in range(ROUNDS):
+                parity = k % 2
+                inputs = [system, self._p, run]
+                outputs = [self._Ap, self._by_blocks]
+                wp.launch(multiply_blocks, dim=blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
+                inputs, outputs = [system, contacts, self._p, run, self.lanes], [self._Ap, self._by_rows]
+                wp.launch(multiply_rows, dim=row_blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
+                inputs = [self._p, self._Ap, self._by_blocks, self._by_rows, parity]
+                wp.launch(update_iterate, dim=dim, inputs=inputs, outputs=[s, run, x, residual], device=device)
+                preconditioner.apply(residual, run, self._z)
+                inputs = [residual, self._z, run]
+                wp.launch(dots, dim=blocks, inputs=inputs, outputs=[self._rr, self._rz], device=device, block_dim=BLOCK)
+                inputs = [self._z, self._rr, self._rz, parity, tolerance, max_iterations]
+                wp.launch(next_direction, dim=dim, inputs=inputs, outputs=[s, run, self._p], device=device)
+            look()
+
+        def look() -> None:
+            self._any.zero_()
+            wp.launch(raise_if_any, dim=self.batch, inputs=[run], outputs=[self._any], device=device)
+
+        preconditioner.apply(residual, active, self._z)
+        inputs = [residual, self._z, active]
+        wp.launch(dots, dim=blocks, inputs=inputs, outputs=[self._rr, self._rz], device=device, block_dim=BLOCK)
+        wp.launch(start, dim=dim, inputs=[self._z, self._rr, self._rz, active], outputs=[s, self._p, run], device=device)
+        look()
+        wp.capture_while(self._any, iterate)
+
+    def _solve_on_cpu(
+        self,
+        system: SystemView,
+        contacts: Contacts,
+        preconditioner: Preconditioner,
+        residual: wp.array,
+        x: wp.array,
+        tolerance: float,
+        max_iterations: int,
+        active: wp.array,
+    ) -> None:
+        s, device = self.scalars, self.device
+        # The arrays of a CPU are NumPy's as well: views, no copies.
+        running, mask = self._running.numpy(), active.numpy() != 0
+        r, solution, z, p, Ap = (a.numpy() for a in (residual, x, self._z, self._p, self._Ap))
+        curvature, iterations, negative = s.rr0.numpy(), s.iterations.numpy(), s.negative.numpy()
+
+        def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+            return np.einsum("bij,bij->b", a, b)
+
+        iterations[mask] = 0
+        negative[mask] = 0
+        preconditioner.apply(residual, active, self._z)
+        rz, first = dot(r, z), dot(r, r)
+        running[:] = mask & (first > 0)
+        p[mask] = z[mask]
+        while running.any():
+            inputs = [system, contacts, self._p, self._running]
+            wp.launch(multiply_in_order, dim=self.batch, inputs=inputs, outputs=[self._Ap, s.rr0], device=device)
+            bad = (running != 0) & ~(curvature > 0)
+            negative[bad] = 1
+            running[bad] = 0
+            on = running != 0
+            iterations[on] += 1
+            alpha = np.where(on, rz / np.where(on, curvature, 1.0), 0.0)[:, None, None]
+            solution += alpha * p
+            r[on] -= (alpha * Ap)[on]
+            running[on & ~((dot(r, r) > tolerance**2 * first) & (iterations < max_iterations))] = 0
+            preconditioner.apply(residual, self._running, self._z)
+            on = running != 0
+            new = dot(r, z)
+            p[on] = z[on] + (new[on] / rz[on])[:, None, None] * p[on]
+            rz = new
