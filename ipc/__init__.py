@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipc.bodies import (
     AffineBody,
+    Body,
     HalfSpace,
     KinematicBody,
     Material,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "RAYTAC_IPC_MARKER",
     "AffineBody",
+    "Body",
     "ContactPairs",
     "Cut",
     "HalfSpace",

@@ -31,7 +31,7 @@ from ipc.solver import decisions, dynamics
 from ipc.solver.decisions import StepState
 from ipc.solver.pcg import Pcg
 from ipc.solver.potential import Potential
-from ipc.solver.preconditioners.choice import make_preconditioner
+from ipc.solver.preconditioners import make_preconditioner
 
 __all__ = ["Newton"]
 

@@ -13,7 +13,7 @@ import ipc
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.normal import Contacts, mat34d
 from ipc.solver.linear import BlockJacobi, SystemView
-from ipc.solver.preconditioners.choice import pays
+from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from ipc.solver.preconditioners.rest_stiffness import rest_blocks
 from ipc.solver.preconditioners.substructure import choose_partition, entries, partition
@@ -331,18 +331,25 @@ def test_cuda_agrees_and_can_be_captured(batch: int, patches: int, rng: np.rando
 
 
 @pytest.mark.parametrize(
-    ("cells", "poisson", "cuda", "expected"),
+    ("cells", "poisson", "tolerance", "batch", "free", "cuda", "expected"),
     [
-        ((6, 6, 2), 0.45, True, False),
-        ((16, 20, 3), 0.45, True, True),
-        ((16, 20, 3), 0.45, False, False),
-        ((26, 32, 5), 0.45, True, False),
-        ((26, 32, 5), 0.49, True, True),
+        ((6, 6, 2), 0.45, 1e-2, 1, False, True, False),
+        ((16, 20, 3), 0.45, 1e-2, 1, False, True, True),
+        ((16, 20, 3), 0.45, 1e-2, 1, True, True, False),
+        ((26, 32, 5), 0.45, 1e-2, 1, False, True, False),
+        ((26, 32, 5), 0.49, 1e-2, 1, False, True, True),
+        ((6, 6, 2), 0.45, 1e-6, 1, True, True, True),
+        ((6, 6, 2), 0.45, 1e-6, 64, False, True, False),
+        ((26, 32, 5), 0.45, 1e-6, 64, True, True, True),
+        ((16, 20, 3), 0.45, 1e-2, 1, False, False, False),
+        ((16, 20, 3), 0.45, 1e-6, 1, False, False, False),
     ],
 )
 def test_auto_takes_the_rest_inverse_where_it_pays(
-    cells: tuple[int, int, int], poisson: float, cuda: bool, expected: bool
+    cells: tuple[int, int, int], poisson: float, tolerance: float, batch: int, free: bool, cuda: bool, expected: bool
 ) -> None:
-    body = bonded_pad(small_pad(cells), material=ipc.Material(1e5, poisson))
-    layout = build_layout([body], 0.0, {}, [])
-    assert pays(layout, cast(Any, SimpleNamespace(is_cuda=cuda))) == expected
+    bodies: list[ipc.Body] = [bonded_pad(small_pad(cells), material=ipc.Material(1e5, poisson))]
+    bodies += [ipc.AffineBody("free", ipc.icosphere(1e-3, 0), pose=ipc.Pose((0, 0, 5e-3)))] if free else []
+    layout = build_layout(bodies, 0.0, {}, [])
+    device = cast(Any, SimpleNamespace(is_cuda=cuda))
+    assert pays(layout, ipc.Settings(linear_tolerance=tolerance), batch, device) == expected
