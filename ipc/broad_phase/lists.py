@@ -60,6 +60,31 @@ class Candidates:
     ee_count: wp.array(dtype=wp.int32)
 
 
+@wp.func
+def pairs_of(candidates: Candidates, ee: wp.bool, env: wp.int32) -> wp.int32:
+    """Candidates of two edges (``ee``) or of a vertex and a face that an environment has stored."""
+    if ee:
+        return wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    return wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+
+
+@wp.func
+def pair_at(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32) -> wp.vec3i:
+    """Candidate i of two edges (``ee``) or of a vertex and a face."""
+    if ee:
+        return candidates.ee[env, i]
+    return candidates.pt[env, i]
+
+
+@wp.func
+def pair_vertices(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.vec4i:
+    """Vertices of two edges (``ee``) or of a vertex and a face."""
+    a, b = pair[0], pair[1]
+    if ee:
+        return wp.vec4i(surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1])
+    return wp.vec4i(a, surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2])
+
+
 @wp.kernel
 def leaves_box(
     x: wp.array2d(dtype=wp.vec3d),
@@ -185,6 +210,50 @@ def overlap(lo: wp.vec3d, hi: wp.vec3d, lo2: wp.vec3d, hi2: wp.vec3d, reach: wp.
     )
 
 
+@wp.func
+def add_point_triangle(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    lo: wp.vec3d,
+    hi: wp.vec3d,
+    surface: Surface,
+    env: wp.int32,
+    v: wp.int32,
+    f: wp.int32,
+    pair: wp.int32,
+    candidates: Candidates,
+):
+    """Adds vertex v, whose box is ``lo`` to ``hi``, and face f if their boxes overlap and v is no corner of f."""
+    if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
+        if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
+            slot = wp.atomic_add(candidates.pt_count, env, 1)
+            if slot < candidates.pt.shape[1]:
+                candidates.pt[env, slot] = wp.vec3i(v, f, pair)
+
+
+@wp.func
+def add_edge_edge(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    lo: wp.vec3d,
+    hi: wp.vec3d,
+    surface: Surface,
+    env: wp.int32,
+    a: wp.int32,
+    b: wp.int32,
+    pair: wp.int32,
+    candidates: Candidates,
+):
+    """Adds edge a, whose box is ``lo`` to ``hi``, and edge b if their boxes overlap and they share no vertex."""
+    if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
+        a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
+        b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
+        if a0 != b0 and a0 != b1 and a1 != b0 and a1 != b1:
+            slot = wp.atomic_add(candidates.ee_count, env, 1)
+            if slot < candidates.ee.shape[1]:
+                candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+
+
 @wp.kernel
 def select_prims(
     low: wp.array2d(dtype=wp.vec3d),
@@ -239,11 +308,7 @@ def find_pt(
     lo, hi = low[env, v], high[env, v]
     for k in range(list_count[env, second]):
         f = members[env, list_start[second] + k]
-        if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
-            if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
-                slot = wp.atomic_add(candidates.pt_count, env, 1)
-                if slot < candidates.pt.shape[1]:
-                    candidates.pt[env, slot] = wp.vec3i(v, f, pair)
+        add_point_triangle(low, high, lo, hi, surface, env, v, f, pair, candidates)
 
 
 @wp.kernel
@@ -267,16 +332,10 @@ def find_ee(
         return
     a = members[env, list_start[first] + i]
     lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
-    a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
     for k in range(list_count[env, second]):
         b = members[env, list_start[second] + k]
         if first != second or a < b:
-            if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
-                b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
-                if a0 != b0 and a0 != b1 and a1 != b0 and a1 != b1:
-                    slot = wp.atomic_add(candidates.ee_count, env, 1)
-                    if slot < candidates.ee.shape[1]:
-                        candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+            add_edge_edge(low, high, lo, hi, surface, env, a, b, pair, candidates)
 
 
 @wp.func

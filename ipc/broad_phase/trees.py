@@ -23,7 +23,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ipc.bodies.layout import Layout
-from ipc.broad_phase.lists import Candidates, Surface, overlap, prim_high, prim_low
+from ipc.broad_phase.lists import Candidates, Surface, add_edge_edge, add_point_triangle, overlap, prim_high, prim_low
 
 __all__ = ["Trees", "trees_pay"]
 
@@ -148,11 +148,7 @@ def ask_faces(
             item = wp.int32(0)
             while wp.bvh_query_next(query, item):
                 f = tree.prim[item - env * tree.prim.shape[0]]
-                if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
-                    if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
-                        slot = wp.atomic_add(candidates.pt_count, env, 1)
-                        if slot < candidates.pt.shape[1]:
-                            candidates.pt[env, slot] = wp.vec3i(v, f, partners.pair[k])
+                add_point_triangle(low, high, lo, hi, surface, env, v, f, partners.pair[k], candidates)
 
 
 @wp.kernel
@@ -174,8 +170,7 @@ def ask_edges(
     if stale[env] == 0:
         return
     a = partners.asking[i]
-    a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
-    own = vert_body[a0]
+    own = vert_body[surface.edges[a, 0]]
     lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
     reach = WIDER * surface.d_hat
     margin = wp.vec3d(reach, reach, reach)
@@ -188,12 +183,7 @@ def ask_edges(
             while wp.bvh_query_next(query, item):
                 b = tree.prim[item - env * tree.prim.shape[0]]
                 if other != own or a < b:
-                    if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
-                        b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
-                        if a0 != b0 and a0 != b1 and a1 != b0 and a1 != b1:
-                            slot = wp.atomic_add(candidates.ee_count, env, 1)
-                            if slot < candidates.ee.shape[1]:
-                                candidates.ee[env, slot] = wp.vec3i(a, b, partners.pair[k])
+                    add_edge_edge(low, high, lo, hi, surface, env, a, b, partners.pair[k], candidates)
 
 
 _EDGES, _FACES = 1, 2

@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.broad_phase.lists import Candidates, Surface
-from ipc.contact.distance import edge_edge_coefficients, point_triangle_coefficients, separation
+from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.contact.distance import pair_coefficients, separation
 
-__all__ = ["ccd_ee", "ccd_plane", "ccd_pt"]
+__all__ = ["ccd_pairs", "ccd_plane"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,9 +32,7 @@ RESOLUTION = wp.constant(wp.float64(1.0e-13))
 
 @wp.func
 def pair_distance(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.float64:
-    if ee:
-        return wp.length(separation(edge_edge_coefficients(x0, x1, x2, x3), x0, x1, x2, x3))
-    return wp.length(separation(point_triangle_coefficients(x0, x1, x2, x3), x0, x1, x2, x3))
+    return wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
 
 
 @wp.func
@@ -92,11 +90,12 @@ def additive_ccd(
 
 
 @wp.kernel
-def ccd_pt(
+def ccd_pairs(
     x: wp.array2d(dtype=wp.vec3d),
     dx: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
+    ee: wp.bool,
     slack: wp.array(dtype=wp.float64),
     floor: wp.array(dtype=wp.float64),
     reach: wp.array(dtype=wp.float64),
@@ -104,64 +103,22 @@ def ccd_pt(
     # outputs
     alpha: wp.array(dtype=wp.float64),
 ):
-    """Lowers alpha[env] to what the point-triangle pairs allow."""
+    """Lowers alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
     env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.pt_count[env]:
+    if active[env] == 0 or i >= pairs_of(candidates, ee, env):
         return
-    item = candidates.pt[env, i]
-    v, f = item[0], item[1]
-    f0, f1, f2 = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
+    v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
     bound = alpha[env]
     t = additive_ccd(
-        False,
-        x[env, v],
-        x[env, f0],
-        x[env, f1],
-        x[env, f2],
-        dx[env, v],
-        dx[env, f0],
-        dx[env, f1],
-        dx[env, f2],
-        slack[env],
-        floor[env],
-        RESOLUTION * reach[env],
-        bound,
-    )
-    if t < bound:
-        wp.atomic_min(alpha, env, t)
-
-
-@wp.kernel
-def ccd_ee(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    slack: wp.array(dtype=wp.float64),
-    floor: wp.array(dtype=wp.float64),
-    reach: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    alpha: wp.array(dtype=wp.float64),
-):
-    """Lowers alpha[env] to what the edge-edge pairs allow."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= candidates.ee_count[env]:
-        return
-    item = candidates.ee[env, i]
-    a0, a1 = surface.edges[item[0], 0], surface.edges[item[0], 1]
-    b0, b1 = surface.edges[item[1], 0], surface.edges[item[1], 1]
-    bound = alpha[env]
-    t = additive_ccd(
-        True,
-        x[env, a0],
-        x[env, a1],
-        x[env, b0],
-        x[env, b1],
-        dx[env, a0],
-        dx[env, a1],
-        dx[env, b0],
-        dx[env, b1],
+        ee,
+        x[env, v[0]],
+        x[env, v[1]],
+        x[env, v[2]],
+        x[env, v[3]],
+        dx[env, v[0]],
+        dx[env, v[1]],
+        dx[env, v[2]],
+        dx[env, v[3]],
         slack[env],
         floor[env],
         RESOLUTION * reach[env],

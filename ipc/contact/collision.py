@@ -244,12 +244,6 @@ class Collision:
         inputs = [*inputs, self.lanes]
         wp.launch(kernel, dim=(self.batch, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
 
-    def _narrow(self, kernels: tuple[Any, Any], inputs: list, outputs: list) -> None:
-        """Launch the point-triangle and the edge-edge kernel over the candidates."""
-        if self._meshes:
-            for kernel in kernels:
-                self._each(kernel, inputs, outputs)
-
     def assemble(
         self,
         x: wp.array,
@@ -269,8 +263,9 @@ class Collision:
         device = self.device
         wp.launch(normal.clear, dim=x.shape, inputs=[active], outputs=[gradient, energy, self.contacts], device=device)
         outputs = [gradient, energy, self.contacts]
-        kernels = (normal.contact_pt, normal.contact_ee)
-        self._narrow(kernels, [x, self.surface, self.candidates, kappa, active], outputs)
+        if self._meshes:
+            for kernel in (normal.contact_pt, normal.contact_ee):
+                self._each(kernel, [x, self.surface, self.candidates, kappa, active], outputs)
         if self.planes:
             inputs = [x, self.surface, R, t, kappa, active]
             self._each(normal.contact_plane, inputs, outputs)
@@ -293,8 +288,9 @@ class Collision:
         change: wp.array,
     ) -> None:
         """Add the change of barrier and friction energy from x0 to x1 to ``change`` (B,) [J]."""
-        kernels = (normal.energy_pt, normal.energy_ee)
-        self._narrow(kernels, [x0, x1, self.surface, self.candidates, kappa, active], [change])
+        if self._meshes:
+            for ee in (False, True):
+                self._each(normal.energy_pairs, [x0, x1, self.surface, self.candidates, ee, kappa, active], [change])
         if self.planes:
             self._each(normal.energy_plane, [x0, x1, self.surface, R, t, kappa, active], [change])
         if self.friction:
@@ -317,9 +313,9 @@ class Collision:
         ``reach`` (B,) is the largest coordinate [m]: no step ends with distances that rounding could close.
         """
         if self._meshes:
-            for kernel, items in ((ccd.ccd_pt, self.candidates.pt), (ccd.ccd_ee, self.candidates.ee)):
-                inputs = [x, dx, self.surface, self.candidates, slack, floor, reach, active]
-                wp.launch(kernel, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
+            for ee, items in ((False, self.candidates.pt), (True, self.candidates.ee)):
+                inputs = [x, dx, self.surface, self.candidates, ee, slack, floor, reach, active]
+                wp.launch(ccd.ccd_pairs, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
         if self.planes:
             inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, reach, active]
             wp.launch(ccd.ccd_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[alpha], device=self.device)

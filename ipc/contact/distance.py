@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["edge_edge_coefficients", "point_triangle_coefficients", "separation"]
+__all__ = ["edge_edge_coefficients", "pair_coefficients", "point_triangle_coefficients", "separation"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,6 +90,14 @@ def edge_edge_coefficients(a0: wp.vec3d, a1: wp.vec3d, b0: wp.vec3d, b1: wp.vec3
         if d < best:
             s, t = ss, tt
     return wp.vec4d(one - s, s, t - one, -t)
+
+
+@wp.func
+def pair_coefficients(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.vec4d:
+    """Coefficients of two edges (``ee``) or of a point and a triangle."""
+    if ee:
+        return edge_edge_coefficients(x0, x1, x2, x3)
+    return point_triangle_coefficients(x0, x1, x2, x3)
 
 
 @wp.func

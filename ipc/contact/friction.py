@@ -119,43 +119,6 @@ def lag_contacts(
         out.pair[env, i] = contacts.pair[env, i]
 
 
-@wp.func
-def add_friction(
-    env: wp.int32,
-    i: wp.int32,
-    x: wp.array2d(dtype=wp.vec3d),
-    start: wp.array2d(dtype=wp.vec3d),
-    lagged: Lagged,
-    eps: wp.float64,
-    gradient: wp.array2d(dtype=wp.vec3d),
-    out: Contacts,
-):
-    """Friction forces and rows."""
-    limit = lagged.limit[env, i]
-    if limit <= wp.float64(0.0):
-        return
-    verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-    u = sliding(x, start, env, verts, c, n)
-    y = wp.length(u)
-    ratio = friction_slope_ratio(y, eps)
-    for k in range(4):
-        if verts[k] >= 0:
-            wp.atomic_add(gradient, env, verts[k], (limit * ratio * c[k]) * u)
-    along = wp.vec3d()
-    if y > wp.float64(0.0):
-        along = u / y
-    else:
-        axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
-        if wp.abs(n[0]) > wp.float64(0.7):
-            axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
-        along = wp.normalize(axis - wp.dot(axis, n) * n)
-    across = wp.cross(n, along)
-    p, q = wp.sqrt(limit * friction_curvature(y, eps)), wp.sqrt(limit * ratio)
-    if p > wp.float64(0.0):
-        push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
-    push_row(out, env, verts, (q * c[0]) * across, (q * c[1]) * across, (q * c[2]) * across, (q * c[3]) * across)
-
-
 @wp.kernel
 def friction_rows(
     x: wp.array2d(dtype=wp.vec3d),
@@ -169,31 +132,33 @@ def friction_rows(
     out: Contacts,
 ):
     """Friction forces and rows."""
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(lagged.count[env], lagged.limit.shape[1])
-    while i < n:
-        add_friction(env, i, x, start, lagged, eps, gradient, out)
-        i += lanes
-
-
-@wp.func
-def add_friction_change(
-    env: wp.int32,
-    i: wp.int32,
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    start: wp.array2d(dtype=wp.vec3d),
-    lagged: Lagged,
-    eps: wp.float64,
-    change: wp.array(dtype=wp.float64),
-):
-    """Adds the change of the friction potential from x0 to x1 [J]."""
-    verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-    y0 = wp.length(sliding(x0, start, env, verts, c, n))
-    y1 = wp.length(sliding(x1, start, env, verts, c, n))
-    wp.atomic_add(change, env, lagged.limit[env, i] * (friction_potential(y1, eps) - friction_potential(y0, eps)))
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        limit = lagged.limit[env, i]
+        if limit <= wp.float64(0.0):
+            continue
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        u = sliding(x, start, env, verts, c, n)
+        y = wp.length(u)
+        ratio = friction_slope_ratio(y, eps)
+        for k in range(4):
+            if verts[k] >= 0:
+                wp.atomic_add(gradient, env, verts[k], (limit * ratio * c[k]) * u)
+        along = wp.vec3d()
+        if y > wp.float64(0.0):
+            along = u / y
+        else:
+            axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+            if wp.abs(n[0]) > wp.float64(0.7):
+                axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+            along = wp.normalize(axis - wp.dot(axis, n) * n)
+        across = wp.cross(n, along)
+        p, q = wp.sqrt(limit * friction_curvature(y, eps)), wp.sqrt(limit * ratio)
+        if p > wp.float64(0.0):
+            push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
+        push_row(out, env, verts, (q * c[0]) * across, (q * c[1]) * across, (q * c[2]) * across, (q * c[3]) * across)
 
 
 @wp.kernel
@@ -209,34 +174,14 @@ def friction_change(
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the friction potential from x0 to x1 [J]."""
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(lagged.count[env], lagged.limit.shape[1])
-    while i < n:
-        add_friction_change(env, i, x0, x1, start, lagged, eps, change)
-        i += lanes
-
-
-@wp.func
-def add_difference(
-    env: wp.int32,
-    i: wp.int32,
-    lagged: Lagged,
-    sign: wp.float64,
-    force: wp.array2d(dtype=wp.vec3d),
-    size: wp.array(dtype=wp.float64),
-):
-    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
-
-    Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
-    """
-    verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-    for k in range(4):
-        if verts[k] >= 0:
-            wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
-    if sign > wp.float64(0.0):
-        wp.atomic_add(size, env, lagged.limit[env, i])
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        y0 = wp.length(sliding(x0, start, env, verts, c, n))
+        y1 = wp.length(sliding(x1, start, env, verts, c, n))
+        wp.atomic_add(change, env, lagged.limit[env, i] * (friction_potential(y1, eps) - friction_potential(y0, eps)))
 
 
 @wp.kernel
@@ -253,13 +198,16 @@ def lag_difference(
 
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
     """
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(lagged.count[env], lagged.limit.shape[1])
-    while i < n:
-        add_difference(env, i, lagged, sign, force, size)
-        i += lanes
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        for k in range(4):
+            if verts[k] >= 0:
+                wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
+        if sign > wp.float64(0.0):
+            wp.atomic_add(size, env, lagged.limit[env, i])
 
 
 @wp.kernel

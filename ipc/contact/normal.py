@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.broad_phase.lists import Candidates, Surface
+from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
-from ipc.contact.distance import edge_edge_coefficients, point_triangle_coefficients, separation
+from ipc.contact.distance import edge_edge_coefficients, pair_coefficients, point_triangle_coefficients, separation
 
 __all__ = [
     "Contacts",
@@ -28,10 +28,10 @@ __all__ = [
     "contact_ee",
     "contact_plane",
     "contact_pt",
-    "energy_ee",
+    "energy_pairs",
     "energy_plane",
-    "energy_pt",
     "mat34d",
+    "rows_of",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -55,6 +55,12 @@ class Contacts:
     row_verts: wp.array2d(dtype=wp.vec4i)
     row: wp.array2d(dtype=mat34d)
     row_count: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def rows_of(contacts: Contacts, env: wp.int32) -> wp.int32:
+    """Rows of an environment that are stored."""
+    return wp.min(contacts.row_count[env], contacts.row.shape[1])
 
 
 @wp.func
@@ -135,111 +141,25 @@ def push_simple(
     push_row(out, env, verts, (k * coef[0]) * n, (k * coef[1]) * n, (k * coef[2]) * n, (k * coef[3]) * n)
 
 
-@wp.kernel
-def clear(
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """No forces, contacts or rows in the active environments."""
-    env, v = wp.tid()
-    if active[env] == 0:
-        return
-    gradient[env, v] = wp.vec3d()
-    if v == 0:
-        energy[env] = wp.float64(0.0)
-        out.count[env] = 0
-        out.row_count[env] = 0
-
-
-@wp.kernel
-def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
-    """Raises the flag if contacts or rows did not fit."""
-    env = wp.tid()
-    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
-        overflow[0] = 1
-
-
 @wp.func
-def add_pt(
+def push_mollified(
+    out: Contacts,
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
     env: wp.int32,
-    i: wp.int32,
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
+    verts: wp.vec4i,
+    coef: wp.vec4d,
+    t: wp.vec3d,
+    D: wp.float64,
+    Dh: wp.float64,
+    scale: wp.float64,
+    u: wp.vec3d,
+    v: wp.vec3d,
+    c: wp.float64,
+    eps: wp.float64,
+    pair: wp.int32,
 ):
-    """Point-triangle pairs."""
-    item = candidates.pt[env, i]
-    v, f = item[0], item[1]
-    f0, f1, f2 = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
-    p, a, b, c = x[env, v], x[env, f0], x[env, f1], x[env, f2]
-    Dh = surface.d_hat * surface.d_hat
-    coef = point_triangle_coefficients(p, a, b, c)
-    t = separation(coef, p, a, b, c)
-    D = wp.length_sq(t)
-    if Dh > D:
-        scale = wp.float64(0.25) * surface.vert_area[v] * scale_of(surface, kappa[env])
-        push_simple(out, gradient, energy, env, wp.vec4i(v, f0, f1, f2), coef, t, D, Dh, scale, item[2])
-
-
-@wp.kernel
-def contact_pt(
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """Point-triangle pairs."""
-    env, i = wp.tid()
-    if active[env] == 0:
-        return
-    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
-    while i < n:
-        add_pt(env, i, x, surface, candidates, kappa, gradient, energy, out)
-        i += lanes
-
-
-@wp.func
-def add_ee(
-    env: wp.int32,
-    i: wp.int32,
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """Edge-edge pairs, mollified where they are nearly parallel."""
-    item = candidates.ee[env, i]
-    ea, eb = item[0], item[1]
-    verts = wp.vec4i(surface.edges[ea, 0], surface.edges[ea, 1], surface.edges[eb, 0], surface.edges[eb, 1])
-    a0, a1, b0, b1 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
-    Dh = surface.d_hat * surface.d_hat
-    coef = edge_edge_coefficients(a0, a1, b0, b1)
-    t = separation(coef, a0, a1, b0, b1)
-    D = wp.length_sq(t)
-    if Dh <= D:
-        return
-    scale = edge_weight(surface, ea, eb) * scale_of(surface, kappa[env])
-    eps = mollifier_threshold(surface, ea, eb)
-    c = cross_squared(a0, a1, b0, b1)
-    if c >= eps:
-        push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
-        return
+    """Force, contact and rows of two nearly parallel edges along u and v; ``scale`` is A κ/d̂³."""
     zero, two = wp.float64(0.0), wp.float64(2.0)
     d = wp.sqrt(D)
     n = t / d
@@ -248,7 +168,6 @@ def add_ee(
     f_d = scale * two * d * first
     f_dd = scale * (two * first + wp.float64(4.0) * D * second)
     m, m1, m2 = mollifier(c, eps), mollifier_first(c, eps), mollifier_second(c, eps)
-    u, v = a1 - a0, b1 - b0
     w = wp.cross(u, v)
     ga, gb = two * wp.cross(v, w), two * wp.cross(w, u)  # ∂c/∂a1, ∂c/∂b1
     slope = m * f_d
@@ -257,7 +176,7 @@ def add_ee(
     wp.atomic_add(gradient, env, verts[2], (slope * coef[2]) * n - (f * m1) * gb)
     wp.atomic_add(gradient, env, verts[3], (slope * coef[3]) * n + (f * m1) * gb)
     wp.atomic_add(energy, env, m * f)
-    push_contact(out, env, verts, coef, n, d, -slope, item[2])
+    push_contact(out, env, verts, coef, n, d, -slope, pair)
     # As a function of d and c alone, m f has the Hessian [h00 h01; h01 h11] over their gradients. It is clamped as the matrix that it is
     # in the space of the four vertices, over the orthonormal e1, e2 that span the gradients: ∇d = g e1, ∇c = s e1 + rest e2.
     h00, h01, h11 = m * f_dd, f_d * m1, f * m2
@@ -297,6 +216,63 @@ def add_ee(
 
 
 @wp.kernel
+def clear(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """No forces, contacts or rows in the active environments."""
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    gradient[env, v] = wp.vec3d()
+    if v == 0:
+        energy[env] = wp.float64(0.0)
+        out.count[env] = 0
+        out.row_count[env] = 0
+
+
+@wp.kernel
+def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if contacts or rows did not fit."""
+    env = wp.tid()
+    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
+        overflow[0] = 1
+
+
+@wp.kernel
+def contact_pt(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Point-triangle pairs."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, pairs_of(candidates, False, env), lanes):
+        item = candidates.pt[env, i]
+        verts = pair_vertices(surface, False, item)
+        p, a, b, c = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+        Dh = surface.d_hat * surface.d_hat
+        coef = point_triangle_coefficients(p, a, b, c)
+        t = separation(coef, p, a, b, c)
+        D = wp.length_sq(t)
+        if Dh > D:
+            scale = wp.float64(0.25) * surface.vert_area[verts[0]] * scale_of(surface, kappa[env])
+            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
+
+
+@wp.kernel
 def contact_ee(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
@@ -310,50 +286,27 @@ def contact_ee(
     out: Contacts,
 ):
     """Edge-edge pairs, mollified where they are nearly parallel."""
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
-    while i < n:
-        add_ee(env, i, x, surface, candidates, kappa, gradient, energy, out)
-        i += lanes
-
-
-@wp.func
-def add_plane(
-    env: wp.int32,
-    i: wp.int32,
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """Points above half-spaces."""
-    v, body = surface.plane_vert[i], surface.plane_body[i]
-    R = frame_R[env, body]
-    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-    d = wp.dot(n, x[env, v] - frame_t[env, body])
-    if d < surface.d_hat:
-        scale = surface.vert_area[v] * scale_of(surface, kappa[env])
-        zero = wp.float64(0.0)
-        coef = wp.vec4d(wp.float64(1.0), zero, zero, zero)
-        push_simple(
-            out,
-            gradient,
-            energy,
-            env,
-            wp.vec4i(v, -1, -1, -1),
-            coef,
-            d * n,
-            d * d,
-            surface.d_hat * surface.d_hat,
-            scale,
-            surface.plane_pair[i],
-        )
+    for i in range(lane, pairs_of(candidates, True, env), lanes):
+        item = candidates.ee[env, i]
+        ea, eb = item[0], item[1]
+        verts = pair_vertices(surface, True, item)
+        a0, a1, b0, b1 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+        Dh = surface.d_hat * surface.d_hat
+        coef = edge_edge_coefficients(a0, a1, b0, b1)
+        t = separation(coef, a0, a1, b0, b1)
+        D = wp.length_sq(t)
+        if Dh <= D:
+            continue
+        scale = edge_weight(surface, ea, eb) * scale_of(surface, kappa[env])
+        eps = mollifier_threshold(surface, ea, eb)
+        c = cross_squared(a0, a1, b0, b1)
+        if c >= eps:
+            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
+        else:
+            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, a1 - a0, b1 - b0, c, eps, item[2])
 
 
 @wp.kernel
@@ -371,136 +324,69 @@ def contact_plane(
     out: Contacts,
 ):
     """Points above half-spaces."""
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = surface.plane_vert.shape[0]
-    while i < n:
-        add_plane(env, i, x, surface, frame_R, frame_t, kappa, gradient, energy, out)
-        i += lanes
+    for i in range(lane, surface.plane_vert.shape[0], lanes):
+        v, body = surface.plane_vert[i], surface.plane_body[i]
+        R = frame_R[env, body]
+        n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+        d = wp.dot(n, x[env, v] - frame_t[env, body])
+        if d < surface.d_hat:
+            scale = surface.vert_area[v] * scale_of(surface, kappa[env])
+            zero = wp.float64(0.0)
+            coef = wp.vec4d(wp.float64(1.0), zero, zero, zero)
+            push_simple(
+                out,
+                gradient,
+                energy,
+                env,
+                wp.vec4i(v, -1, -1, -1),
+                coef,
+                d * n,
+                d * d,
+                surface.d_hat * surface.d_hat,
+                scale,
+                surface.plane_pair[i],
+            )
 
 
 @wp.func
-def pt_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, v: wp.int32, f: wp.int32) -> wp.float64:
-    p = x[env, v]
-    a, b, c = x[env, surface.faces[f, 0]], x[env, surface.faces[f, 1]], x[env, surface.faces[f, 2]]
-    D = wp.length_sq(separation(point_triangle_coefficients(p, a, b, c), p, a, b, c))
-    return wp.float64(0.25) * surface.vert_area[v] * barrier(D, surface.d_hat * surface.d_hat)
-
-
-@wp.func
-def ee_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ea: wp.int32, eb: wp.int32) -> wp.float64:
-    a0, a1 = x[env, surface.edges[ea, 0]], x[env, surface.edges[ea, 1]]
-    b0, b1 = x[env, surface.edges[eb, 0]], x[env, surface.edges[eb, 1]]
-    D = wp.length_sq(separation(edge_edge_coefficients(a0, a1, b0, b1), a0, a1, b0, b1))
-    b = barrier(D, surface.d_hat * surface.d_hat)
+def pair_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+    """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
+    v = pair_vertices(surface, ee, pair)
+    x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
+    b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
     if b == wp.float64(0.0):
         return b
-    return edge_weight(surface, ea, eb) * b * mollifier(cross_squared(a0, a1, b0, b1), mollifier_threshold(surface, ea, eb))
-
-
-@wp.func
-def add_energy_pt(
-    env: wp.int32,
-    i: wp.int32,
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    change: wp.array(dtype=wp.float64),
-):
-    """Adds the change of the point-triangle energy from x0 to x1 [J]."""
-    item = candidates.pt[env, i]
-    e = pt_energy(x1, surface, env, item[0], item[1]) - pt_energy(x0, surface, env, item[0], item[1])
-    if e != wp.float64(0.0):
-        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+    if ee:
+        m = mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
+        return edge_weight(surface, pair[0], pair[1]) * b * m
+    return wp.float64(0.25) * surface.vert_area[v[0]] * b
 
 
 @wp.kernel
-def energy_pt(
+def energy_pairs(
     x0: wp.array2d(dtype=wp.vec3d),
     x1: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
     candidates: Candidates,
+    ee: wp.bool,
     kappa: wp.array(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
     lanes: wp.int32,
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
-    """Adds the change of the point-triangle energy from x0 to x1 [J]."""
-    env, i = wp.tid()
+    """Adds the change of the energy of edge-edge (``ee``) or point-triangle pairs from x0 to x1 [J]."""
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(candidates.pt_count[env], candidates.pt.shape[1])
-    while i < n:
-        add_energy_pt(env, i, x0, x1, surface, candidates, kappa, change)
-        i += lanes
-
-
-@wp.func
-def add_energy_ee(
-    env: wp.int32,
-    i: wp.int32,
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    change: wp.array(dtype=wp.float64),
-):
-    """Adds the change of the edge-edge energy from x0 to x1 [J]."""
-    item = candidates.ee[env, i]
-    e = ee_energy(x1, surface, env, item[0], item[1]) - ee_energy(x0, surface, env, item[0], item[1])
-    if e != wp.float64(0.0):
-        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
-
-
-@wp.kernel
-def energy_ee(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    change: wp.array(dtype=wp.float64),
-):
-    """Adds the change of the edge-edge energy from x0 to x1 [J]."""
-    env, i = wp.tid()
-    if active[env] == 0:
-        return
-    n = wp.min(candidates.ee_count[env], candidates.ee.shape[1])
-    while i < n:
-        add_energy_ee(env, i, x0, x1, surface, candidates, kappa, change)
-        i += lanes
-
-
-@wp.func
-def add_energy_plane(
-    env: wp.int32,
-    i: wp.int32,
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    change: wp.array(dtype=wp.float64),
-):
-    """Adds the change of the point-plane energy from x0 to x1 [J]."""
-    v, body = surface.plane_vert[i], surface.plane_body[i]
-    R = frame_R[env, body]
-    n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-    d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
-    d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
-    if d0 < surface.d_hat or d1 < surface.d_hat:
-        Dh = surface.d_hat * surface.d_hat
-        e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
-        wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        pair = pair_at(candidates, ee, env, i)
+        e = pair_energy(x1, surface, env, ee, pair) - pair_energy(x0, surface, env, ee, pair)
+        if e != wp.float64(0.0):
+            wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
 
 
 @wp.kernel
@@ -517,10 +403,16 @@ def energy_plane(
     change: wp.array(dtype=wp.float64),
 ):
     """Adds the change of the point-plane energy from x0 to x1 [J]."""
-    env, i = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = surface.plane_vert.shape[0]
-    while i < n:
-        add_energy_plane(env, i, x0, x1, surface, frame_R, frame_t, kappa, change)
-        i += lanes
+    for i in range(lane, surface.plane_vert.shape[0], lanes):
+        v, body = surface.plane_vert[i], surface.plane_body[i]
+        R = frame_R[env, body]
+        n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+        d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
+        d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
+        if d0 < surface.d_hat or d1 < surface.d_hat:
+            Dh = surface.d_hat * surface.d_hat
+            e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
+            wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.contact.normal import Contacts, mat34d
+from ipc.contact.normal import Contacts, mat34d, rows_of
 from ipc.reduce import BLOCK
 
 __all__ = [
@@ -178,30 +178,11 @@ def multiply_rows(
     """
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
-    r = c * BLOCK + lane
-    if active[env] != 0 and r < lanes:
-        while r < wp.min(contacts.row_count[env], contacts.row.shape[1]):
+    first = c * BLOCK + lane
+    if active[env] != 0 and first < lanes:
+        for r in range(first, rows_of(contacts, env), lanes):
             total += add_row(system, contacts, env, r, p, out)
-            r += lanes
     wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
-
-
-@wp.func
-def push_row_ahead(
-    env: wp.int32,
-    r: wp.int32,
-    system: SystemView,
-    contacts: Contacts,
-    dx: wp.array2d(dtype=wp.vec3d),
-    residual: wp.array2d(dtype=wp.vec3d),
-):
-    """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    s = wp.float64(0.0)
-    for k in range(4):
-        if verts[k] >= 0:
-            s += wp.dot(row_column(row, k), dx[env, verts[k]])
-    spread_row(system, verts, row, env, -s, residual)
 
 
 @wp.kernel
@@ -215,13 +196,16 @@ def push_rows(
     residual: wp.array2d(dtype=wp.vec3d),
 ):
     """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
-    env, r = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
-    while r < n:
-        push_row_ahead(env, r, system, contacts, dx, residual)
-        r += lanes
+    for r in range(lane, rows_of(contacts, env), lanes):
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        s = wp.float64(0.0)
+        for k in range(4):
+            if verts[k] >= 0:
+                s += wp.dot(row_column(row, k), dx[env, verts[k]])
+        spread_row(system, verts, row, env, -s, residual)
 
 
 @wp.kernel
@@ -245,18 +229,6 @@ def diagonal_blocks(system: SystemView, active: wp.array(dtype=wp.int32), out: w
         out[env, i] = system.blocks[env, system.diagonal[i]]
 
 
-@wp.func
-def add_row_to_diagonal(env: wp.int32, r: wp.int32, system: SystemView, contacts: Contacts, out: wp.array2d(dtype=wp.mat33d)):
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    for k in range(4):
-        v = verts[k]
-        if v >= 0:
-            q = wp.transpose(system.R[env, system.vert_body[v]]) * row_column(row, k)
-            for m in range(system.vert_count[v]):
-                w = system.vert_weight[v, m]
-                wp.atomic_add(out, env, system.vert_nodes[v, m], (w * w) * wp.outer(q, q))
-
-
 @wp.kernel
 def diagonal_rows(
     system: SystemView,
@@ -267,13 +239,18 @@ def diagonal_rows(
     out: wp.array2d(dtype=wp.mat33d),
 ):
     """Adds the diagonal blocks of Σ q qᵀ."""
-    env, r = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
-    while r < n:
-        add_row_to_diagonal(env, r, system, contacts, out)
-        r += lanes
+    for r in range(lane, rows_of(contacts, env), lanes):
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        for k in range(4):
+            v = verts[k]
+            if v >= 0:
+                q = wp.transpose(system.R[env, system.vert_body[v]]) * row_column(row, k)
+                for m in range(system.vert_count[v]):
+                    w = system.vert_weight[v, m]
+                    wp.atomic_add(out, env, system.vert_nodes[v, m], (w * w) * wp.outer(q, q))
 
 
 @wp.kernel

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from ipc.contact.normal import Contacts
+from ipc.contact.normal import Contacts, rows_of
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, add_row, block_row, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
@@ -156,7 +156,7 @@ def product_in_order(
             f = block_row(system, env, i, p)
             total += wp.dot(p[env, i], f)
         Ap[env, i] = f
-    for row in range(wp.min(contacts.row_count[env], contacts.row.shape[1])):
+    for row in range(rows_of(contacts, env)):
         total += add_row(system, contacts, env, row, p, Ap)
     return total
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact.normal import Contacts
+from ipc.contact.normal import Contacts, rows_of
 from ipc.solver.linear import SystemView, add_row, block_row
 
 __all__ = ["THREADS", "Scalars", "solve_in_one_block"]
@@ -70,7 +70,7 @@ def solve_in_one_block(
     if active[env] == 0:
         return
     n = r.shape[1]
-    rows = wp.min(contacts.row_count[env], contacts.row.shape[1])
+    rows = rows_of(contacts, env)
     a = wp.float64(0.0)
     b = wp.float64(0.0)
     i = lane

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact.normal import Contacts, mat34d
+from ipc.contact.normal import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
 
 __all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
@@ -118,17 +118,15 @@ def mark_contacts(
     system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
 ):
     """Which surface nodes the rows act on."""
-    env, r = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0:
         return
-    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
-    while r < n:
+    for r in range(lane, rows_of(contacts, env), lanes):
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         for k in range(4):
             s = surface_of_vertex(system, rest, verts[k])
             if s >= 0 and wp.length_sq(row_column(row, k)) > wp.float64(0.0):
                 small.touched[env, s] = 1
-        r += lanes
 
 
 @wp.kernel
@@ -165,13 +163,11 @@ def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, res
 @wp.kernel
 def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
     """S = Σ q qᵀ."""
-    env, r = wp.tid()
+    env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
-    n = wp.min(contacts.row_count[env], contacts.row.shape[1])
-    while r < n:
+    for r in range(lane, rows_of(contacts, env), lanes):
         add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
-        r += lanes
 
 
 @wp.func
