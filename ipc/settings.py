@@ -31,7 +31,13 @@ class Settings:
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
             part; ``ipc/solver/preconditioners/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
+        armijo: share of the decrease that the slope promises which a step must achieve to be accepted [-].
+        ccd_slack: share of a gap that a Newton step has to leave [-].
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
+        gap_floor: gap, as a share of d̂, that an advance of the driven bodies has to leave; the soft side is given time to yield first.
+        max_advance_attempts: how often an advance of the driven bodies is shortened; the last but one stays in place.
+        poor_advance: share of the remaining motion below which the unknowns get time to rest before the bodies advance again [-].
+        blocked_advance: share of the motion of the driven bodies below which an advance after such a rest says that they are blocked [-].
         broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
             (bounding volume hierarchies), or ``"auto"`` (by the numbers of edges and of body pairs). The pairs are the same.
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
@@ -55,7 +61,13 @@ class Settings:
     max_linear: int = 2000
     preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
+    armijo: float = 1e-4
+    ccd_slack: float = 0.1
     motion_fraction: float = 0.8
+    gap_floor: float = 0.01
+    max_advance_attempts: int = 8
+    poor_advance: float = 0.05
+    blocked_advance: float = 1e-4
     broad_phase: Literal["auto", "lists", "bvh"] = "auto"
     cuda_graph: bool = True
     deterministic: bool = False
@@ -81,5 +93,8 @@ class Settings:
             raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'block_jacobi' or 'rest_inverse'")
         if self.broad_phase not in ("auto", "lists", "bvh"):
             raise IpcError(f"broad_phase = {self.broad_phase!r}: choose 'auto', 'lists' or 'bvh'")
-        if not 0 < self.motion_fraction < 1:
-            raise IpcError(f"motion_fraction = {self.motion_fraction}: it must lie between 0 and 1")
+        if self.max_advance_attempts < 2:
+            raise IpcError(f"max_advance_attempts = {self.max_advance_attempts}: at least two are needed")
+        for name in ("armijo", "ccd_slack", "motion_fraction", "gap_floor", "poor_advance", "blocked_advance"):
+            if not 0 < getattr(self, name) < 1:
+                raise IpcError(f"{name} = {getattr(self, name)}: it must lie between 0 and 1")

@@ -148,23 +148,23 @@ class World:
             pot.goal_p.assign(self._goal_p)
             pot.goal_q.assign(self._goal_q)
             self._told = True
-        found = self._newton.step(alive)
-        failed = found["failed"].astype(bool)
+        values = self._newton.step(alive)
+        failed = values["failed"].astype(bool)
         self._failed |= failed
         return StepReport(
-            converged=found["converged"].astype(bool),
+            converged=values["converged"].astype(bool),
             failed=self._failed.copy(),
-            stalled=found["stalled"].astype(bool),
-            blocked=1.0 - found["share"],
-            min_gap=found["min_gap"],
-            min_det=found["min_det"],
-            newton=found["newton"].astype(np.int64),
-            linear=found["linear"].astype(np.int64),
-            line_search=found["line_search"].astype(np.int64),
-            relags=np.maximum(found["relags"], 0).astype(np.int64),
+            stalled=values["stalled"].astype(bool),
+            blocked=1.0 - values["progress"],
+            min_gap=values["min_gap"],
+            min_det=values["min_det"],
+            newton=values["newton"].astype(np.int64),
+            linear=values["linear"].astype(np.int64),
+            line_search=values["line_search"].astype(np.int64),
+            relags=np.maximum(values["relags"], 0).astype(np.int64),
             projected=host(pot.project).astype(bool),
-            ccd=found["ccd"],
-            speed=found["speed"],
+            ccd=values["ccd"],
+            speed=values["speed"],
             pairs=host(pot.collision.contacts.count).astype(np.int64),
             kappa=host(pot.kappa).copy(),
             elastic=host(pot.elastic_energy).copy(),

@@ -31,6 +31,7 @@ __all__ = [
     "node_world",
     "place_grips",
     "predict",
+    "restart",
     "slope_of",
     "take",
     "vertex_motion",
@@ -362,6 +363,20 @@ def lengths(p: wp.array2d(dtype=wp.vec3d), residual: wp.array2d(dtype=wp.vec3d),
     if not (length < wp.float64(1.0e100)) or not (wp.length(residual[env, i]) < wp.float64(1.0e100)):
         length = wp.float64(1.0e300)
     size[env, i] = length
+
+
+@wp.kernel
+def restart(
+    right_side: wp.array2d(dtype=wp.vec3d),
+    again: wp.array(dtype=wp.int32),
+    residual: wp.array2d(dtype=wp.vec3d),
+    p: wp.array2d(dtype=wp.vec3d),
+):
+    """Restores the right-hand side and clears the solution."""
+    env, i = wp.tid()
+    if again[env] != 0:
+        residual[env, i] = right_side[env, i]
+        p[env, i] = wp.vec3d()
 
 
 @wp.kernel

@@ -15,7 +15,7 @@ the step goes on from there.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -72,13 +72,12 @@ class Newton:
             wp.synchronize_device(self.device)
         self.timers[name] = self.timers.get(name, 0.0) + time.perf_counter() - start
 
-    def _run(self, name: str) -> None:
-        """Run ``_<name>``: from a recording on CUDA, made at the first call and after a buffer has grown."""
-        body = {"whole": self._whole, "rest": self._rest}[name]
+    def _run(self, body: Callable[[], None]) -> None:
+        """Run ``body``: from a recording on CUDA, made at the first call and after a buffer has grown."""
         if not (self.device.is_cuda and self.settings.cuda_graph):
             body()
             return
-        key = name, self.potential.dt  # a recording holds the length of its step
+        key = body.__name__, self.potential.dt  # a recording holds the length of its step
         if key not in self._graphs:
             wp.load_module("ipc", device=self.device, recursive=True)
             self._recording = True
@@ -96,19 +95,19 @@ class Newton:
         """Advance the environments of ``alive`` (B,) by one time step; returns the decisions, by name, each (B,)."""
         since = time.perf_counter()
         self.state.write_alive(alive)
-        self._run("whole")
-        found = self.state.read()
+        self._run(self._whole)
+        values = self.state.read()
         for _ in range(64):
             if not self.potential.collision.overflow.numpy()[0]:
                 break
             self.potential.collision.grow()
             self._graphs.clear()
-            self._run("rest")
-            found = self.state.read()
+            self._run(self._rest)
+            values = self.state.read()
         else:
             raise SolverError("contact buffers grew 64 times in one step and are still too small")
         self.timers["step"] = self.timers.get("step", 0.0) + time.perf_counter() - since
-        return found
+        return values
 
     def _whole(self) -> None:
         with self._stage("begin"):
@@ -120,19 +119,19 @@ class Newton:
         pot, state = self.potential, self.state
         with self._stage("broad"):
             pot.collision.refresh(pot.x, self._still, state.decisions.alive)
-        self._look()
+        self._set_flags()
         wp.capture_while(state.flags.go, self._iterate)
-        wp.launch(decisions.look_at_end, dim=1, inputs=[state.flags], device=self.device)
+        wp.launch(decisions.set_done, dim=1, inputs=[state.flags], device=self.device)
         wp.capture_if(state.flags.done, self._assemble_end)
-        wp.launch(decisions.look_at_end, dim=1, inputs=[state.flags], device=self.device)
+        wp.launch(decisions.set_done, dim=1, inputs=[state.flags], device=self.device)
         wp.capture_if(state.flags.done, self._end)
 
     def _begin(self) -> None:
         pot, state = self.potential, self.state
         inputs = [pot.frame_q, pot.frame_p, pot.goal_q, pot.goal_p, pot.frame_moves]
-        pot.launch(dynamics.compare_frames, self.batch, inputs, [state.decisions.share])
+        pot.launch(dynamics.compare_frames, self.batch, inputs, [state.decisions.progress])
         state.launch(decisions.start_step, self._friction)
-        pot.set_frames(state.decisions.share, pot.R, pot.t)
+        pot.set_frames(state.decisions.progress, pot.R, pot.t)
         pot.place_grips(pot.y, pot.R, pot.t)
         pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
         wp.copy(pot.x_start, pot.x)
@@ -142,9 +141,9 @@ class Newton:
         pot.aim_inertia(pot.R, pot.t)
         pot.measure_reach()
 
-    def _look(self) -> None:
+    def _set_flags(self) -> None:
         self.state.clear_flags()
-        self.state.launch(decisions.look)
+        self.state.launch(decisions.set_flags)
 
     def _note_extremes(self, mask: wp.array) -> None:
         """Least gap and determinant of the state just assembled."""
@@ -159,23 +158,23 @@ class Newton:
         d, f = state.decisions, state.flags
         if self._friction:
             wp.capture_if(f.pending, self._lag)
-        state.launch(decisions.choose_travelling)
-        wp.capture_if(f.travel, pot.look_ahead, share=d.share1)
+        state.launch(decisions.choose_advancing)
+        wp.capture_if(f.advance, pot.look_ahead, share=d.trial_progress)
         with self._stage("forces"):
             pot.assemble(d.active)
             self._note_extremes(d.active)
         with self._stage("matrix"):
             pot.fill_matrix(d.active)
-            wp.capture_if(f.travel, pot.push_ahead, mask=d.travelling)
+            wp.capture_if(f.advance, pot.push_ahead, mask=d.advancing)
         self._solve()
         pot.size_of_step(d.active, d.size)
         state.launch(decisions.judge_direction, pot.dt)
-        with self._stage("travel"):
-            wp.capture_if(f.travel, self._travel)
+        with self._stage("advance"):
+            wp.capture_if(f.advance, self._advance)
         wp.capture_if(f.plain, self._line_search)
         tolerance = settings.velocity_tolerance
         state.launch(decisions.conclude, tolerance, settings.max_newton, settings.friction_relags, self._friction)
-        self._look()
+        self._set_flags()
 
     def _lag(self) -> None:
         """Friction of the environments that rest, or begin, from their contacts as they are."""
@@ -210,26 +209,26 @@ class Newton:
         pot, again = self.potential, self.state.decisions.again
         pot.elements(again)
         pot.fill_matrix(again)
-        pot.launch(decisions.restart, pot.p.shape, [pot.right_side, again], [pot.residual, pot.p])
+        pot.launch(dynamics.restart, pot.p.shape, [pot.right_side, again], [pot.residual, pot.p])
         self._solve_for(again)
 
-    def _travel(self) -> None:
+    def _advance(self) -> None:
         """Move frames and unknowns together as far as gaps allow."""
         pot, state = self.potential, self.state
         d = state.decisions
-        state.launch(decisions.start_travel)
-        wp.capture_while(state.flags.shorten, self._try_travel)
-        state.launch(decisions.conclude_travel)
+        state.launch(decisions.start_advance)
+        wp.capture_while(state.flags.shorten, self._try_advance)
+        state.launch(decisions.conclude_advance, self.settings.blocked_advance, self.settings.poor_advance)
         for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.R, pot.R1), (pot.t, pot.t1)):
-            pot.launch(dynamics.take, old.shape, [new, d.taken], [old])
+            pot.launch(dynamics.take, old.shape, [new, d.accepted], [old])
         pot.aim_inertia(pot.R, pot.t)
 
-    def _try_travel(self) -> None:
+    def _try_advance(self) -> None:
         pot, state = self.potential, self.state
         d = state.decisions
-        slack, floor = 1.0 - self.settings.motion_fraction, decisions.GAP_FLOOR * pot.collision.d_hat
-        state.launch(decisions.try_travel, slack, floor)
-        pot.set_frames(d.share1, pot.R1, pot.t1)
+        slack, floor = 1.0 - self.settings.motion_fraction, self.settings.gap_floor * pot.collision.d_hat
+        state.launch(decisions.try_advance, slack, floor)
+        pot.set_frames(d.trial_progress, pot.R1, pot.t1)
         pot.launch(dynamics.advance_nodes, pot.y.shape, [pot.y, pot.p, d.alpha, pot.y1])
         pot.place_grips(pot.y1, pot.R1, pot.t1)
         pot.place_vertices(pot.y1, pot.R1, pot.t1, pot.x1)
@@ -239,7 +238,7 @@ class Newton:
         pot.collision.limit_step(pot.x, pot.dx, (pot.R, pot.t), (pot.R1, pot.t1), d.slack, d.floor, pot.reach, d.shorten, d.alpha)
         pot.elastic_change(d.shorten, d.trial_det)
         state.flags.shorten.zero_()
-        state.launch(decisions.judge_travel)
+        state.launch(decisions.judge_advance, self.settings.max_advance_attempts)
 
     def _line_search(self) -> None:
         """Take the step p as far as contacts, energy and inversion allow."""
@@ -249,7 +248,7 @@ class Newton:
         with self._stage("broad"):
             pot.collision.refresh(pot.x, pot.dx, d.plain)
         with self._stage("ccd"):
-            state.launch(decisions.start_limit, decisions.CCD_SLACK)
+            state.launch(decisions.start_limit, self.settings.ccd_slack)
             frames = (pot.R, pot.t)
             pot.collision.limit_step(pot.x, pot.dx, frames, frames, d.slack, d.floor, pot.reach, d.plain, d.alpha)
         with self._stage("line_search"):
@@ -257,8 +256,8 @@ class Newton:
             state.launch(decisions.start_search, pot.reach)
             wp.capture_while(state.flags.search, self._try_step)
             state.launch(decisions.end_search)
-            pot.launch(dynamics.take, pot.y.shape, [pot.y1, d.taken], [pot.y])
-            pot.launch(dynamics.take, pot.x.shape, [pot.x1, d.taken], [pot.x])
+            pot.launch(dynamics.take, pot.y.shape, [pot.y1, d.accepted], [pot.y])
+            pot.launch(dynamics.take, pot.x.shape, [pot.x1, d.accepted], [pot.x])
 
     def _try_step(self) -> None:
         pot, state = self.potential, self.state
@@ -267,7 +266,7 @@ class Newton:
         state.launch(decisions.clear_det)
         pot.change(d.searching, d.change, d.trial_det)
         state.flags.search.zero_()
-        state.launch(decisions.judge_energy, self.settings.max_line_search)
+        state.launch(decisions.judge_energy, self.settings.armijo, self.settings.max_line_search)
 
     def _assemble_end(self) -> None:
         """Forces and contacts of the last state."""
@@ -282,10 +281,10 @@ class Newton:
         pot, state = self.potential, self.state
         d = state.decisions
         with self._stage("end"):
-            pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.taken], [pot.y])
+            pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
             pot.place_nodes(pot.xw1)
             pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
-            pot.set_frames(d.share, pot.R, pot.t)
+            pot.set_frames(d.progress, pot.R, pot.t)
             pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
