@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies.body import AffineBody, Body
-from ipc.bodies.layout import Layout, rotation_matrix
+from ipc.bodies.body import AffineBody, Body, rotation_matrix
+from ipc.bodies.layout import Layout
 from ipc.errors import IpcError
 
 __all__ = ["State", "env_mask", "per_env", "start_state", "teleported", "unit_pose"]

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody
-from ipc.bodies.layout import build_layout, rotation_matrix
+from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody, rotation_matrix
+from ipc.bodies.layout import build_layout
 from ipc.contact.overlap import check_overlap, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench

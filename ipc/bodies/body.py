@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,28 @@ from ipc.bodies.material import Material, Stiff
 from ipc.errors import IpcError
 from ipc.meshes.mesh import TetMesh, TriMesh
 
-__all__ = ["AffineBody", "Body", "HalfSpace", "KinematicBody", "Pose", "SoftBody", "vertices_in_box", "vertices_near"]
+__all__ = [
+    "AffineBody",
+    "Body",
+    "HalfSpace",
+    "KinematicBody",
+    "Pose",
+    "SoftBody",
+    "rotation_matrix",
+    "vertices_in_box",
+    "vertices_near",
+]
+
+
+def rotation_matrix(quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices of unit quaternions (w, x, y, z), shape (..., 4) to (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 @dataclass(frozen=True)

@@ -7,32 +7,23 @@ surface points that touch: a soft vertex follows one node, an affine one four, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies.body import AffineBody, Body, HalfSpace, KinematicBody, SoftBody
+from ipc.bodies.body import AffineBody, Body, HalfSpace, KinematicBody, SoftBody, rotation_matrix
 from ipc.bodies.material import MODEL_CODES
 from ipc.errors import IpcError
 from ipc.meshes.mesh import TriMesh, surface_of, surface_topology
 
-__all__ = ["Layout", "build_layout", "rotation_matrix"]
+__all__ = ["Layout", "build_layout"]
 
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
-
-
-def rotation_matrix(quaternion: Sequence[float] | Floats) -> Floats:
-    """Rotation matrices of unit quaternions (w, x, y, z), shape (..., 4) to (..., 3, 3)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+Arrays = dict[str, NDArray]
+"""Arrays of one body by the names of :class:`Layout`, with nodes counted from the body's first."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +31,7 @@ class Layout:
     """The flat arrays; sizes: bodies, N nodes, T elements, K matrix blocks, V vertices, E edges, F faces, P body pairs.
 
     Attributes:
-        names: body names, in order.
+        names: body names, in order.    half_space: body is a half-space (bodies,).
         frame_names: names of the frames: one a body, in order, then grips and aims of driven affine bodies, ``"<body>.<grip>"`` and
             ``"<body>.aim"``.
         framed: frame is driven (kinematic, half-space, soft with bonded vertices, grip, aim), shape (frames,).
@@ -61,9 +52,7 @@ class Layout:
         node_vert_start (N+1,), node_vert, node_vert_weight: the vertices that follow a node.
         edges (E, 2), edge_area (E,), faces (F, 3), edge_rest2: squared rest length [m²] (E,).
         pairs (P, 2): bodies that may touch; a half-space comes second.    friction (P,): μ of each.
-        half_space: body is a half-space, shape (bodies,).
-        min_edge: shortest edge on the deformable or affine surfaces [m]; of all surfaces without one.
-        max_young: largest Young's modulus of the soft bodies [Pa]; 0 without one.
+        min_edge: shortest edge on soft or affine bodies [m].    max_young: largest of the soft bodies [Pa]; 0 without one.
     """
 
     names: tuple[str, ...]
@@ -120,6 +109,10 @@ class Layout:
     max_young: float
 
 
+_NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam")
+"""Fields of :class:`Layout` that are those of the bodies, one after the other."""
+
+
 def _groups(keys: NDArray, count: int) -> tuple[Ints, Ints]:
     """Starts and members of the groups of equal keys 0..count−1, members in rising order."""
     order = np.argsort(keys, kind="stable")
@@ -133,7 +126,7 @@ def _corner_gradients(x: Floats) -> Floats:
     return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1, dtype=np.float64)
 
 
-def _affine_parts(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
+def _affine_mass(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
     """Corners of the reference tetrahedron (4, 3), barycentric weights of the vertices (V, 4), masses (4, 4) and volume."""
     v, f = body.surface.vertices, body.surface.faces
     low, high = v.min(axis=0), v.max(axis=0)
@@ -166,6 +159,146 @@ def _affine_parts(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
     return corners, weights(v), body.material.density * mass, volume
 
 
+def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
+    """Surface and arrays: nodes are the vertices of the mesh, and each vertex of the surface follows one."""
+    x, tets = body.mesh.vertices, body.mesh.tets
+    placed = x if len(body.bonded) else x @ rotation_matrix(body.pose.rotation).T + body.pose.position
+    volume = np.linalg.det(x[tets][:, 1:] - x[tets][:, :1]) / 6
+    lumped = np.bincount(tets.ravel(), weights=np.repeat(body.material.density * volume / 4, 4), minlength=len(x))
+    if not (lumped > 0).all():
+        raise IpcError(f"{body.name}: vertex {int(np.argmin(lumped))} belongs to no tetrahedron")
+    free = np.ones(len(x))
+    free[np.concatenate([body.bonded, *body.grips.values()])] = 0
+    mu, lam = body.material.coefficients()
+    used, local = np.unique(surface_of(tets), return_inverse=True)
+    return TriMesh(x[used], local.reshape(-1, 3)), {
+        "node_rest": placed,
+        "node_free": free,
+        "node_damping": body.material.mass_damping * lumped,
+        "node_drive": np.zeros(len(x)),
+        "aim_local": np.zeros((len(x), 3)),
+        "tets": tets,
+        "grads": _corner_gradients(placed[tets]),
+        "volume": volume,
+        "model": np.full(len(tets), MODEL_CODES[body.material.model]),
+        "mu": np.full(len(tets), mu),
+        "lam": np.full(len(tets), lam),
+        "mass_row": np.arange(len(x)),
+        "mass_col": np.arange(len(x)),
+        "mass": lumped,
+        "vert_count": np.ones(len(used)),
+        "vert_nodes": np.pad(used[:, None], ((0, 0), (0, 3))),
+        "vert_weight": np.tile([1.0, 0, 0, 0], (len(used), 1)),
+    }
+
+
+def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
+    """Surface and arrays: nodes are the corners of a tetrahedron around the body, and each vertex follows all four."""
+    corners, weights, mass, volume = _affine_mass(body)
+    row, col = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
+    return body.surface, {
+        "node_rest": corners @ rotation_matrix(body.pose.rotation).T + body.pose.position,
+        "node_free": np.ones(4),
+        "node_damping": np.zeros(4),
+        "node_drive": np.full(4, body.drive),
+        "aim_local": corners,
+        "tets": np.arange(4)[None],
+        "grads": _corner_gradients(corners[None]),
+        "volume": np.array([volume]),
+        "model": np.array([MODEL_CODES["orthogonal"]]),
+        "mu": np.array([body.material.stiffness]),
+        "lam": np.zeros(1),
+        "mass_row": row.ravel(),
+        "mass_col": col.ravel(),
+        "mass": mass.ravel(),
+        "vert_count": np.full(len(weights), 4),
+        "vert_nodes": np.tile(np.arange(4), (len(weights), 1)),
+        "vert_weight": weights,
+    }
+
+
+def _arrays(body: Body) -> tuple[TriMesh | None, Arrays]:
+    """Surface and arrays of a body; a kinematic one has no nodes, a half-space no surface either."""
+    if isinstance(body, SoftBody):
+        return _soft(body)
+    if isinstance(body, AffineBody):
+        return _affine(body)
+    if isinstance(body, KinematicBody):
+        zero = np.zeros((len(body.surface.vertices), 4))
+        return body.surface, {"vert_count": zero[:, 0], "vert_nodes": zero, "vert_weight": zero}
+    if isinstance(body, HalfSpace):
+        return None, {}
+    raise IpcError(f"{body!r} is no body: choose SoftBody, AffineBody, KinematicBody or HalfSpace")
+
+
+def _frames(bodies: Sequence[Body], node_start: Ints) -> Arrays:
+    """Frames, one a body in order and then those of grips and aims, and what they carry."""
+    names, owner, node_aim = [body.name for body in bodies], list(range(len(bodies))), np.full(node_start[-1], -1)
+    moves = [isinstance(b, KinematicBody | HalfSpace) or (isinstance(b, SoftBody) and len(b.bonded) > 0) for b in bodies]
+    nodes, frames, places = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, 3))]
+    for number, body in enumerate(bodies):
+        if isinstance(body, SoftBody):
+            for grip, ids in body.grips.items():
+                nodes.append(ids + node_start[number])
+                frames.append(np.full(len(ids), len(names)))
+                places.append(body.mesh.vertices[ids])
+                names.append(f"{body.name}.{grip}")
+                owner.append(number)
+                moves.append(True)
+        elif isinstance(body, AffineBody) and body.drive:
+            node_aim[node_start[number] : node_start[number + 1]] = len(names)
+            names.append(f"{body.name}.aim")
+            owner.append(number)
+            moves.append(False)
+    framed = np.array(moves) | (np.arange(len(names)) >= len(bodies))
+    poses = [(*bodies[b].pose.position, *bodies[b].pose.rotation) for b in owner]
+    return {
+        "frame_names": np.array(names),
+        "framed": framed,
+        "frame_body": _ints(owner),
+        "frame_moves": _ints(moves),
+        "frame_pose": np.where(framed[:, None], poses, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+        "node_aim": _ints(node_aim),
+        "grip_node": _ints(np.concatenate(nodes)),
+        "grip_frame": _ints(np.concatenate(frames)),
+        "grip_local": np.concatenate(places),
+    }
+
+
+def _pairs(
+    bodies: Sequence[Body], friction: float, exceptions: Mapping[tuple[str, str], float], ignored: Sequence[tuple[str, str]]
+) -> tuple[Ints, Floats]:
+    """Bodies that may touch (P, 2), half-spaces second, and μ of each pair (P,)."""
+    movable = [isinstance(body, SoftBody | AffineBody) for body in bodies]
+    mu_of, skip = {frozenset(pair): mu for pair, mu in exceptions.items()}, {frozenset(pair) for pair in ignored}
+    pairs, mus = [], []
+    for i, first in enumerate(bodies):
+        for j in range(i, len(bodies)):
+            names = frozenset((first.name, bodies[j].name))
+            if names in skip or not (movable[i] or movable[j]):
+                continue
+            if i == j and not (isinstance(first, SoftBody) and first.self_contact):
+                continue
+            pairs.append((j, i) if isinstance(first, HalfSpace) else (i, j))
+            mus.append(mu_of.get(names, friction))
+            if not mus[-1] >= 0:
+                raise IpcError(f"friction of {first.name!r} and {bodies[j].name!r} is {mus[-1]}: it cannot be negative")
+    return _ints(pairs).reshape(-1, 2), _floats(mus)
+
+
+def _ints(values: ArrayLike) -> Ints:
+    return np.ascontiguousarray(values, dtype=np.int32)
+
+
+def _floats(values: ArrayLike) -> Floats:
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _starts(lengths: Iterable[int]) -> Ints:
+    """First index of each of several lists in their concatenation, with the total at the end."""
+    return _ints([0, *np.cumsum(list(lengths))])
+
+
 def build_layout(
     bodies: Sequence[Body], friction: float, exceptions: Mapping[tuple[str, str], float], ignored: Sequence[tuple[str, str]]
 ) -> Layout:
@@ -188,208 +321,80 @@ def build_layout(
             if name not in names:
                 raise IpcError(f"no body is named {name!r}: choose from {', '.join(names)}")
 
-    node_rest, node_free, node_damping, tets, grads, volume, codes, mus, lams = ([] for _ in range(9))
-    mass_rows, mass_cols, mass_values = [], [], []
-    count, vert_nodes, vert_weight, vert_local, vert_area, edges, edge_area, edge_rest2, faces = ([] for _ in range(9))
-    node_start, vert_start, edge_start, face_start, tet_start = ([0] for _ in range(5))
-    shortest, fallback = np.inf, np.inf
-    frame_names, frame_bodies, frame_moves = list(names), list(range(len(bodies))), []
-    for body in bodies:
-        frame_moves.append(
-            int(isinstance(body, KinematicBody | HalfSpace) or (isinstance(body, SoftBody) and len(body.bonded) > 0))
-        )
-    grip_node, grip_frame, grip_local, node_drive, node_aim, aim_local = ([] for _ in range(6))
-
-    for number, body in enumerate(bodies):
-        nodes, verts = node_start[-1], vert_start[-1]
-        surface: TriMesh | None = None
-        if isinstance(body, SoftBody):
-            x, t = body.mesh.vertices, body.mesh.tets
-            placed = x if len(body.bonded) else x @ rotation_matrix(body.pose.rotation).T + body.pose.position
-            vol = np.linalg.det(x[t][:, 1:] - x[t][:, :1]) / 6
-            lumped = np.bincount(t.ravel(), weights=np.repeat(body.material.density * vol / 4, 4), minlength=len(x))
-            if not (lumped > 0).all():
-                raise IpcError(f"{body.name}: vertex {int(np.argmin(lumped))} belongs to no tetrahedron")
-            free = np.ones(len(x), np.int32)
-            free[body.bonded] = 0
-            for grip, ids in body.grips.items():
-                free[ids] = 0
-                grip_node.append(ids + nodes)
-                grip_frame.append(np.full(len(ids), len(frame_names)))
-                grip_local.append(x[ids])
-                frame_names.append(f"{body.name}.{grip}")
-                frame_bodies.append(number)
-                frame_moves.append(1)
-            node_drive.append(np.zeros(len(x)))
-            node_aim.append(np.full(len(x), -1))
-            aim_local.append(np.zeros((len(x), 3)))
-            node_rest.append(placed)
-            node_free.append(free)
-            node_damping.append(body.material.mass_damping * lumped)
-            tets.append(t + nodes)
-            grads.append(_corner_gradients(placed[t]))
-            volume.append(vol)
-            mu, lam = body.material.coefficients()
-            codes.append(np.full(len(t), MODEL_CODES[body.material.model]))
-            mus.append(np.full(len(t), mu))
-            lams.append(np.full(len(t), lam))
-            mass_rows.append(np.arange(len(x)) + nodes)
-            mass_cols.append(np.arange(len(x)) + nodes)
-            mass_values.append(lumped)
-            boundary = surface_of(t)
-            used, local = np.unique(boundary, return_inverse=True)
-            surface = TriMesh(x[used], local.reshape(-1, 3).astype(np.int32))
-            count.append(np.ones(len(used)))
-            vert_nodes.append(np.stack([used + nodes] + [np.zeros(len(used))] * 3, axis=1))
-            vert_weight.append(np.tile([1.0, 0, 0, 0], (len(used), 1)))
-        elif isinstance(body, AffineBody):
-            corners, w, m, vol = _affine_parts(body)
-            node_rest.append(corners @ rotation_matrix(body.pose.rotation).T + body.pose.position)
-            node_free.append(np.ones(4, np.int32))
-            node_drive.append(np.full(4, body.drive))
-            node_aim.append(np.full(4, len(frame_names) if body.drive else -1))
-            aim_local.append(corners)
-            if body.drive:
-                frame_names.append(f"{body.name}.aim")
-                frame_bodies.append(number)
-                frame_moves.append(0)
-            node_damping.append(np.zeros(4))
-            tets.append(np.arange(4)[None] + nodes)
-            grads.append(_corner_gradients(corners[None]))
-            volume.append([vol])
-            codes.append([MODEL_CODES["orthogonal"]])
-            mus.append([body.material.stiffness])
-            lams.append([0.0])
-            a, b = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
-            mass_rows.append(a.ravel() + nodes)
-            mass_cols.append(b.ravel() + nodes)
-            mass_values.append(m.ravel())
-            surface = body.surface
-            count.append(np.full(len(w), 4))
-            vert_nodes.append(np.tile(np.arange(4) + nodes, (len(w), 1)))
-            vert_weight.append(w)
-        elif isinstance(body, KinematicBody):
-            surface = body.surface
-            count.append(np.zeros(len(surface.vertices)))
-            vert_nodes.append(np.zeros((len(surface.vertices), 4)))
-            vert_weight.append(np.zeros((len(surface.vertices), 4)))
-        elif not isinstance(body, HalfSpace):
-            raise IpcError(f"{body!r} is no body: choose SoftBody, AffineBody, KinematicBody or HalfSpace")
-        if surface is not None:
-            topology = surface_topology(surface.vertices, surface.faces)
-            ends = surface.vertices[topology.edges]
-            rest2 = ((ends[:, 1] - ends[:, 0]) ** 2).sum(axis=1)
-            if not rest2.min() > 0:
-                raise IpcError(f"{body.name}: the surface has an edge of no length")
-            vert_local.append(surface.vertices)
-            vert_area.append(topology.vertex_area)
-            edges.append(topology.edges + verts)
-            edge_area.append(topology.edge_area)
-            edge_rest2.append(rest2)
-            faces.append(surface.faces + verts)
-            fallback = min(fallback, float(rest2.min()) ** 0.5)
-            if not isinstance(body, KinematicBody):
-                shortest = min(shortest, float(rest2.min()) ** 0.5)
-        for start, parts in zip(
-            (node_start, vert_start, edge_start, face_start, tet_start), (node_rest, vert_local, edges, faces, tets), strict=True
-        ):
-            start.append(sum(len(p) for p in parts))
+    parts = [_arrays(body) for body in bodies]
+    node_start, tet_start = (_starts(len(arrays.get(name, ())) for _, arrays in parts) for name in ("node_rest", "tets"))
     if node_start[-1] == 0:
         raise IpcError("nothing can move: a world needs a SoftBody or an AffineBody")
 
-    def ints(parts: list, columns: int = 0) -> Ints:
-        shape = (0, columns) if columns else (0,)
-        return np.ascontiguousarray(np.concatenate([np.zeros(shape), *parts]), dtype=np.int32)
+    def joined(name: str, start: Ints | None = None) -> NDArray:
+        """Arrays of all bodies; indices count from each body's ``start``."""
+        return np.concatenate([a[name] + (0 if start is None else start[k]) for k, (_, a) in enumerate(parts) if name in a])
 
-    def floats(parts: list, columns: int = 0) -> Floats:
-        shape = (0, columns) if columns else (0,)
-        return np.ascontiguousarray(np.concatenate([np.zeros(shape), *parts]), dtype=np.float64)
+    meshes = [mesh for mesh, _ in parts]
+    topologies = [surface_topology(mesh.vertices, mesh.faces) if mesh else None for mesh in meshes]
+    vert_start, face_start = (_starts(len(getattr(m, name)) if m else 0 for m in meshes) for name in ("vertices", "faces"))
+    edge_start = _starts(len(topology.edges) if topology else 0 for topology in topologies)
+    surfaces = [
+        (m, topology, first) for m, topology, first in zip(meshes, topologies, vert_start, strict=False) if m and topology
+    ]
+    vert_local = np.concatenate([mesh.vertices for mesh, _, _ in surfaces])
+    edges = _ints(np.concatenate([topology.edges + first for _, topology, first in surfaces]))
+    edge_rest2 = ((vert_local[edges[:, 1]] - vert_local[edges[:, 0]]) ** 2).sum(axis=1)
+    edge_body = np.repeat(np.arange(len(bodies)), np.diff(edge_start))
+    if not edge_rest2.min() > 0:
+        raise IpcError(f"{names[edge_body[np.argmin(edge_rest2)]]}: the surface has an edge of no length")
+    deformable = ~np.array([isinstance(body, KinematicBody) for body in bodies])[edge_body]
 
-    all_tets, n = ints(tets, 4), node_start[-1]
-    a, b = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
-    rows = np.concatenate([all_tets[:, a.ravel()].ravel(), ints(mass_rows)]).astype(np.int64)
-    cols = np.concatenate([all_tets[:, b.ravel()].ravel(), ints(mass_cols)]).astype(np.int64)
+    tets, n = _ints(joined("tets", node_start)), int(node_start[-1])
+    a, b = (index.ravel() for index in np.meshgrid(np.arange(4), np.arange(4), indexing="ij"))
+    rows = np.concatenate([tets[:, a].ravel(), joined("mass_row", node_start)]).astype(np.int64)
+    cols = np.concatenate([tets[:, b].ravel(), joined("mass_col", node_start)]).astype(np.int64)
     blocks, which = np.unique(rows * n + cols, return_inverse=True)
-    elements = 16 * len(all_tets)
-    part_start, part = _groups(which[:elements], len(blocks))
-    corner_start, corner = _groups(all_tets.ravel(), n)
-    counts, follows = ints(count), ints(vert_nodes, 4)
-    slots = np.arange(4)[None] < counts[:, None]
-    followers, members = _groups(follows[slots], n)
-
-    young = [body.material.young for body in bodies if isinstance(body, SoftBody)]
-    movable = [isinstance(body, SoftBody | AffineBody) for body in bodies]
-    mu_of = {frozenset(pair): mu for pair, mu in exceptions.items()}
-    skip = {frozenset(pair) for pair in ignored}
-    pairs, mu_list = [], []
-    for i, first in enumerate(bodies):
-        for j in range(i, len(bodies)):
-            if frozenset((names[i], names[j])) in skip or not (movable[i] or movable[j]):
-                continue
-            if i == j and not (isinstance(first, SoftBody) and first.self_contact):
-                continue
-            pairs.append((j, i) if isinstance(first, HalfSpace) else (i, j))
-            mu_list.append(mu_of.get(frozenset((names[i], names[j])), friction))
-            if not mu_list[-1] >= 0:
-                raise IpcError(f"friction of {names[i]!r} and {names[j]!r} is {mu_list[-1]}: it cannot be negative")
-    lengths = np.diff(vert_start)
-    framed = np.array([moves == 1 or i >= len(bodies) for i, moves in enumerate(frame_moves)])
+    part_start, part = _groups(which[: 16 * len(tets)], len(blocks))
+    corner_start, corner = _groups(tets.ravel(), n)
+    vert_count, vert_weight = _ints(joined("vert_count")), _floats(joined("vert_weight"))
+    slots = np.arange(4)[None] < vert_count[:, None]
+    vert_nodes = _ints(np.where(slots, joined("vert_nodes", node_start), 0))
+    node_vert_start, members = _groups(vert_nodes[slots], n)
+    pairs, mus = _pairs(bodies, friction, exceptions, ignored)
+    frames = _frames(bodies, node_start)
     return Layout(
         names=names,
-        frame_names=tuple(frame_names),
-        framed=framed,
-        frame_body=np.array(frame_bodies, np.int32),
-        frame_moves=np.array(frame_moves, np.int32),
-        frame_pose=np.array(
-            [
-                (*bodies[b].pose.position, *bodies[b].pose.rotation) if f else (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-                for b, f in zip(frame_bodies, framed, strict=True)
-            ]
-        ),
+        frame_names=tuple(frames.pop("frame_names").tolist()),
         half_space=np.array([isinstance(b, HalfSpace) for b in bodies]),
-        node_start=np.array(node_start, np.int32),
-        vert_start=np.array(vert_start, np.int32),
-        edge_start=np.array(edge_start, np.int32),
-        face_start=np.array(face_start, np.int32),
-        tet_start=np.array(tet_start, np.int32),
-        node_rest=floats(node_rest, 3),
-        node_free=ints(node_free),
-        node_body=np.repeat(np.arange(len(bodies)), np.diff(node_start)).astype(np.int32),
-        node_damping=floats(node_damping),
-        grip_node=ints(grip_node),
-        grip_frame=ints(grip_frame),
-        grip_local=floats(grip_local, 3),
-        node_drive=floats(node_drive),
-        node_aim=ints(node_aim),
-        aim_local=floats(aim_local, 3),
-        tets=all_tets,
-        grads=np.ascontiguousarray(np.concatenate(grads), dtype=np.float64),
-        volume=floats(volume),
-        model=ints(codes),
-        mu=floats(mus),
-        lam=floats(lams),
-        row_start=np.concatenate([[0], np.cumsum(np.bincount(blocks // n, minlength=n))]).astype(np.int32),
-        col=(blocks % n).astype(np.int32),
-        mass=np.bincount(which[elements:], weights=floats(mass_values), minlength=len(blocks)).astype(np.float64),
+        node_start=node_start,
+        vert_start=vert_start,
+        edge_start=edge_start,
+        face_start=face_start,
+        tet_start=tet_start,
+        node_free=_ints(joined("node_free")),
+        node_body=np.repeat(np.arange(len(bodies), dtype=np.int32), np.diff(node_start)),
+        tets=tets,
+        model=_ints(joined("model")),
+        row_start=_starts(np.bincount(blocks // n, minlength=n)),
+        col=_ints(blocks % n),
+        mass=_floats(np.bincount(which[16 * len(tets) :], weights=joined("mass"), minlength=len(blocks))),
         part_start=part_start,
         part=part,
         corner_start=corner_start,
         corner=corner,
-        vert_body=np.repeat(np.arange(len(bodies)), lengths).astype(np.int32),
-        vert_count=counts,
-        vert_nodes=follows,
-        vert_weight=floats(vert_weight, 4),
-        vert_local=floats(vert_local, 3),
-        vert_area=floats(vert_area),
-        node_vert_start=followers,
-        node_vert=np.ascontiguousarray(np.nonzero(slots)[0][members], dtype=np.int32),
-        node_vert_weight=np.ascontiguousarray(floats(vert_weight, 4)[slots][members]),
-        edges=ints(edges, 2),
-        edge_area=floats(edge_area),
-        edge_rest2=floats(edge_rest2),
-        faces=ints(faces, 3),
-        pairs=np.array(pairs, np.int32).reshape(-1, 2),
-        friction=np.array(mu_list, np.float64),
-        min_edge=shortest if np.isfinite(shortest) else fallback,
-        max_young=max(young, default=0.0),
+        vert_body=np.repeat(np.arange(len(bodies), dtype=np.int32), np.diff(vert_start)),
+        vert_count=vert_count,
+        vert_nodes=vert_nodes,
+        vert_weight=vert_weight,
+        vert_local=vert_local,
+        vert_area=np.concatenate([s.vertex_area for _, s, _ in surfaces]),
+        node_vert_start=node_vert_start,
+        node_vert=_ints(np.nonzero(slots)[0][members]),
+        node_vert_weight=_floats(vert_weight[slots][members]),
+        edges=edges,
+        edge_area=np.concatenate([s.edge_area for _, s, _ in surfaces]),
+        edge_rest2=edge_rest2,
+        faces=_ints(np.concatenate([m.faces + first for m, _, first in surfaces])),
+        pairs=pairs,
+        friction=mus,
+        min_edge=float(edge_rest2[deformable].min()) ** 0.5,
+        max_young=max((body.material.young for body in bodies if isinstance(body, SoftBody)), default=0.0),
+        **{name: _floats(joined(name)) for name in _NUMBERS},
+        **frames,
     )

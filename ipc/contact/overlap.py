@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ipc.bodies.layout import Layout, rotation_matrix
+from ipc.bodies.body import rotation_matrix
+from ipc.bodies.layout import Layout
 from ipc.errors import OverlapError
 from ipc.state import State
 
