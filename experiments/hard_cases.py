@@ -23,12 +23,12 @@ from pathlib import Path
 
 import tyro
 
-from experiments.hard_run import Setup, Worst
-from experiments.hard_scenes import CASES, random_presses
 from raytac.errors import RaytacError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.io.options import CommonOptions
+from tests.ipc.hard.run import Setup, Worst
+from tests.ipc.hard.scenes import CASES, random_presses
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The hard cases of experiments/hard_cases.py: surfaces apart after every step, elements upright, bounded iterations, what each says."""
+"""The hard cases: surfaces apart after every step, elements upright, bounded iterations, what each says."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import ipc
-from experiments.hard_run import MAX_NEWTON, Mechanics, Setup, Worst
-from experiments.hard_scenes import CASES, SOFT, random_presses
-from experiments.hard_shapes import cube
+from tests.ipc.hard.run import MAX_NEWTON, Mechanics, Setup, Worst
+from tests.ipc.hard.scenes import CASES, SOFT, random_presses
+from tests.ipc.hard.shapes import cube
 
 SLOW = ["crush", "beam_twist", "mat_twist", "squeeze_and_release", "edge_alignment", "wedge_out_of_crack"]
 """Those that take longer than some two seconds."""

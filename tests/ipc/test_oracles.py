@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.contact_oracles import (
+from tests.ipc.oracles.closed_forms import (
     BondedLayer,
     Elastic,
     boussinesq_displacement,

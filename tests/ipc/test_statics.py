@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import ipc
-from experiments.contact_meshes import equal_area, rim_block
-from experiments.contact_oracles import punch_force
-from experiments.ipc_validation import (
+from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
+from tests.ipc.oracles.closed_forms import punch_force
+from tests.ipc.oracles.meshes import equal_area, rim_block
+from tests.ipc.oracles.nodal_press import nodal_press
+from tests.ipc.oracles.presses import (
     CONTACT,
     SOLID,
     cantilever_error,
@@ -19,8 +21,6 @@ from experiments.ipc_validation import (
     punch_error,
     richardson,
 )
-from experiments.nodal_press import nodal_press
-from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
 
 
 def test_cantilever_converges_to_the_beam() -> None:

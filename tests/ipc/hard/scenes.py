@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 import ipc
-from experiments.hard_run import D_HAT, MAX_NEWTON, G, Setup, Worst, carries, mass, run, world_of
-from experiments.hard_shapes import (
+from ipc.bodies import rotation_matrix
+from tests.ipc.hard.run import D_HAT, MAX_NEWTON, G, Setup, Worst, carries, mass, run, world_of
+from tests.ipc.hard.shapes import (
     SIZE,
     about,
     as_surface,
@@ -26,7 +27,6 @@ from experiments.hard_shapes import (
     sheet,
     wedge,
 )
-from ipc.bodies import rotation_matrix
 
 SOFT = ipc.Material(2e4, 0.4)
 """As soft for its size as a metre of 1 MPa: its own weight compresses a cube by 1 %."""

@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 import ipc
-from experiments.contact_oracles import Elastic, boussinesq_displacement
+from tests.ipc.oracles.closed_forms import Elastic, boussinesq_displacement
 
 Floats = NDArray[np.float64]
 
