@@ -16,6 +16,8 @@ from typing import Any
 import warp as wp
 
 __all__ = [
+    "Masses",
+    "VertexMap",
     "advance_nodes",
     "aim_bodies",
     "compare_frames",
@@ -39,6 +41,31 @@ __all__ = [
 ]
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class VertexMap:
+    """Nodes that the vertices follow, and the vertices that follow a node; names as in :class:`ipc.bodies.layout.Layout`."""
+
+    body: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    nodes: wp.array2d(dtype=wp.int32)
+    weight: wp.array2d(dtype=wp.float64)
+    local: wp.array(dtype=wp.vec3d)
+    follower_start: wp.array(dtype=wp.int32)
+    follower: wp.array(dtype=wp.int32)
+    follower_weight: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Masses:
+    """Entries of the mass matrix in the block pattern: ``mass`` [kg], ``inertia`` with the drives on top [kg], ``drag`` [kg/s²]."""
+
+    row_start: wp.array(dtype=wp.int32)
+    col: wp.array(dtype=wp.int32)
+    mass: wp.array(dtype=wp.float64)
+    inertia: wp.array(dtype=wp.float64)
+    drag: wp.array(dtype=wp.float64)
 
 
 @wp.kernel
@@ -80,41 +107,34 @@ def vertex_positions(
     y: wp.array2d(dtype=wp.vec3d),
     R: wp.array2d(dtype=wp.mat33d),
     t: wp.array2d(dtype=wp.vec3d),
-    vert_body: wp.array(dtype=wp.int32),
-    vert_count: wp.array(dtype=wp.int32),
-    vert_nodes: wp.array2d(dtype=wp.int32),
-    vert_weight: wp.array2d(dtype=wp.float64),
-    vert_local: wp.array2d(dtype=wp.vec3d),
+    verts: VertexMap,
     # outputs
     x: wp.array2d(dtype=wp.vec3d),
 ):
     """World positions of the vertices."""
     env, v = wp.tid()
     local = wp.vec3d()
-    if vert_count[v] == 0:
-        local = vert_local[0, v]
-    for k in range(vert_count[v]):
-        local += vert_weight[v, k] * y[env, vert_nodes[v, k]]
-    x[env, v] = R[env, vert_body[v]] * local + t[env, vert_body[v]]
+    if verts.count[v] == 0:
+        local = verts.local[v]
+    for k in range(verts.count[v]):
+        local += verts.weight[v, k] * y[env, verts.nodes[v, k]]
+    x[env, v] = R[env, verts.body[v]] * local + t[env, verts.body[v]]
 
 
 @wp.kernel
 def vertex_motion(
     p: wp.array2d(dtype=wp.vec3d),
     R: wp.array2d(dtype=wp.mat33d),
-    vert_body: wp.array(dtype=wp.int32),
-    vert_count: wp.array(dtype=wp.int32),
-    vert_nodes: wp.array2d(dtype=wp.int32),
-    vert_weight: wp.array2d(dtype=wp.float64),
+    verts: VertexMap,
     # outputs
     dx: wp.array2d(dtype=wp.vec3d),
 ):
     """World displacements of the vertices for the node displacements p."""
     env, v = wp.tid()
     local = wp.vec3d()
-    for k in range(vert_count[v]):
-        local += vert_weight[v, k] * p[env, vert_nodes[v, k]]
-    dx[env, v] = R[env, vert_body[v]] * local
+    for k in range(verts.count[v]):
+        local += verts.weight[v, k] * p[env, verts.nodes[v, k]]
+    dx[env, v] = R[env, verts.body[v]] * local
 
 
 @wp.kernel
@@ -168,18 +188,13 @@ def node_gradient(
     y: wp.array2d(dtype=wp.vec3d),
     local_target: wp.array2d(dtype=wp.vec3d),
     local_start: wp.array2d(dtype=wp.vec3d),
-    row_start: wp.array(dtype=wp.int32),
-    col: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
-    drag: wp.array(dtype=wp.float64),
+    masses: Masses,
     inertia_scale: wp.float64,
     vert_gradient: wp.array2d(dtype=wp.vec3d),
     R: wp.array2d(dtype=wp.mat33d),
     node_body: wp.array(dtype=wp.int32),
     node_free: wp.array(dtype=wp.int32),
-    node_vert_start: wp.array(dtype=wp.int32),
-    node_vert: wp.array(dtype=wp.int32),
-    node_vert_weight: wp.array(dtype=wp.float64),
+    verts: VertexMap,
     active: wp.array(dtype=wp.int32),
     # outputs
     gradient: wp.array2d(dtype=wp.vec3d),
@@ -195,13 +210,14 @@ def node_gradient(
         return
     g = gradient[env, i]
     elastic = wp.length(g)
-    for k in range(row_start[i], row_start[i + 1]):
-        j = col[k]
-        if mass[k] != wp.float64(0.0):
-            g += (mass[k] * inertia_scale) * (y[env, j] - local_target[env, j]) + drag[k] * (y[env, j] - local_start[env, j])
+    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+        j = masses.col[k]
+        if masses.inertia[k] != wp.float64(0.0):
+            pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
+            g += pull + masses.drag[k] * (y[env, j] - local_start[env, j])
     contact = wp.vec3d()
-    for k in range(node_vert_start[i], node_vert_start[i + 1]):
-        contact += node_vert_weight[k] * vert_gradient[env, node_vert[k]]
+    for k in range(verts.follower_start[i], verts.follower_start[i + 1]):
+        contact += verts.follower_weight[k] * vert_gradient[env, verts.follower[k]]
     g += wp.transpose(R[env, node_body[i]]) * contact
     force_size[env, i] = elastic + wp.length(contact)
     gradient[env, i] = g
@@ -217,10 +233,7 @@ def inertia_change(
     y1: wp.array2d(dtype=wp.vec3d),
     local_target: wp.array2d(dtype=wp.vec3d),
     local_start: wp.array2d(dtype=wp.vec3d),
-    row_start: wp.array(dtype=wp.int32),
-    col: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
-    drag: wp.array(dtype=wp.float64),
+    masses: Masses,
     inertia_scale: wp.float64,
     active: wp.array(dtype=wp.int32),
     # outputs
@@ -232,11 +245,12 @@ def inertia_change(
         return
     half = wp.float64(0.5)
     f = wp.vec3d()
-    for k in range(row_start[i], row_start[i + 1]):
-        j = col[k]
-        if mass[k] != wp.float64(0.0):
+    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+        j = masses.col[k]
+        if masses.inertia[k] != wp.float64(0.0):
             mean = half * (y0[env, j] + y1[env, j])
-            f += (mass[k] * inertia_scale) * (mean - local_target[env, j]) + drag[k] * (mean - local_start[env, j])
+            pull = (masses.inertia[k] * inertia_scale) * (mean - local_target[env, j])
+            f += pull + masses.drag[k] * (mean - local_start[env, j])
     change[env, i] = wp.dot(y1[env, i] - y0[env, i], f)
 
 
@@ -258,17 +272,15 @@ def new_velocity(
 @wp.kernel
 def kinetic_energy(
     v: wp.array2d(dtype=wp.vec3d),
-    row_start: wp.array(dtype=wp.int32),
-    col: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
+    masses: Masses,
     # outputs
     energy: wp.array2d(dtype=wp.float64),
 ):
     """½ v·M v node by node [J]."""
     env, i = wp.tid()
     f = wp.vec3d()
-    for k in range(row_start[i], row_start[i + 1]):
-        f += mass[k] * v[env, col[k]]
+    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+        f += masses.mass[k] * v[env, masses.col[k]]
     energy[env, i] = wp.float64(0.5) * wp.dot(v[env, i], f)
 
 

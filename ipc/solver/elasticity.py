@@ -28,10 +28,23 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.contact.barrier import barrier, barrier_first, barrier_second
+from ipc.solver.dynamics import Masses
 
-__all__ = ["block_hessian", "element_energy_change", "element_state", "node_elastic_gradient"]
+__all__ = ["Elements", "block_hessian", "element_energy_change", "element_state", "node_elastic_gradient"]
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Elements:
+    """Tetrahedra: nodes, ∇w of each corner [1/m], volume [m³], energy code and its coefficients [Pa]."""
+
+    tets: wp.array2d(dtype=wp.int32)
+    grads: wp.array2d(dtype=wp.vec3d)
+    volume: wp.array(dtype=wp.float64)
+    model: wp.array(dtype=wp.int32)
+    mu: wp.array(dtype=wp.float64)
+    lam: wp.array(dtype=wp.float64)
 
 
 @wp.func
@@ -167,26 +180,19 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
 
 
 @wp.func
-def deformation(
-    env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), tets: wp.array2d(dtype=wp.int32), grads: wp.array2d(dtype=wp.vec3d)
-) -> wp.mat33d:
+def deformation(env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), elements: Elements) -> wp.mat33d:
     """F of element e. Differences to corner 0, so that a common translation costs no digits."""
-    x0 = y[env, tets[e, 0]]
-    F = wp.outer(y[env, tets[e, 1]] - x0, grads[e, 1])
-    F += wp.outer(y[env, tets[e, 2]] - x0, grads[e, 2])
-    F += wp.outer(y[env, tets[e, 3]] - x0, grads[e, 3])
+    x0 = y[env, elements.tets[e, 0]]
+    F = wp.outer(y[env, elements.tets[e, 1]] - x0, elements.grads[e, 1])
+    F += wp.outer(y[env, elements.tets[e, 2]] - x0, elements.grads[e, 2])
+    F += wp.outer(y[env, elements.tets[e, 3]] - x0, elements.grads[e, 3])
     return F
 
 
 @wp.kernel
 def element_state(
     y: wp.array2d(dtype=wp.vec3d),
-    tets: wp.array2d(dtype=wp.int32),
-    grads: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array(dtype=wp.float64),
-    model: wp.array(dtype=wp.int32),
-    mu: wp.array(dtype=wp.float64),
-    lam: wp.array(dtype=wp.float64),
+    elements: Elements,
     active: wp.array(dtype=wp.int32),
     project: wp.array(dtype=wp.int32),
     # outputs
@@ -200,23 +206,23 @@ def element_state(
     env, e = wp.tid()
     if active[env] == 0:
         return
-    F = deformation(env, e, y, tets, grads)
+    F = deformation(env, e, y, elements)
     J = wp.determinant(F)
-    f = stress_factors(F, J, model[e], mu[e], lam[e])
-    if project[env] != 0 and model[e] != 2:
-        f[1] = geometric_factor(F, f[0], f[2], lam[e] * (wp.float64(1.0) + squeeze_second(J)), f[1])
+    f = stress_factors(F, J, elements.model[e], elements.mu[e], elements.lam[e])
+    if project[env] != 0 and elements.model[e] != 2:
+        f[1] = geometric_factor(F, f[0], f[2], elements.lam[e] * (wp.float64(1.0) + squeeze_second(J)), f[1])
     el_F[env, e] = F
-    el_P[env, e] = volume[e] * first_piola(F, J, model[e], mu[e], lam[e])
+    el_P[env, e] = elements.volume[e] * first_piola(F, J, elements.model[e], elements.mu[e], elements.lam[e])
     el_mck[env, e] = f
     el_J[env, e] = J
-    el_energy[env, e] = volume[e] * strain_energy(F, model[e], mu[e], lam[e])
+    el_energy[env, e] = elements.volume[e] * strain_energy(F, elements.model[e], elements.mu[e], elements.lam[e])
 
 
 @wp.kernel
 def node_elastic_gradient(
     corner_start: wp.array(dtype=wp.int32),
     corner: wp.array(dtype=wp.int32),
-    grads: wp.array2d(dtype=wp.vec3d),
+    elements: Elements,
     el_P: wp.array2d(dtype=wp.mat33d),
     active: wp.array(dtype=wp.int32),
     # outputs
@@ -229,7 +235,7 @@ def node_elastic_gradient(
     g = wp.vec3d()
     for k in range(corner_start[i], corner_start[i + 1]):
         e = corner[k] / 4
-        g += el_P[env, e] * grads[e, corner[k] - 4 * e]
+        g += el_P[env, e] * elements.grads[e, corner[k] - 4 * e]
     gradient[env, i] = g
 
 
@@ -238,13 +244,8 @@ def block_hessian(
     upper: wp.array2d(dtype=wp.int32),
     part_start: wp.array(dtype=wp.int32),
     part: wp.array(dtype=wp.int32),
-    grads: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array(dtype=wp.float64),
-    model: wp.array(dtype=wp.int32),
-    mu: wp.array(dtype=wp.float64),
-    lam: wp.array(dtype=wp.float64),
-    mass: wp.array(dtype=wp.float64),
-    drag: wp.array(dtype=wp.float64),
+    elements: Elements,
+    masses: Masses,
     inertia_scale: wp.float64,
     el_F: wp.array2d(dtype=wp.mat33d),
     el_mck: wp.array2d(dtype=wp.vec3d),
@@ -261,23 +262,23 @@ def block_hessian(
         return
     k = upper[u, 0]
     one = wp.identity(n=3, dtype=wp.float64)
-    H = (mass[k] * inertia_scale + drag[k]) * one
+    H = (masses.inertia[k] * inertia_scale + masses.drag[k]) * one
     for s in range(part_start[k], part_start[k + 1]):
         e = part[s] / 16
         code = part[s] - 16 * e
-        ga = grads[e, code / 4]
-        gb = grads[e, code % 4]
+        ga = elements.grads[e, code / 4]
+        gb = elements.grads[e, code % 4]
         F = el_F[env, e]
         f = el_mck[env, e]
         ba = F * ga
         bb = F * gb
-        if model[e] == 2:
+        if elements.model[e] == 2:
             # The Gauss-Newton part; (F Fᵀ − 1) stays tiny while the body is near-rigid, and is not always positive.
-            H += (wp.float64(4.0) * mu[e] * volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
+            H += (wp.float64(4.0) * elements.mu[e] * elements.volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
         else:
             C = cofactor(F)
-            stiff = lam[e] * (wp.float64(1.0) + squeeze_second(wp.determinant(F)))
-            H += volume[e] * (
+            stiff = elements.lam[e] * (wp.float64(1.0) + squeeze_second(wp.determinant(F)))
+            H += elements.volume[e] * (
                 (f[0] * wp.dot(ga, gb)) * one
                 + f[2] * wp.outer(ba, bb)
                 + stiff * wp.outer(C * ga, C * gb)
@@ -292,12 +293,7 @@ def block_hessian(
 def element_energy_change(
     y0: wp.array2d(dtype=wp.vec3d),
     y1: wp.array2d(dtype=wp.vec3d),
-    tets: wp.array2d(dtype=wp.int32),
-    grads: wp.array2d(dtype=wp.vec3d),
-    volume: wp.array(dtype=wp.float64),
-    model: wp.array(dtype=wp.int32),
-    mu: wp.array(dtype=wp.float64),
-    lam: wp.array(dtype=wp.float64),
+    elements: Elements,
     active: wp.array(dtype=wp.int32),
     # outputs
     change: wp.array2d(dtype=wp.float64),
@@ -307,7 +303,7 @@ def element_energy_change(
     env, e = wp.tid()
     if active[env] == 0:
         return
-    F0 = deformation(env, e, y0, tets, grads)
-    F1 = deformation(env, e, y1, tets, grads)
-    change[env, e] = volume[e] * strain_energy_change(F0, F1, model[e], mu[e], lam[e])
+    F0 = deformation(env, e, y0, elements)
+    F1 = deformation(env, e, y1, elements)
+    change[env, e] = elements.volume[e] * strain_energy_change(F0, F1, elements.model[e], elements.mu[e], elements.lam[e])
     det[env, e] = wp.determinant(F1)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ipc.contact.normal import Contacts, mat34d, rows_of
 from ipc.reduce import BLOCK
+from ipc.solver.dynamics import VertexMap
 
 __all__ = [
     "BlockJacobi",
@@ -50,10 +51,7 @@ class SystemView:
     diagonal: wp.array(dtype=wp.int32)
     free: wp.array(dtype=wp.int32)
     node_body: wp.array(dtype=wp.int32)
-    vert_body: wp.array(dtype=wp.int32)
-    vert_count: wp.array(dtype=wp.int32)
-    vert_nodes: wp.array2d(dtype=wp.int32)
-    vert_weight: wp.array2d(dtype=wp.float64)
+    verts: VertexMap
     blocks: wp.array2d(dtype=wp.mat33d)
     R: wp.array2d(dtype=wp.mat33d)
 
@@ -123,11 +121,11 @@ def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
     for k in range(4):
         v = verts[k]
         if v >= 0:
-            if system.vert_count[v] > 0:
+            if system.verts.count[v] > 0:
                 local = wp.vec3d()
-                for m in range(system.vert_count[v]):
-                    local += system.vert_weight[v, m] * p[env, system.vert_nodes[v, m]]
-                s += wp.dot(row_column(row, k), system.R[env, system.vert_body[v]] * local)
+                for m in range(system.verts.count[v]):
+                    local += system.verts.weight[v, m] * p[env, system.verts.nodes[v, m]]
+                s += wp.dot(row_column(row, k), system.R[env, system.verts.body[v]] * local)
     return s
 
 
@@ -137,12 +135,12 @@ def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
     for k in range(4):
         v = verts[k]
         if v >= 0:
-            if system.vert_count[v] > 0:
-                q = s * (wp.transpose(system.R[env, system.vert_body[v]]) * row_column(row, k))
-                for m in range(system.vert_count[v]):
-                    node = system.vert_nodes[v, m]
+            if system.verts.count[v] > 0:
+                q = s * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
+                for m in range(system.verts.count[v]):
+                    node = system.verts.nodes[v, m]
                     if system.free[node] != 0:
-                        wp.atomic_add(out, env, node, system.vert_weight[v, m] * q)
+                        wp.atomic_add(out, env, node, system.verts.weight[v, m] * q)
 
 
 @wp.func
@@ -247,10 +245,10 @@ def diagonal_rows(
         for k in range(4):
             v = verts[k]
             if v >= 0:
-                q = wp.transpose(system.R[env, system.vert_body[v]]) * row_column(row, k)
-                for m in range(system.vert_count[v]):
-                    w = system.vert_weight[v, m]
-                    wp.atomic_add(out, env, system.vert_nodes[v, m], (w * w) * wp.outer(q, q))
+                q = wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k)
+                for m in range(system.verts.count[v]):
+                    w = system.verts.weight[v, m]
+                    wp.atomic_add(out, env, system.verts.nodes[v, m], (w * w) * wp.outer(q, q))
 
 
 @wp.kernel

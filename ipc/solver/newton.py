@@ -207,7 +207,7 @@ class Newton:
 
     def _solve_again(self) -> None:
         pot, again = self.potential, self.state.decisions.again
-        pot.elements(again)
+        pot.evaluate_elements(again)
         pot.fill_matrix(again)
         pot.launch(dynamics.restart, pot.p.shape, [pot.right_side, again], [pot.residual, pot.p])
         self._solve_for(again)
@@ -244,7 +244,7 @@ class Newton:
         """Take the step p as far as contacts, energy and inversion allow."""
         pot, state = self.potential, self.state
         d = state.decisions
-        pot.launch(dynamics.vertex_motion, pot.x.shape, [pot.p, pot.R, *pot.vert_map], [pot.dx])
+        pot.launch(dynamics.vertex_motion, pot.x.shape, [pot.p, pot.R, pot.verts], [pot.dx])
         with self._stage("broad"):
             pot.collision.refresh(pot.x, pot.dx, d.plain)
         with self._stage("ccd"):

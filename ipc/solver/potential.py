@@ -60,18 +60,20 @@ class Potential:
         self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device, settings.broad_phase)
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
-        self.tets = ints(layout.tets)
-        self.grads = wp.array(layout.grads, dtype=wp.vec3d, device=device)
-        self.elastic = [floats(layout.volume), ints(layout.model), floats(layout.mu), floats(layout.lam)]
+        self.elements = elasticity.Elements()
+        self.elements.tets, self.elements.model = ints(layout.tets), ints(layout.model)
+        self.elements.grads = wp.array(layout.grads, dtype=wp.vec3d, device=device)
+        self.elements.volume, self.elements.mu, self.elements.lam = floats(layout.volume), floats(layout.mu), floats(layout.lam)
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
-        self.row_start, self.col = ints(layout.row_start), ints(layout.col)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
         self.dt = settings.dt
         self._damping = np.zeros(len(layout.col))
         self._damping[diagonal] = layout.node_damping
-        self.mass, self.drag = floats(layout.mass), floats(self._damping / self.dt)
-        self.inertia = floats(layout.mass * (1.0 + layout.node_drive[rows]))
+        self.masses = dynamics.Masses()
+        self.masses.row_start, self.masses.col = ints(layout.row_start), ints(layout.col)
+        self.masses.mass, self.masses.drag = floats(layout.mass), floats(self._damping / self.dt)
+        self.masses.inertia = floats(layout.mass * (1.0 + layout.node_drive[rows]))
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
         self.driven = bool((layout.node_aim >= 0).any())
         self.grips = len(layout.grip_node)
@@ -82,9 +84,16 @@ class Potential:
         self.frame_moves = ints(layout.frame_moves)
         self.part_start, self.part = ints(layout.part_start), ints(layout.part)
         self.corner_start, self.corner = ints(layout.corner_start), ints(layout.corner)
-        self.followers = [ints(layout.node_vert_start), ints(layout.node_vert), floats(layout.node_vert_weight)]
-        self.vert_map = [ints(layout.vert_body), ints(layout.vert_count), ints(layout.vert_nodes), floats(layout.vert_weight)]
-        self.vert_local = wp.array(layout.vert_local[None], dtype=wp.vec3d, device=device)
+        self.verts = dynamics.VertexMap()
+        self.verts.body, self.verts.count, self.verts.nodes = (
+            ints(layout.vert_body),
+            ints(layout.vert_count),
+            ints(layout.vert_nodes),
+        )
+        self.verts.weight = floats(layout.vert_weight)
+        self.verts.local = wp.array(layout.vert_local, dtype=wp.vec3d, device=device)
+        self.verts.follower_start, self.verts.follower = ints(layout.node_vert_start), ints(layout.node_vert)
+        self.verts.follower_weight = floats(layout.node_vert_weight)
 
         # State: node positions in their bodies' frames, world velocities, frames where they are and where they shall go.
         self.y, self.v = vectors(nodes), vectors(nodes)
@@ -118,7 +127,7 @@ class Potential:
         self.system.stride = width
         self.system.col, self.system.diagonal = ints(columns), ints(self.where[diagonal])
         self.system.free, self.system.node_body = self.node_free, self.node_body
-        self.system.vert_body, self.system.vert_count, self.system.vert_nodes, self.system.vert_weight = self.vert_map
+        self.system.verts = self.verts
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R
 
@@ -140,7 +149,7 @@ class Potential:
         """Let the next steps be ``dt`` [s] long."""
         if dt != self.dt:
             self.dt = dt
-            self.drag.assign(self._damping / dt)
+            self.masses.drag.assign(self._damping / dt)
 
     # --- places ----------------------------------------------------------------------------------------------------------------
 
@@ -156,7 +165,7 @@ class Potential:
 
     def place_vertices(self, y: wp.array, R: wp.array, t: wp.array, x: wp.array) -> None:
         """World positions of the vertices."""
-        self.launch(dynamics.vertex_positions, x.shape, [y, R, t, *self.vert_map, self.vert_local], [x])
+        self.launch(dynamics.vertex_positions, x.shape, [y, R, t, self.verts], [x])
 
     def place_nodes(self, out: wp.array) -> None:
         """World positions of the nodes."""
@@ -194,9 +203,9 @@ class Potential:
 
     # --- value, gradient, Hessian ----------------------------------------------------------------------------------------------
 
-    def elements(self, active: wp.array) -> None:
+    def evaluate_elements(self, active: wp.array) -> None:
         """F, stress, energy and Hessian factors of the elements at y."""
-        inputs = [self.y, self.tets, self.grads, *self.elastic, active, self.project]
+        inputs = [self.y, self.elements, active, self.project]
         outputs = [self.el_F, self.el_P, self.el_mck, self.el_J, self.el_energy]
         self.launch(elasticity.element_state, self.el_J.shape, inputs, outputs)
 
@@ -208,20 +217,20 @@ class Potential:
 
     def assemble(self, active: wp.array) -> None:
         """Forces, contacts and energies at y; ``gradient`` holds bonded nodes too, ``residual`` is minus it on the unknowns."""
-        self.elements(active)
-        inputs = [self.corner_start, self.corner, self.grads, self.el_P, active]
+        self.evaluate_elements(active)
+        inputs = [self.corner_start, self.corner, self.elements, self.el_P, active]
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
         self.touch(active)
         inputs = [
-            *(self.y, self.local_target, self.local_start, self.row_start, self.col, self.inertia, self.drag, self.inertia_scale),
-            *(self.vert_gradient, self.R, self.node_body, self.node_free, *self.followers, active),
+            *(self.y, self.local_target, self.local_start, self.masses, self.inertia_scale, self.vert_gradient),
+            *(self.R, self.node_body, self.node_free, self.verts, active),
         ]
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
     def fill_matrix(self, active: wp.array) -> None:
-        """The block matrix of inertia and elasticity from what :meth:`elements` left."""
+        """The block matrix of inertia and elasticity from what :meth:`evaluate_elements` left."""
         inputs = [
-            *(self.upper, self.part_start, self.part, self.grads, *self.elastic, self.inertia, self.drag, self.inertia_scale),
+            *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
             *(self.el_F, self.el_mck, active),
         ]
         self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
@@ -233,7 +242,7 @@ class Potential:
 
     def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
         """Change of the elements' energy from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
-        inputs = [self.y, self.y1, self.tets, self.grads, *self.elastic, active]
+        inputs = [self.y, self.y1, self.elements, active]
         self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, [self.el_change, self.el_J1])
         self.reduce(self.el_J1, active, MIN, min_det)
 
@@ -242,10 +251,7 @@ class Potential:
         change.zero_()
         self.elastic_change(active, min_det)
         self.reduce(self.el_change, active, SUM, change)
-        inputs = [
-            *(self.y, self.y1, self.local_target, self.local_start, self.row_start, self.col),
-            *(self.inertia, self.drag, self.inertia_scale, active),
-        ]
+        inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.inertia_scale, active]
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
         self.collision.energy_change(
@@ -277,6 +283,5 @@ class Potential:
         self.elastic_energy.zero_()
         self.kinetic.zero_()
         self.reduce(self.el_energy, self.everyone, SUM, self.elastic_energy)
-        inputs = [self.v, self.row_start, self.col, self.mass]
-        self.launch(dynamics.kinetic_energy, self.v.shape, inputs, [self.node_change])
+        self.launch(dynamics.kinetic_energy, self.v.shape, [self.v, self.masses], [self.node_change])
         self.reduce(self.node_change, self.everyone, SUM, self.kinetic)

@@ -108,9 +108,9 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
     """Surface number of the node that vertex v follows, or −1: other bodies' vertices follow four nodes or none."""
     if v < 0:
         return -1
-    if system.vert_count[v] != 1:
+    if system.verts.count[v] != 1:
         return -1
-    return rest.surface[system.vert_nodes[v, 0]]
+    return rest.surface[system.verts.nodes[v, 0]]
 
 
 @wp.kernel
@@ -150,12 +150,12 @@ def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, res
     for k in range(4):
         s = surface_of_vertex(system, rest, verts[k])
         if s >= 0:
-            qi = wp.transpose(system.R[env, system.vert_body[verts[k]]]) * row_column(row, k)
+            qi = wp.transpose(system.R[env, system.verts.body[verts[k]]]) * row_column(row, k)
             if wp.length_sq(qi) > wp.float64(0.0):
                 for m in range(4):
                     other = surface_of_vertex(system, rest, verts[m])
                     if other >= 0:
-                        qj = wp.transpose(system.R[env, system.vert_body[verts[m]]]) * row_column(row, m)
+                        qj = wp.transpose(system.R[env, system.verts.body[verts[m]]]) * row_column(row, m)
                         if wp.length_sq(qj) > wp.float64(0.0):
                             wp.atomic_add(small.a, env, small.slot[env, s], small.slot[env, other], wp.outer(qi, qj))
 

@@ -110,7 +110,7 @@ def test_rest_state_is_free_of_stress_and_has_lame_constants(model: Model, poiss
     solver = make_potential(material)
     rest = solver.layout.node_rest
     assert np.abs(gradient_at(solver, rest)).max() < 1e-9 * material.young
-    solver.inertia.zero_()
+    solver.masses.inertia.zero_()
     solver.fill_matrix(solver.everyone)
     H = dense(solver)
     mu, lam = material.lame()
