@@ -4,7 +4,7 @@
     python experiments/bench_preconditioners.py --device cuda --sizes 300,1400,5300 --envs 1,128 --linear-tolerance 1e-6
 
 The press of ``experiments/bench_ipc.py`` at ν = 0.45 and 0.49. Block-Jacobi has kernels of its own, all iterations of an environment in
-one thread on the CPU and in one block of threads on CUDA; the others are applied from the common loop, which is NumPy's on the CPU.
+one thread on the CPU and in one block of threads on CUDA; the others are applied from the common loop, launch by launch.
 FSAI is Warp's (adaptive, 32 entries a row, single precision, refitted in every Newton iteration to the matrix with the diagonal blocks
 of the contacts). Times are medians over the steps after the first; on a machine that others use too, the processor time says more than
 the clock, with one thread of BLAS (OPENBLAS_NUM_THREADS=1). On CUDA the stages are those of further steps launch by launch.

@@ -17,7 +17,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ipc.contact.normal import Contacts, mat34d, rows_of
-from ipc.reduce import BLOCK
 from ipc.solver.dynamics import VertexMap
 
 __all__ = [
@@ -50,7 +49,6 @@ class SystemView:
     col: wp.array(dtype=wp.int32)
     diagonal: wp.array(dtype=wp.int32)
     free: wp.array(dtype=wp.int32)
-    node_body: wp.array(dtype=wp.int32)
     verts: VertexMap
     blocks: wp.array2d(dtype=wp.mat33d)
     R: wp.array2d(dtype=wp.mat33d)
@@ -90,22 +88,21 @@ def multiply_blocks(
     system: SystemView,
     p: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
+    threads: wp.int32,
     # outputs
     out: wp.array2d(dtype=wp.vec3d),
     partial: wp.array2d(dtype=wp.float64),
 ):
-    """out = blocks p on the unknowns, zero elsewhere, and the shares of p·out; blocks of threads (B, chunks, BLOCK), CUDA only."""
+    """out = blocks p on the unknowns, zero elsewhere, and the shares of p·out; blocks of threads (B, chunks, ``threads``)."""
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
     if active[env] != 0:
-        i = c * BLOCK + lane
-        while i < p.shape[1]:
+        for i in range(c * threads + lane, p.shape[1], partial.shape[1] * threads):
             f = wp.vec3d()
             if system.free[i] != 0:
                 f = block_row(system, env, i, p)
                 total += wp.dot(p[env, i], f)
             out[env, i] = f
-            i += partial.shape[1] * BLOCK
     wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
 
 
@@ -166,6 +163,7 @@ def multiply_rows(
     p: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
     lanes: wp.int32,
+    threads: wp.int32,
     # outputs
     out: wp.array2d(dtype=wp.vec3d),
     partial: wp.array2d(dtype=wp.float64),
@@ -176,7 +174,7 @@ def multiply_rows(
     """
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
-    first = c * BLOCK + lane
+    first = c * threads + lane
     if active[env] != 0 and first < lanes:
         for r in range(first, rows_of(contacts, env), lanes):
             total += add_row(system, contacts, env, r, p, out)

@@ -1,7 +1,8 @@
 """Preconditioned conjugate gradients for a batch of systems, all at once, each with its own step lengths and its own end.
 
-On CUDA an iteration is six launches that can be recorded: sums are taken by blocks of threads, and every thread adds the few shares of
-its environment itself instead of waiting for a launch that does. Small systems, and all on a CPU, go to :mod:`ipc.solver.pcg_block`.
+An iteration is six launches that can be recorded: sums are taken by blocks of threads, and every thread adds the few shares of its
+environment itself instead of waiting for a launch that does. On a CPU a block is one thread. With block-Jacobi small systems, and all on
+a CPU, go to :mod:`ipc.solver.pcg_block`.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -10,12 +11,13 @@ its environment itself instead of waiting for a launch that does. Small systems,
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
+
 import warp as wp
 
-from ipc.contact.normal import Contacts, rows_of
+from ipc.contact.normal import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
-from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, add_row, block_row, multiply_blocks, multiply_rows
+from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
 
 __all__ = ["Pcg"]
@@ -35,19 +37,18 @@ def dots(
     r: wp.array2d(dtype=wp.vec3d),
     z: wp.array2d(dtype=wp.vec3d),
     running: wp.array(dtype=wp.int32),
+    threads: wp.int32,
     # outputs
     rr: wp.array2d(dtype=wp.float64),
     rz: wp.array2d(dtype=wp.float64),
 ):
-    """Shares of r·r and r·z; blocks of threads (B, chunks, BLOCK)."""
+    """Shares of r·r and r·z; blocks of threads (B, chunks, ``threads``)."""
     env, c, lane = wp.tid()
     a, b = wp.float64(0.0), wp.float64(0.0)
     if running[env] != 0:
-        i = c * BLOCK + lane
-        while i < r.shape[1]:
+        for i in range(c * threads + lane, r.shape[1], rr.shape[1] * threads):
             a += wp.length_sq(r[env, i])
             b += wp.dot(r[env, i], z[env, i])
-            i += rr.shape[1] * BLOCK
     wp.tile_store(rr[env], wp.tile_sum(wp.tile(a)), offset=c)
     wp.tile_store(rz[env], wp.tile_sum(wp.tile(b)), offset=c)
 
@@ -140,43 +141,6 @@ def next_direction(
         s.rz[1 - parity, env] = new
 
 
-@wp.func
-def product_in_order(
-    system: SystemView,
-    contacts: Contacts,
-    env: wp.int32,
-    p: wp.array2d(dtype=wp.vec3d),
-    Ap: wp.array2d(dtype=wp.vec3d),
-) -> wp.float64:
-    """Ap = H p of one environment; returns p·Ap."""
-    total = wp.float64(0.0)
-    for i in range(p.shape[1]):
-        f = wp.vec3d()
-        if system.free[i] != 0:
-            f = block_row(system, env, i, p)
-            total += wp.dot(p[env, i], f)
-        Ap[env, i] = f
-    for row in range(rows_of(contacts, env)):
-        total += add_row(system, contacts, env, row, p, Ap)
-    return total
-
-
-@wp.kernel
-def multiply_in_order(
-    system: SystemView,
-    contacts: Contacts,
-    p: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    Ap: wp.array2d(dtype=wp.vec3d),
-    curvature: wp.array(dtype=wp.float64),
-):
-    """One thread an environment."""
-    env = wp.tid()
-    if active[env] != 0:
-        curvature[env] = product_in_order(system, contacts, env, p, Ap)
-
-
 class Pcg:
     """Preconditioned conjugate gradients (Hestenes, Stiefel 1952).
 
@@ -193,9 +157,9 @@ class Pcg:
         few = nodes <= ONE_BLOCK_NODES and (lanes == 1 or batch * nodes <= ONE_BLOCK_TOTAL)
         self.one_block = few or not device.is_cuda
         self._p, self._Ap, self._z = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(3))
-        self._by_blocks, self._rr, self._rz = (
-            wp.zeros((batch, chunks_of(nodes)), dtype=wp.float64, device=device) for _ in range(3)
-        )
+        self._threads = BLOCK if device.is_cuda else 1
+        chunks = chunks_of(nodes) if device.is_cuda else 1
+        self._by_blocks, self._rr, self._rz = (wp.zeros((batch, chunks), dtype=wp.float64, device=device) for _ in range(3))
         self._by_rows = wp.zeros((batch, -(-lanes // BLOCK)), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
@@ -227,89 +191,53 @@ class Pcg:
             max_iterations: after these the solution so far stands (it is a descent direction).
             active: mask (B,).
         """
-        s, run, device, dim = self.scalars, self._running, self.device, residual.shape
         if isinstance(preconditioner, BlockJacobi) and self.one_block:
-            threads = THREADS if device.is_cuda else 1
+            threads = THREADS if self.device.is_cuda else 1
             inputs = [
                 *(system, contacts, preconditioner.inverse, tolerance, max_iterations, threads, min(self.lanes, threads), active),
                 *(self._p, self._Ap),
             ]
-            size, outputs = (self.batch, threads), [residual, x, s]
-            wp.launch(solve_in_one_block, dim=size, inputs=inputs, outputs=outputs, device=device, block_dim=THREADS)
-            return
-        if not device.is_cuda:
-            self._solve_on_cpu(system, contacts, preconditioner, residual, x, tolerance, max_iterations, active)
-            return
-        blocks, row_blocks = (*self._rr.shape, BLOCK), (*self._by_rows.shape, BLOCK)
+            size, outputs = (self.batch, threads), [residual, x, self.scalars]
+            wp.launch(solve_in_one_block, dim=size, inputs=inputs, outputs=outputs, device=self.device, block_dim=THREADS)
+        else:
+            self._solve_by_launches(system, contacts, preconditioner, residual, x, tolerance, max_iterations, active)
 
-        def iterate() -> None:
-            for k in range(ROUNDS):
-                parity = k % 2
-                inputs = [system, self._p, run]
-                outputs = [self._Ap, self._by_blocks]
-                wp.launch(multiply_blocks, dim=blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
-                inputs, outputs = [system, contacts, self._p, run, self.lanes], [self._Ap, self._by_rows]
-                wp.launch(multiply_rows, dim=row_blocks, inputs=inputs, outputs=outputs, device=device, block_dim=BLOCK)
-                inputs = [self._p, self._Ap, self._by_blocks, self._by_rows, parity]
-                wp.launch(update_iterate, dim=dim, inputs=inputs, outputs=[s, run, x, residual], device=device)
-                preconditioner.apply(residual, run, self._z)
-                inputs = [residual, self._z, run]
-                wp.launch(dots, dim=blocks, inputs=inputs, outputs=[self._rr, self._rz], device=device, block_dim=BLOCK)
-                inputs = [self._z, self._rr, self._rz, parity, tolerance, max_iterations]
-                wp.launch(next_direction, dim=dim, inputs=inputs, outputs=[s, run, self._p], device=device)
-            look()
-
-        def look() -> None:
-            self._any.zero_()
-            wp.launch(raise_if_any, dim=self.batch, inputs=[run], outputs=[self._any], device=device)
-
-        preconditioner.apply(residual, active, self._z)
-        inputs = [residual, self._z, active]
-        wp.launch(dots, dim=blocks, inputs=inputs, outputs=[self._rr, self._rz], device=device, block_dim=BLOCK)
-        wp.launch(start, dim=dim, inputs=[self._z, self._rr, self._rz, active], outputs=[s, self._p, run], device=device)
-        look()
-        wp.capture_while(self._any, iterate)
-
-    def _solve_on_cpu(
+    def _solve_by_launches(
         self,
         system: SystemView,
         contacts: Contacts,
         preconditioner: Preconditioner,
-        residual: wp.array,
+        r: wp.array,
         x: wp.array,
         tolerance: float,
         max_iterations: int,
         active: wp.array,
     ) -> None:
-        s, device = self.scalars, self.device
-        # The arrays of a CPU are NumPy's as well: views, no copies.
-        running, mask = self._running.numpy(), active.numpy() != 0
-        r, solution, z, p, Ap = (a.numpy() for a in (residual, x, self._z, self._p, self._Ap))
-        curvature, iterations, negative = s.rr0.numpy(), s.iterations.numpy(), s.negative.numpy()
+        s, running, z, threads = self.scalars, self._running, self._z, self._threads
+        blocks, row_blocks = (*self._rr.shape, threads), (*self._by_rows.shape, threads)
 
-        def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            return np.einsum("bij,bij->b", a, b)
+        def launch(kernel: Any, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
 
-        iterations[mask] = 0
-        negative[mask] = 0
-        preconditioner.apply(residual, active, self._z)
-        rz, first = dot(r, z), dot(r, r)
-        running[:] = mask & (first > 0)
-        p[mask] = z[mask]
-        while running.any():
-            inputs = [system, contacts, self._p, self._running]
-            wp.launch(multiply_in_order, dim=self.batch, inputs=inputs, outputs=[self._Ap, s.rr0], device=device)
-            bad = (running != 0) & ~(curvature > 0)
-            negative[bad] = 1
-            running[bad] = 0
-            on = running != 0
-            iterations[on] += 1
-            alpha = np.where(on, rz / np.where(on, curvature, 1.0), 0.0)[:, None, None]
-            solution += alpha * p
-            r[on] -= (alpha * Ap)[on]
-            running[on & ~((dot(r, r) > tolerance**2 * first) & (iterations < max_iterations))] = 0
-            preconditioner.apply(residual, self._running, self._z)
-            on = running != 0
-            new = dot(r, z)
-            p[on] = z[on] + (new[on] / rz[on])[:, None, None] * p[on]
-            rz = new
+        def look() -> None:
+            self._any.zero_()
+            launch(raise_if_any, (self.batch,), [running], [self._any])
+
+        def iterate() -> None:
+            for k in range(ROUNDS):
+                parity = k % 2
+                launch(multiply_blocks, blocks, [system, self._p, running, threads], [self._Ap, self._by_blocks])
+                inputs = [system, contacts, self._p, running, self.lanes, threads]
+                launch(multiply_rows, row_blocks, inputs, [self._Ap, self._by_rows])
+                launch(update_iterate, r.shape, [self._p, self._Ap, self._by_blocks, self._by_rows, parity], [s, running, x, r])
+                preconditioner.apply(r, running, z)
+                launch(dots, blocks, [r, z, running, threads], [self._rr, self._rz])
+                inputs = [z, self._rr, self._rz, parity, tolerance, max_iterations]
+                launch(next_direction, r.shape, inputs, [s, running, self._p])
+            look()
+
+        preconditioner.apply(r, active, z)
+        launch(dots, blocks, [r, z, active, threads], [self._rr, self._rz])
+        launch(start, r.shape, [z, self._rr, self._rz, active], [s, self._p, running])
+        look()
+        wp.capture_while(self._any, iterate)

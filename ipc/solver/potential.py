@@ -126,7 +126,7 @@ class Potential:
         self.system.row_base, self.system.row_length = ints(base), ints(np.diff(layout.row_start))
         self.system.stride = width
         self.system.col, self.system.diagonal = ints(columns), ints(self.where[diagonal])
-        self.system.free, self.system.node_body = self.node_free, self.node_body
+        self.system.free = self.node_free
         self.system.verts = self.verts
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R

@@ -316,11 +316,11 @@ def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pyte
     from ipc.solver import pcg
 
     ends, general = [], []
-    way = pcg.Pcg._solve_on_cpu
-    monkeypatch.setattr(pcg.Pcg, "_solve_on_cpu", lambda *args: general.append(1) or way(*args))
+    solve = pcg.Pcg._solve_by_launches
+    monkeypatch.setattr(pcg.Pcg, "_solve_by_launches", lambda *args: general.append(1) or solve(*args))
     for batched in (False, True):
         if batched:
-            monkeypatch.setattr(pcg, "BlockJacobi", type("Other", (), {}))  # solve() no longer knows it and takes the general way
+            monkeypatch.setattr(pcg, "BlockJacobi", type("Other", (), {}))  # so that solve() takes the general loop
         world = make_world(num_envs=2, friction=0.3)
         reports = press(world, np.array([0.3e-3, 0.4e-3]), 2)
         ends.append((world.positions("pad"), reports[-1].linear))

@@ -12,6 +12,7 @@ import warp as wp
 import ipc
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.normal import Contacts, mat34d
+from ipc.solver.dynamics import VertexMap
 from ipc.solver.linear import BlockJacobi, SystemView
 from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
@@ -53,17 +54,14 @@ class Problem:
         rows_of = np.repeat(np.arange(count), np.diff(layout.row_start))
         for name, values in (
             *(("row_base", layout.row_start[:-1]), ("row_length", np.diff(layout.row_start)), ("col", layout.col)),
-            *(
-                ("diagonal", np.flatnonzero(rows_of == layout.col)),
-                ("free", layout.node_free),
-                ("node_body", layout.node_body),
-                ("vert_body", layout.vert_body),
-            ),
-            *(("vert_count", layout.vert_count), ("vert_nodes", layout.vert_nodes)),
+            *(("diagonal", np.flatnonzero(rows_of == layout.col)), ("free", layout.node_free)),
         ):
             setattr(s, name, self._array(values, wp.int32))
         s.stride = 1
-        s.vert_weight = self._array(layout.vert_weight, wp.float64)
+        s.verts = VertexMap()
+        for name, values in (("body", layout.vert_body), ("count", layout.vert_count), ("nodes", layout.vert_nodes)):
+            setattr(s.verts, name, self._array(values, wp.int32))
+        s.verts.weight = self._array(layout.vert_weight, wp.float64)
         s.blocks, s.R = self._array(self._repeat(blocks), wp.mat33d), self._array(self._repeat(R), wp.mat33d)
         self.contacts.row_verts = self._array(self._repeat(verts), wp.vec4i)
         self.contacts.row = self._array(self._repeat(rows), mat34d)
