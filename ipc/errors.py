@@ -1,4 +1,4 @@
-"""The errors that this package raises; each names the value, the rule and the choices."""
+"""Errors of this package; each names the value, the rule and the choices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numbers that steer a step."""
+"""Settings of a time step."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Settings:
         kappa: barrier stiffness κ [Pa]; None: the largest Young's modulus of the soft bodies (1e5 Pa without one).
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
         friction_velocity: ε_v [m/s]; below this sliding speed friction grows smoothly from zero.
-        friction_relags: how often a step may renew the lagged normal forces and tangents after its first solve.
+        friction_relags: number of times that a step may renew the lagged normal forces and tangents after its first solve.
         friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
-            part; ``ipc/solver/preconditioners/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
+            part; ``docs/ipc-preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         armijo: share of the decrease that the slope promises which a step must achieve to be accepted [-].
         ccd_slack: share of a gap that a Newton step has to leave [-].
@@ -38,7 +38,7 @@ class Settings:
         max_advance_attempts: how often an advance of the driven bodies is shortened; the last but one stays in place.
         poor_advance: share of the remaining motion below which the unknowns get time to rest before the bodies advance again [-].
         blocked_advance: share of the motion of the driven bodies below which an advance after such a rest says that they are blocked [-].
-        broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
+        broad_phase: search for pairs that may touch: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
             (bounding volume hierarchies), or ``"auto"`` (by the numbers of edges and of body pairs). The pairs are the same.
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
             ``World.timers``.

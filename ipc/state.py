@@ -37,7 +37,7 @@ class State:
 
 
 def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
-    """Undeformed and at rest, where the layout has the bodies."""
+    """The state of undeformed bodies at rest, placed as in the layout."""
     nodes = np.broadcast_to(layout.node_rest, (num_envs, *layout.node_rest.shape))
     frames = layout.frame_pose
     return State(
@@ -59,10 +59,10 @@ def teleported(
     rotation: Floats | None,
     mask: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Put a frame elsewhere in the environments of the mask, with all that is bonded to it, at rest; changes ``state``.
+    """Move a frame, and all that is bonded to it, in the environments of the mask; velocities become zero. Changes ``state``.
 
     Args:
-        body: that the frame belongs to.
+        body: owner of the frame.
         position, rotation: [m] (B, 3), unit quaternion (w, x, y, z) (B, 4); None keeps it.
 
     Returns:
@@ -87,7 +87,7 @@ def teleported(
 
 
 def _carry_grips(state: State, layout: Layout, body: int, mask: NDArray[np.bool_], before: tuple[Floats, Floats]) -> None:
-    """Grips keep their places in the frame of the body that was moved."""
+    """Move grips along with the frame of their body."""
     turn = rotation_matrix(state.frame_rotation[:, body]) @ np.swapaxes(before[0][:, body], -1, -2)
     for grip in np.flatnonzero((layout.frame_body == body) & (layout.frame_moves == 1)):
         if grip == body:

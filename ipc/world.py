@@ -1,4 +1,4 @@
-"""The public face: bodies in, steps, positions and forces out."""
+"""A world of bodies: time steps, positions and forces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ipc.contact.overlap import check_overlap, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
-from ipc.solver.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
+from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, pair_forces, rigid_motion, touching
 from ipc.solver.newton import Newton
 from ipc.solver.patch_motion import RestPatches
 from ipc.solver.potential import Potential
@@ -30,8 +30,8 @@ class World:
     """Bodies that deform, move and touch, in ``num_envs`` copies that do not see each other.
 
     Args:
-        bodies: what there is; names are unique.
-        settings: how to step.
+        bodies: of unique names.
+        settings: of the time step.
         num_envs: number of environments, B.
         device: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"auto"`` (CUDA if there is one).
         friction: μ by pair of body names, where it differs from ``settings.friction``.
@@ -73,10 +73,10 @@ class World:
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
         frames = self.layout.frame_pose
-        # What the device is told before a step, kept here so that telling it costs one copy and no wait.
+        # Targets of the next step. They are copied to the device before a step if they changed.
         self._goal_p = np.zeros((num_envs, len(frames), 3))
         self._goal_q = np.zeros((num_envs, len(frames), 4))
-        self._told = False
+        self._targets_set = True
         self._start = start_state(self.layout, num_envs, self.kappa)
         self.restore(self._start)
 
@@ -99,11 +99,11 @@ class World:
         raise IpcError(f"no body or grip is named {name!r}: choose from {choices}")
 
     def set_target(self, name: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None) -> None:
-        """Say where a driven body's frame shall be at the end of the next step; it stays there until told otherwise.
+        """Set the pose of a driven frame at the end of the next step; it stays there until it is set again.
 
         Args:
             name: a kinematic body, a half-space, a soft body with bonded vertices, a grip ``"<body>.<grip>"``, or an affine body with
-                a drive, which goes there as far as its drive and contacts let it.
+                a drive, which reaches the pose as far as its drive and contacts allow.
             position: frame origin in the world [m], shape (3,) or (B, 3); None keeps the last target's.
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps the last target's. Steps turn by less than half a turn.
         """
@@ -113,7 +113,7 @@ class World:
             self._goal_p[:, frame] = p
         if q is not None:
             self._goal_q[:, frame] = q[:, [1, 2, 3, 0]]
-        self._told = False
+        self._targets_set = True
 
     def set_gravity(self, gravity: ArrayLike) -> None:
         """Set the acceleration of every body [m/s²], world frame, shape (3,) or (B, 3)."""
@@ -144,10 +144,10 @@ class World:
             raise IpcError(f"dt = {dt}: it must be positive")
         pot, alive = self._potential, ~self._failed
         pot.set_dt(dt or self.settings.dt)
-        if not self._told:
+        if self._targets_set:
             pot.goal_p.assign(self._goal_p)
             pot.goal_q.assign(self._goal_q)
-            self._told = True
+            self._targets_set = False
         values = self._newton.step(alive)
         failed = values["failed"].astype(bool)
         self._failed |= failed
@@ -180,7 +180,7 @@ class World:
     # --- outputs ---------------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
-        """Where a driven body's or a grip's frame is in the world: rotations (B, 3, 3) and positions [m] (B, 3)."""
+        """Rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or a grip's frame in the world."""
         body = self._frame(name)
         return host(self._potential.R)[:, body].copy(), host(self._potential.t)[:, body].copy()
 
@@ -250,27 +250,22 @@ class World:
         return self.contact_forces(name) / area[None, :, None]
 
     def wrench(self, name: str) -> Wrench:
-        """What the others do to a body: contact forces on a kinematic or affine body or half-space, the bond's pull on a pad's frame.
+        """Force and torque of the others on a body: contact forces, or the pull of a soft body's bond on its frame.
 
         For a soft body with bonded vertices this is the force of the pad on what holds it, and ``"<body>.<grip>"`` gives the force on
         that grip; for a free soft body it is the sum of its contacts.
         """
-        solver, layout = self._potential, self.layout
+        layout = self.layout
         if name in layout.frame_names[len(layout.names) :] and not name.endswith(".aim"):
             frame = layout.frame_names.index(name)
-            return bond_wrench(solver, int(layout.frame_body[frame]), frame, layout.grip_node[layout.grip_frame == frame])
+            nodes = layout.grip_node[layout.grip_frame == frame]
+            return bond_wrench(self._potential, int(layout.frame_body[frame]), frame, nodes)
         body = self._index(name)
-        origin = host(solver.t)[:, body] if layout.framed[body] else np.zeros((self.num_envs, 3))
-        first, last = layout.vert_start[body : body + 2]
-        if isinstance(self.bodies[body], HalfSpace):
-            points, forces = plane_forces(layout, solver, body)
-        elif isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
+        if isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
             nodes = np.arange(layout.node_start[body], layout.node_start[body + 1])
-            held = nodes[(layout.node_free[nodes] == 0) & ~np.isin(nodes, layout.grip_node)]
-            return bond_wrench(solver, body, body, held)
-        else:
-            points, forces = host(solver.x)[:, first:last], -host(solver.vert_gradient)[:, first:last]
-        return Wrench(forces.sum(axis=1), np.cross(points - origin[:, None], forces).sum(axis=1))
+            nodes = nodes[(layout.node_free[nodes] == 0) & ~np.isin(nodes, layout.grip_node)]
+            return bond_wrench(self._potential, body, body, nodes)
+        return contact_wrench(layout, self._potential, body)
 
     def contacts(self, env: int = 0) -> ContactPairs:
         """The contact pairs of one environment at the end of the last step."""
@@ -279,7 +274,7 @@ class World:
         return contact_pairs(self.layout, self._potential, env)
 
     def pressing(self) -> dict[tuple[str, str], PairForces]:
-        """Forces at the end of the last step by names of the two bodies; pairs that nowhere touch are not in it."""
+        """Forces at the end of the last step by names of the two bodies; pairs that touch in no environment are left out."""
         return pair_forces(self.layout, self._potential)
 
     def rigid_motion(self, name: str) -> RigidMotion:
@@ -290,10 +285,9 @@ class World:
         return rigid_motion(self.layout, self._potential, body)
 
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
-        """The part of a bonded soft body that bore contact forces at the end of the last step, as if it moved as a whole.
+        """The part of a bonded soft body under contact forces at the end of the last step, as if it moved as a whole.
 
-        None where nothing touches what is free of it. The first call for a body inverts its rest matrix (before any step it
-        answers None, and that is done).
+        None where nothing touches its free nodes, as before any step. The first call for a body inverts its rest matrix.
 
         Raises:
             IpcError: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
@@ -306,11 +300,11 @@ class World:
         return self._patches[body].loaded(self._potential, env)
 
     def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
-        """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+        """Bodies closer than d̂ to a body at the end of the last step, (B,) by name; those that never were are left out."""
         return touching(self.layout, self._potential, self._index(name))
 
     def overlap(self, env: int = 0) -> str | None:
-        """Say which surfaces cross, touch or contain each other in one environment as it is now; None where all are apart.
+        """Describe the first surfaces that cross, touch or contain each other in one environment; None where all are apart.
 
         Edges and triangles are compared exactly, on the host: a check for tests and experiments, not for every step of a batch. Only
         pairs of bodies that may touch are looked at, a body with itself where it has ``self_contact``.
@@ -347,12 +341,12 @@ class World:
             OverlapError: if surfaces cross or touch in that state.
         """
         mask, s = env_mask(envs, self.num_envs), self._potential
-        for what, found, needed in (
+        for what, given, needed in (
             ("nodes", state.y.shape, (*s.y.shape, 3)),
             ("frames", state.frame_position.shape, (*s.frame_p.shape, 3)),
         ):
-            if found != needed:
-                raise IpcError(f"the state has {what} of shape {found}: this world has {needed}")
+            if given != needed:
+                raise IpcError(f"the state has {what} of shape {given}: this world has {needed}")
         check_overlap(self.layout, state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         for target, values in (
@@ -379,7 +373,7 @@ class World:
         s.place_vertices(s.y, s.R, s.t, s.x)
 
     def reset(self, envs: ArrayLike | None = None) -> None:
-        """Put environments (a mask (B,), a list, or None for all) back to how the world was made."""
+        """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""
         self.restore(self._start, envs)
 
     def teleport(
@@ -404,4 +398,4 @@ class World:
         goal_p, goal_q = self._goal_p[:, ~moved].copy(), self._goal_q[:, ~moved].copy()
         self.restore(state, mask)
         self._goal_p[:, ~moved], self._goal_q[:, ~moved] = goal_p, goal_q
-        self._told = False
+        self._targets_set = True

@@ -1,4 +1,4 @@
-"""What a world is made of: soft, affine and kinematic bodies, half-spaces, and the queries that find bonded vertices."""
+"""Bodies of a world: soft, affine and kinematic ones, half-spaces, and queries for the vertices to bond."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ class SoftBody:
         name: unique name.
         mesh: tetrahedra in the body's frame.
         material: elastic material.
-        bonded: indices of the vertices that are fixed to the body's frame, exactly: they move with its pose and are no unknowns.
+        bonded: indices of the vertices that are fixed to the body's frame: they move with its pose exactly and are no unknowns.
         pose: ``world_from_body`` at the start. With bonded vertices the frame is driven (see ``World.set_target``); without, it only
             places the body.
-        self_contact: whether the body's surface may touch itself.
+        self_contact: if True, the body's surface may touch itself.
         grips: further sets of vertices, each bonded exactly to a moving frame of its own, which is driven under the name
             ``"<body>.<grip>"`` and begins at ``pose``; they need ``bonded`` vertices beside them, whose frame the body is solved in.
     """
@@ -84,17 +84,17 @@ class SoftBody:
         grips = {key: self._vertices(key, ids) for key, ids in self.grips.items()}
         if grips and not len(bonded):
             raise IpcError(f"{self.name}: grips {', '.join(grips)} need bonded vertices beside them")
-        held = np.concatenate([bonded, *grips.values()])
-        if len(np.unique(held)) < len(held):
+        fixed = np.concatenate([bonded, *grips.values()])
+        if len(np.unique(fixed)) < len(fixed):
             raise IpcError(f"{self.name}: a vertex is held twice, by bonded or grips {', '.join(grips)}")
         object.__setattr__(self, "bonded", bonded)
         object.__setattr__(self, "grips", grips)
 
     def _vertices(self, what: str, ids: ArrayLike) -> NDArray[np.int64]:
-        found = np.unique(np.asarray(ids, dtype=np.int64))
-        if len(found) and (found[0] < 0 or found[-1] >= len(self.mesh.vertices)):
-            raise IpcError(f"{self.name}: {what} names vertices {found[0]} to {found[-1]}: there are {len(self.mesh.vertices)}")
-        return found
+        unique = np.unique(np.asarray(ids, dtype=np.int64))
+        if len(unique) and (unique[0] < 0 or unique[-1] >= len(self.mesh.vertices)):
+            raise IpcError(f"{self.name}: {what} names vertices {unique[0]} to {unique[-1]}: there are {len(self.mesh.vertices)}")
+        return unique
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class AffineBody:
         material: stiffness and density.
         pose: ``world_from_body`` at the start.
         drive: strength s of a drive towards the pose given by ``World.set_target`` (its start at first): the step adds
-            ½ s/h² ‖x − x_aim‖²_M, so that a free body covers s/(1 + s) of the way in one step and contact may hold it back. 0: free.
+            ½ s/h² ‖x − x_aim‖²_M, so that a free body covers s/(1 + s) of the distance in one step and contact may stop it. 0: free.
     """
 
     name: str
@@ -123,7 +123,7 @@ class AffineBody:
 
 @dataclass(frozen=True)
 class KinematicBody:
-    """A rigid surface that goes where it is told (see ``World.set_target``); it may be open.
+    """A rigid surface of prescribed pose (see ``World.set_target``); it may be open.
 
     Attributes:
         name: unique name.

@@ -1,4 +1,4 @@
-"""Lay the bodies of a world out in flat arrays that every environment shares.
+"""The layout of the bodies of a world in flat arrays that every environment shares.
 
 Unknowns are *nodes*. A soft body's nodes are its vertices; an affine body has four, the corners of a tetrahedron around it, so that
 its twelve unknowns are positions too: x(X) = Σ_k w_k(X) u_k with barycentric w. Nodes live in their body's frame. *Vertices* are the

@@ -1,8 +1,8 @@
 """Broad phase: pairs of primitives whose boxes overlap, kept for as long as no vertex leaves its box.
 
-Every vertex has a box around the motion it was last asked about, widened by a margin; a primitive's box is the union of its vertices'
-boxes widened by d̂/2. Two primitives whose boxes do not overlap stay farther apart than d̂ wherever their vertices go inside their
-boxes, so the list holds until one leaves (checked for every Newton step; the usual step needs no new list).
+Every vertex has a box around the last motion that was checked, widened by a margin; a primitive's box is the union of its vertices'
+boxes widened by d̂/2. Two primitives whose boxes do not overlap stay farther apart than d̂ as long as their vertices stay inside their
+boxes. So the list holds until a vertex leaves its box (checked for every Newton step; most steps need no new list).
 
 The search by lists: per body pair, primitives outside the other body's box are dropped first; the rest are tested all against all, which
 for a pad and a tool is a few hundred against a few hundred. :mod:`ipc.broad_phase.trees` finds the same pairs where there are more.
@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Surface:
-    """What every environment shares."""
+    """The surfaces of all bodies, which every environment shares."""
 
     edges: wp.array2d(dtype=wp.int32)
     faces: wp.array2d(dtype=wp.int32)
@@ -351,7 +351,7 @@ def rank_candidates(
     # outputs
     ordered: wp.array2d(dtype=wp.vec3i),
 ):
-    """Puts every pair where its rank says; pairs are unique, so their order no longer depends on who found them first."""
+    """Sorts the pairs. They are unique, so the result does not depend on the order in which threads wrote them."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= count[env]:
         return

@@ -1,7 +1,7 @@
 """Broad phase by bounding volume hierarchies: one over faces and one over edges, with a subtree for each body of each environment.
 
-A vertex asks, for every body it may touch, that body's faces; an edge asks that body's edges. Time grows with n log n and with the pairs
-found, where the lists of :mod:`ipc.broad_phase.lists` grow with the product of their lengths; and two launches serve all pairs of bodies.
+A vertex searches the faces of every body that it may touch, and an edge that body's edges. Time grows with n log n and with the number of
+pairs, that of :mod:`ipc.broad_phase.lists` with the product of the lengths. Two launches serve all pairs of bodies.
 
 A hierarchy is built once, from the shapes at rest, and only refitted afterwards: primitives that are neighbours on a surface stay
 neighbours however the body moves, and every body has a subtree of its own, so that where bodies are to each other does not matter.
@@ -78,7 +78,7 @@ class Tree:
 
 @wp.struct
 class Partners:
-    """Who asks whom: vertices or edges ``asking`` of a body look at each ``body`` from its ``start`` on, for the body pair ``pair``."""
+    """Queries: the primitives ``asking`` of a body search each ``body`` from its ``start`` on, for the body pair ``pair``."""
 
     asking: wp.array(dtype=wp.int32)
     start: wp.array(dtype=wp.int32)  # (bodies + 1,)
@@ -118,7 +118,7 @@ def body_corner(corners: wp.array3d(dtype=wp.float64), env: wp.int32, body: wp.i
 
 
 @wp.kernel
-def ask_faces(
+def query_faces(
     low: wp.array2d(dtype=wp.vec3d),
     high: wp.array2d(dtype=wp.vec3d),
     body_low: wp.array3d(dtype=wp.float64),
@@ -131,7 +131,7 @@ def ask_faces(
     # outputs
     candidates: Candidates,
 ):
-    """Vertices against the faces of the bodies that theirs may touch."""
+    """Vertices against the faces of the bodies that their body may touch."""
     env, i = wp.tid()
     if stale[env] == 0:
         return
@@ -152,7 +152,7 @@ def ask_faces(
 
 
 @wp.kernel
-def ask_edges(
+def query_edges(
     low: wp.array2d(dtype=wp.vec3d),
     high: wp.array2d(dtype=wp.vec3d),
     body_low: wp.array3d(dtype=wp.float64),
@@ -193,7 +193,7 @@ _CPU, _CUDA = (300, 2e6, 3), (700, 3e6, 10)
 
 
 def trees_pay(layout: Layout, pairs: Sequence[tuple[int, int, int]], cuda: bool) -> bool:
-    """Whether hierarchies find the candidates of the body pairs (index, a, b) sooner than lists do; docs/ipc-broad-phase.md has figures."""
+    """Expect hierarchies to be faster than lists for the body pairs (index, a, b); docs/ipc-broad-phase.md has figures."""
     own, product, most = _CUDA if cuda else _CPU
     edges = np.diff(layout.edge_start).astype(float)
     return len(pairs) >= most or any(edges[a] >= own if a == b else edges[a] * edges[b] >= product for _, a, b in pairs)
@@ -204,7 +204,7 @@ def _span(start: NDArray[np.int32], body: int) -> NDArray[np.int32]:
 
 
 class _Side:
-    """A hierarchy over primitives of one kind and who asks it.
+    """A hierarchy over primitives of one kind, and the queries to it.
 
     Args:
         kind: 1 for edges, 2 for faces.
@@ -221,7 +221,7 @@ class _Side:
         asked = sorted({b for _, b, _ in asks})
         lower, upper, group = [], [], []
         for number, body in enumerate(asked):
-            # The shape at rest, a unit in size: clusters are found as finely for small bodies as for large ones.
+            # The shape at rest, scaled to a unit, so that clusters are as fine for small bodies as for large ones.
             ids, verts = prims[_span(start, body)], slice(layout.vert_start[body], layout.vert_start[body + 1])
             size = np.ptp(layout.vert_local[verts], axis=0).max()
             corners = (layout.vert_local[ids] - layout.vert_local[verts].min(axis=0)) / size
@@ -301,7 +301,7 @@ class Trees:
             stale: mask (B,).
             candidates: where to add.
         """
-        searches: tuple[tuple[Any, _Side], ...] = ((ask_faces, self._faces), (ask_edges, self._edges))
+        searches: tuple[tuple[Any, _Side], ...] = ((query_faces, self._faces), (query_edges, self._edges))
         for kernel, side in searches:
             side.refit(*boxes[:2], surface, stale)
             inputs = [*boxes, surface, vert_body, side.tree, side.partners, stale]

@@ -51,7 +51,7 @@ def additive_ccd(
     least: wp.float64,
     t_max: wp.float64,
 ) -> wp.float64:
-    """The t in [0, t_max] to which the pair may go; t_max if its distance stays above ``slack`` of the one at t = 0.
+    """The largest t in [0, t_max] for the pair; t_max if its distance stays above ``slack`` of the one at t = 0.
 
     Nor may it fall below ``floor`` [m]; a pair that is already there may hardly come closer. At t it is not below ``least`` [m]; a pair
     that is already there is no closer than it was.
@@ -70,7 +70,7 @@ def additive_ccd(
     end = wp.max(gap, wp.min(least, start))
     if start - end > speed * t_max:
         return t_max
-    t, kept, d = zero, zero, start
+    t, safe, d = zero, zero, start
     for _ in range(MAX_ADVANCES):
         # The next time at which the distance could have fallen to the gap; the safety factor covers rounding.
         t_next = t + SAFETY * (d - gap) / speed + wp.float64(1.0e-15)
@@ -81,12 +81,12 @@ def additive_ccd(
         before = d
         d = pair_distance(ee, x0 + t_next * d0, x1 + t_next * d1, x2 + t_next * d2, x3 + t_next * d3)
         if d > gap and d >= end:
-            kept = t_next
+            safe = t_next
         # A pair that parts goes on however small its advances are: they grow with the distance.
         if t_next == t_max or d <= gap * wp.float64(1.001) or (t_next - t < wp.float64(1.0e-6) and d <= before):
-            return kept
+            return safe
         t = t_next
-    return kept
+    return safe
 
 
 @wp.kernel

@@ -1,7 +1,7 @@
-"""Everything that surfaces do to each other: candidate lists, contact forces and rows, friction, and how far a step may go.
+"""Contact of a batch of environments: candidate lists, contact forces and rows, friction, and the limits of steps.
 
 Nothing here waits for the device: launches cover the buffers, counts are read by the kernels, and what did not fit raises the flag
-``overflow``, whereupon the caller discards what it was doing, calls ``grow`` and does it again.
+``overflow``. The caller then discards its work, calls ``grow`` and repeats it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Collision:
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.
         device: Warp device.
-        broad_phase: how pairs are found, as in :class:`ipc.settings.Settings`.
+        broad_phase: search for pairs, as in :class:`ipc.settings.Settings`.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Collision:
         broad_phase: str = "auto",
     ) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
-        # Pairs of an environment are shared by so many threads. One alone adds forces up in the order of the lists.
+        # Threads that share the pairs of an environment. One alone adds forces up in the order of the lists.
         self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
         self._sort = deterministic and device.is_cuda
         verts, bodies = int(layout.vert_start[-1]), len(layout.names)
@@ -138,7 +138,7 @@ class Collision:
         self._force = wp.zeros(batch, dtype=wp.float64, device=device)
         self._reduce = Reducer(batch, max(1, verts), device)
         self._reduce.prepare(verts)
-        self._low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first look builds a list
+        self._low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
 
     # --- buffers ---------------------------------------------------------------------------------------------------------------
 
@@ -167,7 +167,7 @@ class Collision:
                 setattr(lagged, name, new)
 
     def grow(self) -> None:
-        """Make room for what did not fit, and for as much again; the lists are made anew at the next look."""
+        """Make room for what did not fit, and for as much again; new lists are made at the next check."""
         counts = (self.candidates.pt_count, self.candidates.ee_count, self.contacts.count, self.contacts.row_count)
         rooms = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
         most = [int(c.numpy().max()) for c in counts]
@@ -189,7 +189,7 @@ class Collision:
         self._low.assign(low)
 
     def refresh(self, x: wp.array, dx: wp.array, active: wp.array) -> None:
-        """Make the candidate lists hold for every position on the way from x to x + dx (B, V), or set ``overflow``."""
+        """Make the candidate lists hold for every position from x to x + dx (B, V), or set ``overflow``."""
         if not self._meshes:
             return
         self._stale.zero_()

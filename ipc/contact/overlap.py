@@ -90,8 +90,8 @@ def meet(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDArray[np.in
 
 
 def _meet_in_plane(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDArray[np.bool_]:
-    """Whether segments meet triangles of the same plane: no line of a side of either has the other wholly beyond it."""
-    found, done = np.zeros(len(p), bool), np.zeros(len(p), bool)
+    """True for segments that meet triangles of the same plane: no side of either separates the two."""
+    meeting, done = np.zeros(len(p), bool), np.zeros(len(p), bool)
     for axes in ((0, 1), (1, 2), (2, 0)):  # a triangle with area has one in the projection on some coordinate plane
         rows = np.flatnonzero(~done)
         p_, q_, a_, b_, c_ = (x[rows][:, axes] for x in (p, q, a, b, c))
@@ -103,8 +103,8 @@ def _meet_in_plane(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDA
             beyond |= (turn * orientation(u, v, p_) < 0) & (turn * orientation(u, v, q_) < 0)
         sides = np.stack([orientation(p_, q_, corner) for corner in (a_, b_, c_)])
         beyond |= (sides > 0).all(axis=0) | (sides < 0).all(axis=0)
-        found[rows], done[rows] = ~beyond, True
-    return found
+        meeting[rows], done[rows] = ~beyond, True
+    return meeting
 
 
 def world_vertices(layout: Layout, y: Floats, rotation: Floats, position: Floats) -> Floats:
@@ -136,13 +136,13 @@ def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int
     i, j = _box_pairs(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
     apart = (edges[i][:, :, None] != faces[j][:, None, :]).all(axis=(1, 2))
     i, j = i[apart], j[apart]
-    how = meet(ends[i, 0], ends[i, 1], *(corners[j, k] for k in range(3)))
-    if (how == APART).all():
+    relation = meet(ends[i, 0], ends[i, 1], *(corners[j, k] for k in range(3)))
+    if (relation == APART).all():
         return None
-    if not (how == CROSSING).any():
-        first = int(np.argmax(how))
+    if not (relation == CROSSING).any():
+        first = int(np.argmax(relation))
         return int(i[first]), int(j[first]), None
-    i, j = i[how == CROSSING], j[how == CROSSING]
+    i, j = i[relation == CROSSING], j[relation == CROSSING]
     a, b, c = (corners[j, k] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -152,7 +152,7 @@ def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int
 
 
 def _contains(x: Floats, faces: NDArray, point: Floats) -> bool:
-    """Whether a closed surface winds around the point (van Oosterom, Strackee 1983); false for an open surface seen from outside."""
+    """True if a closed surface winds around the point (van Oosterom, Strackee 1983); false for an open one seen from outside."""
     a, b, c = (x[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     top = (a * np.cross(b, c)).sum(axis=1)
@@ -216,6 +216,6 @@ def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None
         seen.add(key)
         rotation, position = state.frame_rotation[env], state.frame_position[env]
         x = world_vertices(layout, state.y[env], rotation, position)
-        found = find_overlap(layout, x, rotation_matrix(rotation)[:, :, 2], position)
-        if found is not None:
-            raise OverlapError(f"environment {env}: {found}: start with the surfaces apart")
+        overlap = find_overlap(layout, x, rotation_matrix(rotation)[:, :, 2], position)
+        if overlap is not None:
+            raise OverlapError(f"environment {env}: {overlap}: start with the surfaces apart")

@@ -90,7 +90,7 @@ def graded(length: float, count: int, ratio: float = 1.0) -> NDArray[np.float64]
 
 
 Cut = Literal["mirrored", "alike"]
-"""How the cells of a grid are cut into tetrahedra; see ``box_mesh``."""
+"""Subdivision of the cells of a grid into tetrahedra; see ``box_mesh``."""
 
 # The six tetrahedra of a cube around its diagonal 0-7 (corner k has bits x = k & 1, y = k & 2, z = k & 4). Opposite faces of the cube have
 # the same diagonals, so neighbouring cells match whether or not they are mirrored in the face between them.
@@ -104,13 +104,13 @@ def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, cut: Cut = "mirrored") ->
 
     Args:
         x, y, z: grid lines [m], at least two each.
-        cut: which way the diagonals of the cells run.
+        cut: direction of the diagonals of the cells.
 
             - ``"mirrored"``: each cell is the mirror image of its neighbours, in all three directions. Two by two by two cells are the
               barycentric subdivision of a cube, as the Powell-Sabin split is of a triangle; there, continuous piecewise linear fields
-              without divergence approximate well (S. Zhang, J. Comput. Math. 26, 2008, in two dimensions; that it helps in three is seen
-              and not proven). Locks little where ν nears 0.5; docs/soft-pad.md has figures.
-            - ``"alike"``: all diagonals run the same way, but for a reflection in the middle of x and of y. Locks where ν nears 0.5.
+              without divergence approximate well (S. Zhang, J. Comput. Math. 26, 2008, in two dimensions; in three this is measured,
+              not proven). Locks little where ν nears 0.5; docs/soft-pad.md has figures.
+            - ``"alike"``: all diagonals are parallel, but for a reflection in the middle of x and of y. Locks where ν nears 0.5.
 
             With even cell counts in x and y either mesh is symmetric about its middle planes, if the grid lines are.
 
@@ -156,7 +156,7 @@ def domed_pad(
         radius: radius of curvature along x and along y [m]; ``math.inf`` is flat.
         cells: number of cells in x, y and z.
         grading: ratio of each layer's height to the one below it; below 1 the layers get thinner towards the outer surface.
-        cut: how a cell is cut into tetrahedra, see ``box_mesh``.
+        cut: direction of the diagonals of the cells, see ``box_mesh``.
 
     Raises:
         IpcError: if the edge of the dome would fall below the base.

@@ -51,14 +51,14 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
         raise IpcError(f"edge_length = {edge_length} m: it must be positive")
     folder = cache or default_cache()
     path = None if folder is None else folder / tets_name(surface, edge_length)
-    kept = kept_tets(path, surface, edge_length)
+    kept = read_tets(path, surface, edge_length)
     if kept is not None:
         return kept
     vertices, tets = _fill(surface, edge_length)
     negative = tet_volumes(vertices, tets) < 0
     tets[negative] = tets[negative][:, [0, 1, 3, 2]]
     mesh = TetMesh(vertices, tets)
-    keep_tets(path, mesh, surface, edge_length)
+    write_tets(path, mesh, surface, edge_length)
     return mesh
 
 
@@ -72,8 +72,8 @@ def _fill(surface: TriMesh, edge_length: float) -> tuple[np.ndarray, np.ndarray]
         if done.returncode != 0:
             last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
             raise IpcError(f"pytetwild could not fill the surface with an edge length of {edge_length} m: {last[0]}")
-        with np.load(Path(folder) / "tets.npz") as found:
-            return found["vertices"], found["tets"]
+        with np.load(Path(folder) / "tets.npz") as mesh:
+            return mesh["vertices"], mesh["tets"]
 
 
 def default_cache() -> Path | None:
@@ -92,8 +92,8 @@ def tets_name(surface: TriMesh, edge_length: float) -> str:
     return f"{digest.hexdigest()[:32]}.npz"
 
 
-def kept_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMesh | None:
-    """The mesh kept at ``path``; None if there is none, or, with a warning, if it is damaged or of another surface or length."""
+def read_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMesh | None:
+    """The mesh stored at ``path``; None if there is none, or, with a warning, if it is damaged or of another surface or length."""
     if path is None:
         return None
     try:
@@ -107,12 +107,12 @@ def kept_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMes
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, IpcError) as error:
-        if os.path.lexists(path):  # else the folder cannot be used at all, of which `keep_tets` tells
+        if os.path.lexists(path):  # else the folder cannot be used at all, and `write_tets` warns
             warnings.warn(f"{path} in the cache cannot be used and is made again: {error}", RuntimeWarning, stacklevel=3)
         return None
 
 
-def keep_tets(path: Path | None, mesh: TetMesh, surface: TriMesh, edge_length: float) -> None:
+def write_tets(path: Path | None, mesh: TetMesh, surface: TriMesh, edge_length: float) -> None:
     """Write a mesh beside ``path``, synchronise it with the disk, and rename it; a warning where that cannot be."""
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, vertices=mesh.vertices, tets=mesh.tets, **_request(surface, edge_length))

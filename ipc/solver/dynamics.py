@@ -1,4 +1,4 @@
-"""Frames, inertia and the way between nodes (unknowns, in their body's frame) and vertices (surface points, in the world).
+"""Frames, inertia, and the maps between nodes (unknowns, in their body's frame) and vertices (surface points, in the world).
 
 Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n + h v_n + h² a.
 Because a frame's rotation keeps lengths, the same energy holds in frame coordinates with ỹ = Rᵀ(x̃ − t): no fictitious forces, and a
@@ -74,15 +74,15 @@ def frames_at(
     start_p: wp.array2d(dtype=wp.vec3d),
     end_q: wp.array2d(dtype=wp.quatd),
     end_p: wp.array2d(dtype=wp.vec3d),
-    share: wp.array(dtype=wp.float64),
+    progress: wp.array(dtype=wp.float64),
     # outputs
     R: wp.array2d(dtype=wp.mat33d),
     t: wp.array2d(dtype=wp.vec3d),
     now_q: wp.array2d(dtype=wp.quatd),
 ):
-    """Frames a share of the way from start to end: positions along a line, rotations along the shorter arc."""
+    """Frames at a share of the motion from start to end: positions along a line, rotations along the shorter arc."""
     env, b = wp.tid()
-    s = share[env]
+    s = progress[env]
     q0 = start_q[env, b]
     sign = wp.float64(1.0)
     if wp.dot(q0, end_q[env, b]) < wp.float64(0.0):
@@ -304,17 +304,17 @@ def compare_frames(
     goal_p: wp.array2d(dtype=wp.vec3d),
     moves: wp.array(dtype=wp.int32),
     # outputs
-    share: wp.array(dtype=wp.float64),
+    progress: wp.array(dtype=wp.float64),
 ):
-    """share = 0 where a frame has a way to go, else 1."""
+    """progress = 0 where a frame has to move, else 1."""
     env = wp.tid()
-    share[env] = wp.float64(1.0)
+    progress[env] = wp.float64(1.0)
     for b in range(frame_q.shape[1]):
         if moves[b] != 0:
             p, q = frame_p[env, b], goal_p[env, b]
             r, s = frame_q[env, b], goal_q[env, b]
             if p[0] != q[0] or p[1] != q[1] or p[2] != q[2] or r[0] != s[0] or r[1] != s[1] or r[2] != s[2] or r[3] != s[3]:
-                share[env] = wp.float64(0.0)
+                progress[env] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -346,7 +346,7 @@ def place_grips(
     # outputs
     y: wp.array2d(dtype=wp.vec3d),
 ):
-    """Gripped nodes go with their grip's frame; y holds them in their body's frame, as all nodes."""
+    """Positions y of gripped nodes, which move with the frame of their grip, in the frame of their body."""
     env, g = wp.tid()
     node, frame = grip_node[g], grip_frame[g]
     body = node_body[node]
@@ -406,7 +406,7 @@ def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2
         y[env, i] = y1[env, i]
 
 
-# Said here, so that the module is compiled once and not again at each new type.
+# All types at once, so that the module is compiled only once.
 for _type in (wp.vec3d, wp.mat33d):
     wp.overload(take, [wp.array2d(dtype=_type), wp.array(dtype=wp.int32), wp.array2d(dtype=_type)])
 

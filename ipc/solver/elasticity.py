@@ -7,7 +7,7 @@ With F = Σ_a x_a ∇w_aᵀ and J = det F:
 ``orthogonal`` (code 2)  Ψ = μ ‖F Fᵀ − 1‖²                                                        (Lan et al. 2022, eq. 6)
 
 To the first two comes, below J = J₀ = 0.2, the barrier −λ (J − J₀)² ln(J/J₀), of the form of the contact barrier: without it a collapsed
-element costs little, Newton's method runs against det F = 0 as against a wall, and nothing moves any more. Above J₀ it is zero.
+element costs little, Newton's steps are cut short at det F = 0, and the step stalls. Above J₀ it is zero.
 
 For the first two, P = m F + c cof F with m = μ or μ (1 − 1/(I_C + 1)) and c = λ (J − 1) − μ or λ (J − a), plus the barrier's slope. The
 second derivative is
@@ -16,7 +16,7 @@ second derivative is
 
 and every term but the last is positive semi-definite. The blocks need no 9×9 matrix: with g_a = ∇w_a, the last term couples corners
 a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-definite, ``geometric_factor`` shrinks c toward 0 until it is;
-the semi-definite set of c is an interval around 0, found from the singular values (Smith et al. 2018, section 4, gives the modes).
+the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -95,8 +95,8 @@ def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64
         return mu * wp.ddot(C, C)
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
-        kept = half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
-        return kept + lam * squeeze(J)
+        base = half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
+        return base + lam * squeeze(J)
     return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + half * lam * (J - one) * (J - one) + lam * squeeze(J)
 
 
@@ -122,7 +122,7 @@ def first_piola(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, la
 
 @wp.func
 def stretch_block_definite(s: wp.vec3d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.bool:
-    """Whether the 3×3 block of the stretch modes is positive semi-definite (all leading minors are non-negative)."""
+    """True if the 3×3 block of the stretch modes is positive semi-definite (all leading minors are non-negative)."""
     p = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
     a00 = m + k * s[0] * s[0] + lam * p[0] * p[0]
     a11 = m + k * s[1] * s[1] + lam * p[1] * p[1]

@@ -1,4 +1,4 @@
-"""Forces and motions that a solved step leaves, summed up by body and by pair of bodies; world frame, on the host."""
+"""Forces and motions after a solved step, summed by body and by pair of bodies; world frame, on the host."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ipc.bodies.layout import Layout
 from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
 from ipc.solver.potential import Potential
 
-__all__ = ["bond_wrench", "contact_pairs", "host", "pair_forces", "plane_forces", "rigid_motion", "touching"]
+__all__ = ["bond_wrench", "contact_pairs", "contact_wrench", "host", "pair_forces", "rigid_motion", "touching"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
@@ -26,7 +26,7 @@ def host(array: wp.array) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class _Forces:
-    """C forces between two primitives, those of all environments in one list: a vertex bears coef · force."""
+    """C forces between two primitives, those of all environments in one list: coef · force acts on a vertex."""
 
     env: Ints
     pair: Ints
@@ -42,7 +42,7 @@ class _Forces:
         return np.where(layout.vert_body[self.verts[:, 0]] == layout.pairs[self.pair, 0], 1.0, -1.0)
 
     def points(self, layout: Layout, x: Floats) -> Floats:
-        """Where they act on the pair's first body [m], (C, 3); ``x``: all vertices, (B, V, 3)."""
+        """Points of action on the pair's first body [m], (C, 3); ``x``: all vertices, (B, V, 3)."""
         coef = self.side(layout)[:, None] * self.coef
         weights = np.where((coef > 0.0) & (self.verts >= 0), coef, 0.0)
         at = x[self.env[:, None], np.maximum(self.verts, 0)]
@@ -50,7 +50,7 @@ class _Forces:
 
 
 def _normal_forces(potential: Potential) -> _Forces:
-    """Of the contacts at the end of the step."""
+    """Normal forces of the contacts at the end of the step."""
     contacts = potential.collision.contacts
     pair = host(contacts.pair)
     at = np.nonzero(np.arange(pair.shape[1]) < host(contacts.count)[:, None])
@@ -59,7 +59,7 @@ def _normal_forces(potential: Potential) -> _Forces:
 
 
 def _friction_forces(potential: Potential) -> _Forces:
-    """Of the lagged contacts: −μ λ f1(|u|) u / |u|, with u their sliding in the step (see ``ipc/contact/friction.py``)."""
+    """Friction forces of the lagged contacts: −μ λ f1(|u|) u / |u|, with u their sliding in the step (see ``ipc/contact/friction.py``)."""
     lagged = potential.collision.lagged
     pair = host(lagged.pair)
     at = np.nonzero(np.arange(pair.shape[1]) < host(lagged.count)[:, None])
@@ -77,49 +77,57 @@ def _all_forces(potential: Potential) -> list[_Forces]:
 
 
 def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wrench:
-    """What a body's bonded ``nodes`` do to the frame that holds them, about its origin."""
+    """Force and torque of a body's bonded ``nodes`` on the frame that carries them, about its origin."""
     R, t = host(potential.R)[:, body], host(potential.t)
     forces = -np.einsum("bij,bnj->bni", R, host(potential.gradient)[:, nodes])
     points = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None, body]
     return Wrench(forces.sum(axis=1), np.cross(points - t[:, None, frame], forces).sum(axis=1))
 
 
-def plane_forces(layout: Layout, potential: Potential, body: int) -> tuple[Floats, Floats]:
-    """Points and forces on a half-space: the reactions of its contacts, friction included, (B, n, 3)."""
-    x = host(potential.x)
-    forces = np.zeros_like(x)
-    for found in _all_forces(potential):
-        mine = (found.verts[:, 1] < 0) & (layout.pairs[found.pair, 1] == body)
-        np.add.at(forces, (found.env[mine], found.verts[mine, 0]), -found.force[mine])
-    return x, forces
+def contact_wrench(layout: Layout, potential: Potential, body: int) -> Wrench:
+    """Contact and friction forces on a body, about the origin of its frame, or of the world for a body without one.
+
+    Those on a half-space are the reactions on the vertices that touch it.
+    """
+    x, t = host(potential.x), host(potential.t)
+    if layout.half_space[body]:
+        points, forces = x, np.zeros_like(x)
+        for some in _all_forces(potential):
+            mine = (some.verts[:, 1] < 0) & (layout.pairs[some.pair, 1] == body)
+            np.add.at(forces, (some.env[mine], some.verts[mine, 0]), -some.force[mine])
+    else:
+        first, last = layout.vert_start[body : body + 2]
+        points, forces = x[:, first:last], -host(potential.vert_gradient)[:, first:last]
+    origin = t[:, None, body] if layout.framed[body] else 0.0
+    return Wrench(forces.sum(axis=1), np.cross(points - origin, forces).sum(axis=1))
 
 
 def contact_pairs(layout: Layout, potential: Potential, env: int) -> ContactPairs:
     """The contact pairs of one environment at the end of the last step."""
-    found = potential.collision.contacts
-    n = int(host(found.count)[env])
-    pairs = layout.pairs[host(found.pair)[env, :n]]
+    contacts = potential.collision.contacts
+    n = int(host(contacts.count)[env])
+    pairs = layout.pairs[host(contacts.pair)[env, :n]]
     return ContactPairs(
         bodies=tuple((layout.names[a], layout.names[b]) for a, b in pairs),
-        vertices=host(found.verts)[env, :n].copy(),
-        weights=host(found.coef)[env, :n].copy(),
-        normal=host(found.normal)[env, :n].copy(),
-        gap=host(found.gap)[env, :n].copy(),
-        force=host(found.force)[env, :n].copy(),
+        vertices=host(contacts.verts)[env, :n].copy(),
+        weights=host(contacts.coef)[env, :n].copy(),
+        normal=host(contacts.normal)[env, :n].copy(),
+        gap=host(contacts.gap)[env, :n].copy(),
+        force=host(contacts.force)[env, :n].copy(),
     )
 
 
 def pair_forces(layout: Layout, potential: Potential) -> dict[tuple[str, str], PairForces]:
-    """What touches what, by names of the two bodies; pairs that nowhere touch are not in it."""
+    """Forces by names of the two bodies; pairs that touch in no environment are left out."""
     x = host(potential.x)
     batch, forces = len(x), _all_forces(potential)
     points, signs = [f.points(layout, x) for f in forces], [f.side(layout)[:, None] for f in forces]
-    answer = {}
+    result = {}
     for p in np.unique(forces[0].pair):
         normal, middle, weight, wrench = np.zeros((batch, 3)), np.zeros((batch, 3)), np.zeros(batch), np.zeros((batch, 6))
-        for k, (found, at, sign) in enumerate(zip(forces, points, signs, strict=True)):
-            mine = found.pair == p
-            env, force = found.env[mine], (sign * found.force)[mine]
+        for k, (some, at, sign) in enumerate(zip(forces, points, signs, strict=True)):
+            mine = some.pair == p
+            env, force = some.env[mine], (sign * some.force)[mine]
             if k == 0:
                 size = np.linalg.norm(force, axis=1)
                 np.add.at(normal, env, force)
@@ -129,8 +137,8 @@ def pair_forces(layout: Layout, potential: Potential) -> dict[tuple[str, str], P
                     place = middle / weight[:, None]
             arm = at[mine] - np.nan_to_num(place)[env]
             np.add.at(wrench, env, np.concatenate([force, np.cross(arm, force)], axis=1))
-        answer[tuple(layout.names[b] for b in layout.pairs[p])] = PairForces(normal, place, wrench)
-    return answer
+        result[tuple(layout.names[b] for b in layout.pairs[p])] = PairForces(normal, place, wrench)
+    return result
 
 
 def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion:
@@ -154,12 +162,12 @@ def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion
 
 
 def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:
-    """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
-    found = potential.collision.contacts
-    pair = host(found.pair)
-    there = np.zeros((len(pair), len(layout.pairs)), bool)
-    env, k = np.nonzero(np.arange(pair.shape[1]) < host(found.count)[:, None])
-    there[env, pair[env, k]] = True
-    mine = np.flatnonzero((layout.pairs == body).any(axis=1) & there.any(axis=0))
+    """Bodies closer than d̂ to a body at the end of the last step, (B,) by name; those that never were are left out."""
+    contacts = potential.collision.contacts
+    pair = host(contacts.pair)
+    near = np.zeros((len(pair), len(layout.pairs)), bool)
+    env, k = np.nonzero(np.arange(pair.shape[1]) < host(contacts.count)[:, None])
+    near[env, pair[env, k]] = True
+    mine = np.flatnonzero((layout.pairs == body).any(axis=1) & near.any(axis=0))
     other = layout.pairs[mine].sum(axis=1) - body
-    return {layout.names[b]: there[:, p] for p, b in zip(mine, other, strict=True)}
+    return {layout.names[b]: near[:, p] for p, b in zip(mine, other, strict=True)}

@@ -1,6 +1,6 @@
 """The Newton matrix: H = blocks + Σ q qᵀ, a block matrix of one pattern for every environment, and the contact rows.
 
-Products with it, its diagonal, and what approximates its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
+Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
 dimensions, counts are read on the device.
 """
 
@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SystemView:
-    """What a product with H reads; ``free`` is 1 on the unknowns.
+    """Arrays that a product with H reads; ``free`` is 1 on the unknowns.
 
     Block s of row i lies at ``row_base[i] + s·stride``: rows are dealt out in slices of ``stride``, so that threads of neighbouring rows
     read neighbouring blocks (Monakov et al. 2010, sliced ELLPACK); with a stride of 1 the rows lie one after the other.
@@ -212,7 +212,7 @@ def push_blocks(
     # outputs
     residual: wp.array2d(dtype=wp.vec3d),
 ):
-    """residual −= blocks · lift on the unknowns: gripped nodes that move under orders take their neighbours along."""
+    """residual −= blocks · lift on the unknowns: gripped nodes, whose motion is prescribed, take their neighbours along."""
     env, i = wp.tid()
     if active[env] != 0 and system.free[i] != 0:
         residual[env, i] = residual[env, i] - block_row(system, env, i, lift)

@@ -1,15 +1,19 @@
-"""One time step: driven bodies advance as far as they can, projected Newton finds the state of least incremental potential.
+"""One time step: driven bodies advance as far as they can, and projected Newton minimises the incremental potential.
 
-Each Newton iteration (i) tells the linear system where driven frames are going, so that the unknowns move out of their way in the same
-step, and takes that step as far as gaps allow, until the frames have arrived; (ii) solves H p = −g by PCG, with the exact Hessian first
-and a positive semi-definite one once negative curvature is met (projection on demand, after Longva et al. 2023, "Pitfalls of
-Projection"); (iii) limits the step by continuous collision detection; (iv) halves it until the energy falls enough and no tetrahedron
-is inverted. An environment is done when p is small and its frames have arrived, or are blocked; then its friction is lagged anew, as
-often as the settings say. Environments never wait on or change each other's arithmetic: every decision is a mask.
+A Newton iteration has four parts:
+(i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
+Frames and unknowns then move together as far as gaps allow.
+(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one once negative curvature is met
+(projection on demand, after Longva et al. 2023, "Pitfalls of Projection").
+(iii) Continuous collision detection limits the step.
+(iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
 
-The loop itself is made of conditional nodes, so that on CUDA a whole step is one graph launch without a word from the host; on a CPU the
-same functions run as they stand. If a buffer was too small the step halts before anything changed, the host lets the buffer grow, and
-the step goes on from there.
+An environment is done when p is small and its frames have arrived, or are blocked. Its friction is then lagged again, as often as the
+settings say. Environments never wait on or change each other's arithmetic: every decision is a mask.
+
+The loop itself is made of conditional nodes, so that on CUDA a whole step is one graph launch without the host. On a CPU the same functions
+run as they stand. If a buffer was too small, the step halts before anything changes, the host lets the buffer grow, and the step goes on
+from there.
 """
 
 from __future__ import annotations
@@ -115,7 +119,7 @@ class Newton:
         self._rest()
 
     def _rest(self) -> None:
-        """Everything after the preparation; also what is left to do once buffers have grown."""
+        """Everything after the preparation; repeated once buffers have grown."""
         pot, state = self.potential, self.state
         with self._stage("broad"):
             pot.collision.refresh(pot.x, self._still, state.decisions.alive)
@@ -159,13 +163,13 @@ class Newton:
         if self._friction:
             wp.capture_if(f.pending, self._lag)
         state.launch(decisions.choose_advancing)
-        wp.capture_if(f.advance, pot.look_ahead, share=d.trial_progress)
+        wp.capture_if(f.advance, pot.prescribe, progress=d.trial_progress)
         with self._stage("forces"):
             pot.assemble(d.active)
             self._note_extremes(d.active)
         with self._stage("matrix"):
             pot.fill_matrix(d.active)
-            wp.capture_if(f.advance, pot.push_ahead, mask=d.advancing)
+            wp.capture_if(f.advance, pot.push_prescribed, mask=d.advancing)
         self._solve()
         pot.size_of_step(d.active, d.size)
         state.launch(decisions.judge_direction, pot.dt)

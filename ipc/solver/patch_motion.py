@@ -1,10 +1,10 @@
-"""A patch on the surface of a bonded body that moves as a whole: how stiffly the body holds it, and how heavy it is.
+"""A patch on the surface of a bonded body that moves as a whole: the stiffness of its support, and its mass.
 
 The linear body at rest: with C the compliance between the patch's nodes and R their rigid motions about the patch's centre (6 columns),
 K = Rᵀ C⁻¹ R. The rest of the body follows by the deflection that K belongs to, u = C_:P C⁻¹ R, and moves with the mass uᵀ M u (R. J. Guyan,
 Reduction of stiffness and mass matrices, AIAA Journal 3, 1965). A deformed body is taken to be as stiff as at rest, turned with the patch,
-and as a string besides: under a force T it bears T (6/5 x²/L + 2/15 L θ² ± 1/5 x θ) / 2 across it (the geometric stiffness of a beam,
-J. S. Przemieniecki, Theory of Matrix Structural Analysis, 1968), here bounded by 1.3 T/L and 7/30 T L along and about all axes, with L the
+and as a string besides: under a force T its energy grows by T (6/5 x²/L + 2/15 L θ² ± 1/5 x θ) / 2 across it (the geometric stiffness
+of a beam, J. S. Przemieniecki, Theory of Matrix Structural Analysis, 1968), here bounded by 1.3 T/L and 7/30 T L along and about all axes, with L the
 least distance from what is bonded.
 """
 
@@ -46,7 +46,7 @@ class RestPatches:
         name, size = layout.names[body], entries(layout, nodes, label)
         if size > MAX_ENTRIES:
             rule = f"the inverse of its rest matrix would have {size} numbers, at most {MAX_ENTRIES}; cut it more coarsely"
-            raise IpcError(f"{name!r} has {len(nodes)} free vertices, too many to tell how stiffly it is held: {rule}")
+            raise IpcError(f"{name!r} has {len(nodes)} free vertices, too many for the stiffness of a patch: {rule}")
         blocks = rest_blocks(layout, replace(settings, dt=_STATIC))
         try:
             self._inner = condense(layout, blocks, nodes, label)
@@ -60,7 +60,7 @@ class RestPatches:
         self._mass = np.bincount(rows, weights=layout.mass, minlength=len(layout.node_rest))
 
     def loaded(self, potential: Potential, env: int) -> PatchMotion | None:
-        """Of the free nodes that bear contact forces since the last step; None where there are none."""
+        """Motion of the free nodes under contact forces of the last step; None where there are none."""
         layout = self._layout
         first, last = layout.vert_start[self._body : self._body + 2]
         forces = potential.vert_gradient.numpy()[env, first:last]
@@ -69,9 +69,9 @@ class RestPatches:
         return self.motion(potential, env, nodes, float(np.linalg.norm(forces.sum(axis=0)))) if len(nodes) else None
 
     def motion(self, potential: Potential, env: int, patch: NDArray[np.integer], force: float = 0.0) -> PatchMotion:
-        """Of the nodes ``patch`` (n,), numbers of the layout, as they are in one environment; bonded ones are left out.
+        """Motion of the nodes ``patch`` (n,), numbers of the layout, in one environment; bonded ones are ignored.
 
-        ``force``: size of what the patch bears [N].
+        ``force``: size of the force on the patch [N].
 
         Raises ``ValueError`` where none of them is free to move.
         """
@@ -91,20 +91,20 @@ class RestPatches:
         # From the body's frame at rest to the world as it is.
         frame, origin = potential.R.numpy()[env, self._body], potential.t.numpy()[env, self._body]
         y, v = potential.y.numpy()[env, patch], potential.v.numpy()[env, patch]
-        turn = frame @ _turn(rest - middle, y - y.mean(axis=0))
-        both = np.kron(np.eye(2), turn)
-        stiffness, mass = both @ (0.5 * (stiffness + stiffness.T)) @ both.T, both @ mass @ both.T
+        rotation = frame @ _rotation(rest - middle, y - y.mean(axis=0))
+        turned = np.kron(np.eye(2), rotation)
+        stiffness, mass = turned @ (0.5 * (stiffness + stiffness.T)) @ turned.T, turned @ mass @ turned.T
         length = float(np.linalg.norm(rest[:, None] - self._bonded, axis=2).min())
         stiffness += force * np.diag([1.3 / length] * 3 + [7.0 / 30.0 * length] * 3)
         arm = (y - y.mean(axis=0)) @ frame.T
         spread = _rigid(arm)
         motion: Floats = np.linalg.lstsq(spread, np.asarray(v, np.float64).reshape(-1), rcond=1e-9)[0].astype(np.float64)
-        heavy = float(np.trace(mass[:3, :3])) / 3.0
-        inertia = mass[3:, 3:] + heavy * _LEAST_RADIUS**2 * np.eye(3)
-        return PatchMotion(heavy, inertia, frame @ y.mean(axis=0) + origin, motion, stiffness)
+        total = float(np.trace(mass[:3, :3])) / 3.0
+        inertia = mass[3:, 3:] + total * _LEAST_RADIUS**2 * np.eye(3)
+        return PatchMotion(total, inertia, frame @ y.mean(axis=0) + origin, motion, stiffness)
 
     def _moving_mass(self, interface: Floats) -> Floats:
-        """uᵀ M u of the deflection u (3 Γ, 6) of the interface, and of what follows inside."""
+        """uᵀ M u of the deflection u (3 Γ, 6) of the interface and of the nodes inside."""
         inner = self._inner
         parts = [(inner.interface, interface)]
         place = {int(node): k for k, node in enumerate(inner.interface)}
@@ -120,18 +120,18 @@ class RestPatches:
 
 
 def _rigid(arm: Floats) -> Floats:
-    """Motions of points (n, 3) about the origin: three ways, three turns; (3 n, 6)."""
+    """Rigid motions of points (n, 3): three translations and three rotations about the origin; (3 n, 6)."""
     x, y, z = arm.T
-    found = np.zeros((len(arm), 3, 6))
-    found[:, :, :3] = np.eye(3)
+    motions = np.zeros((len(arm), 3, 6))
+    motions[:, :, :3] = np.eye(3)
     zero = np.zeros_like(x)
     # ω × arm
-    found[:, :, 3:] = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    return found.reshape(-1, 6)
+    motions[:, :, 3:] = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    return motions.reshape(-1, 6)
 
 
-def _turn(before: Floats, after: Floats) -> Floats:
-    """The rotation that takes points (n, 3) best to others; 1 where they lie on a line or in a point."""
+def _rotation(before: Floats, after: Floats) -> Floats:
+    """The rotation that best maps points (n, 3) to others; the identity where they lie on a line or in a point."""
     u, size, v = np.linalg.svd(after.T @ before)
     if size[1] <= 1e-6 * max(size[0], 1e-300):
         return np.eye(3)

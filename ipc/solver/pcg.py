@@ -27,9 +27,9 @@ wp.set_module_options({"enable_backward": False})
 ROUNDS = 4
 """Iterations between two looks at whether any environment still runs."""
 ONE_BLOCK_NODES = 3000
-"""Nodes up to which a system is left to one block of threads."""
+"""Nodes up to which one block of threads solves a system."""
 ONE_BLOCK_TOTAL = 600_000
-"""Nodes of all environments up to which it is: 304,000 were faster that way on an H200, 1,160,000 slower by a third."""
+"""The same for the nodes of all environments: 304,000 were faster so on an H200, 1,160,000 slower by a third."""
 
 
 @wp.kernel
@@ -153,7 +153,7 @@ class Pcg:
 
     def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
         self.batch, self.nodes, self.lanes, self.device = batch, nodes, lanes, device
-        # With one lane the sums must not depend on the batch, and neither may the way they are made.
+        # With one lane the sums, and so the choice between the two forms, must not depend on the batch.
         few = nodes <= ONE_BLOCK_NODES and (lanes == 1 or batch * nodes <= ONE_BLOCK_TOTAL)
         self.one_block = few or not device.is_cuda
         self._p, self._Ap, self._z = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(3))
@@ -180,12 +180,12 @@ class Pcg:
         max_iterations: int,
         active: wp.array,
     ) -> None:
-        """Solve H x = residual for the active environments, from x = 0; ``scalars`` says how it went.
+        """Solve H x = residual for the active environments, from x = 0; ``scalars`` has the iterations.
 
         Args:
             system, contacts: the matrix.
             preconditioner: already updated.
-            residual: right-hand side (B, N); overwritten by what is left of it.
+            residual: right-hand side (B, N); overwritten by the residual.
             x: solution (B, N); must be zero for the active environments.
             tolerance: on ‖r‖/‖r_0‖.
             max_iterations: after these the solution so far stands (it is a descent direction).

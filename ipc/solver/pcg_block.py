@@ -80,12 +80,12 @@ def solve_in_one_block(
         a += wp.length_sq(r[env, i])
         b += wp.dot(r[env, i], z)
         i += threads
-    first = block_sum(a)
+    rr0 = block_sum(a)
     rz = block_sum(b)
     if lane == 0:
         s.iterations[env] = 0
         s.negative[env] = 0
-    if first == wp.float64(0.0):
+    if rr0 == wp.float64(0.0):
         return
     wait_for_block()
     for it in range(max_iterations):
@@ -118,19 +118,19 @@ def solve_in_one_block(
         i = lane
         while i < n:
             x[env, i] = x[env, i] + alpha * p[env, i]
-            left = r[env, i] - alpha * Ap[env, i]
-            r[env, i] = left
-            z = inverse[env, i] * left
+            r_new = r[env, i] - alpha * Ap[env, i]
+            r[env, i] = r_new
+            z = inverse[env, i] * r_new
             Ap[env, i] = z
-            a += wp.length_sq(left)
-            b += wp.dot(left, z)
+            a += wp.length_sq(r_new)
+            b += wp.dot(r_new, z)
             i += threads
-        square = block_sum(a)
-        new = block_sum(b)
-        if not (square > tolerance * tolerance * first):
+        rr = block_sum(a)
+        rz_new = block_sum(b)
+        if not (rr > tolerance * tolerance * rr0):
             return
-        beta = new / rz
-        rz = new
+        beta = rz_new / rz
+        rz = rz_new
         i = lane
         while i < n:
             p[env, i] = Ap[env, i] + beta * p[env, i]

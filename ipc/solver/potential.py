@@ -95,7 +95,7 @@ class Potential:
         self.verts.follower_start, self.verts.follower = ints(layout.node_vert_start), ints(layout.node_vert)
         self.verts.follower_weight = floats(layout.node_vert_weight)
 
-        # State: node positions in their bodies' frames, world velocities, frames where they are and where they shall go.
+        # State: node positions in their bodies' frames, world velocities, frames as they are, and their goals.
         self.y, self.v = vectors(nodes), vectors(nodes)
         self.frame_q, self.goal_q, self.now_q = (wp.zeros((batch, frames), dtype=wp.quatd, device=device) for _ in range(3))
         self.frame_p, self.goal_p = vectors(frames), vectors(frames)
@@ -153,13 +153,13 @@ class Potential:
 
     # --- places ----------------------------------------------------------------------------------------------------------------
 
-    def set_frames(self, share: wp.array, R: wp.array, t: wp.array) -> None:
-        """Frames a ``share`` (B,) of the way from where the step began to their goals."""
-        inputs = [self.frame_q, self.frame_p, self.goal_q, self.goal_p, share]
+    def set_frames(self, progress: wp.array, R: wp.array, t: wp.array) -> None:
+        """Frames at a share ``progress`` (B,) of the motion from the start of the step to their goals."""
+        inputs = [self.frame_q, self.frame_p, self.goal_q, self.goal_p, progress]
         self.launch(dynamics.frames_at, self.frame_q.shape, inputs, [R, t, self.now_q])
 
     def place_grips(self, y: wp.array, R: wp.array, t: wp.array) -> None:
-        """Put the gripped nodes where their frames say."""
+        """Move the gripped nodes to their places in their frames."""
         if self.grips:
             self.launch(dynamics.place_grips, (self.batch, self.grips), [*self.grip, R, t], [y])
 
@@ -182,9 +182,9 @@ class Potential:
         if self.driven:
             self.launch(dynamics.aim_bodies, self.xw.shape, [self.goal_q, self.goal_p, *self.drive], [self.target])
 
-    def look_ahead(self, share: wp.array) -> None:
-        """What moves under orders, as far as ``share`` (B,) says: ``dx`` of its vertices, ``lift`` of gripped nodes, inertia there."""
-        self.set_frames(share, self.R1, self.t1)
+    def prescribe(self, progress: wp.array) -> None:
+        """Prescribed motion up to ``progress`` (B,): ``dx`` of its vertices, ``lift`` of gripped nodes, and inertia there."""
+        self.set_frames(progress, self.R1, self.t1)
         if self.grips:
             wp.copy(self.y1, self.y)
             self.place_grips(self.y1, self.R1, self.t1)
@@ -193,8 +193,8 @@ class Potential:
         self.launch(dynamics.difference, self.x.shape, [self.x1, self.x], [self.dx])
         self.aim_inertia(self.R1, self.t1)
 
-    def push_ahead(self, mask: wp.array) -> None:
-        """Residual −= H (what look_ahead found), with the matrix filled: what moves under orders pushes the unknowns ahead of it."""
+    def push_prescribed(self, mask: wp.array) -> None:
+        """Residual −= H times the prescribed motion, with the matrix filled: driven bodies push the unknowns ahead of them."""
         contacts = self.collision.contacts
         lanes = self.collision.lanes
         self.launch(push_rows, (self.batch, lanes), [self.system, contacts, self.dx, mask, lanes], [self.residual])
@@ -228,7 +228,7 @@ class Potential:
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
     def fill_matrix(self, active: wp.array) -> None:
-        """The block matrix of inertia and elasticity from what :meth:`evaluate_elements` left."""
+        """The block matrix of inertia and elasticity, from the results of :meth:`evaluate_elements`."""
         inputs = [
             *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
             *(self.el_F, self.el_mck, active),

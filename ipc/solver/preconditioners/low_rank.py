@@ -5,7 +5,7 @@ inverse C = K_0⁻¹ is known between all nodes of a surface. By Woodbury's iden
 
     (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹.
 
-S is not regular (friction may be missing), so a share REGULAR of the elastic stiffness of each contact node is added to it. W is found
+S is not regular (friction may be missing), so a share REGULAR of the elastic stiffness of each contact node is added to it. W is computed
 in double precision by one block of threads an environment. An environment with more contact nodes than there is room for is marked as
 one that does not fit: with part of its contacts the identity is of little use.
 """
@@ -47,7 +47,7 @@ class Rest:
 
     ``inverse`` holds the matrices one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix of width[p]
     that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix, ``surface`` (N,) its number among
-    the surface nodes or −1, ``surface_node`` (s,) the other way round.
+    the surface nodes or −1, ``surface_node`` (s,) the inverse of that.
     """
 
     inverse: wp.array(dtype=wp.float32)
@@ -64,8 +64,8 @@ class Rest:
 class Small:
     """The contact nodes of each environment and their systems; m is the room.
 
-    ``touched``, ``slot`` (B, s): whether a surface node touches, and its place among the contact nodes.    ``count`` (B,): contact nodes;
-    more than m do not fit.    ``node`` (B, m).    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
+    ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
+    ``count`` (B,): contact nodes; more than m do not fit.    ``node`` (B, m).    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
     """
 
@@ -89,7 +89,7 @@ def rest_entry(rest: Rest, part: wp.int32, u: wp.int32, v: wp.int32) -> wp.float
 
 @wp.func
 def fits(small: Small, env: wp.int32) -> wp.bool:
-    """Whether there is room for the contact nodes of an environment."""
+    """True if there is room for the contact nodes of an environment."""
     return small.count[env] <= small.node.shape[1]
 
 
@@ -117,7 +117,7 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
 def mark_contacts(
     system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
 ):
-    """Which surface nodes the rows act on."""
+    """Marks the surface nodes that the rows act on."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -174,7 +174,7 @@ def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.arra
 def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
     """The inverse of the blocks ``a``, in place (Gauss-Jordan; no pivots are needed where a matrix is positive definite).
 
-    All lanes of the environment work on it and get the same answer: False where a pivot is not positive.
+    All lanes of the environment work on it and get the same result: False where a pivot is not positive.
     """
     wait_for_lanes()
     for k in range(m):

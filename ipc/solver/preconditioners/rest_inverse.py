@@ -2,7 +2,7 @@
 
 A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
 (``substructure.py``), in single precision, and the contacts are added as a low-rank part (``low_rank.py``): M is exact as long as
-the body is at rest, and what deformation changes is left to PCG. Nodes of other bodies, and environments with more contacts than there
+the body is at rest, and PCG deals with what deformation changes. Nodes of other bodies, and environments with more contacts than there
 is room for, have block-Jacobi. Across a batch the application is a product of matrices that every environment shares. On CUDA
 everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
 """
@@ -73,7 +73,7 @@ def multiply_tiles(
     # outputs
     y: wp.array2d(dtype=wp.float32),
 ):
-    """y = x · matrix in tiles, patch by patch; tiles without a running environment are left out."""
+    """y = x · matrix in tiles, patch by patch; tiles without a running environment are skipped."""
     patch, i, j = wp.tid()
     some = wp.int32(0)
     for env in range(i * TILE_ENVS, wp.min((i + 1) * TILE_ENVS, running.shape[0])):
@@ -105,7 +105,7 @@ class Product:
         self.y_whole = y[0]
 
     def compute(self, running: wp.array) -> None:
-        """Do it for the running environments."""
+        """Compute the products of the running environments."""
         patches, inputs, outputs = self.matrix.shape
         common = [self.matrix, self.x, self.x_first, self.y_first]
         device = wp.get_device(self.matrix.device)
@@ -128,13 +128,13 @@ class Product:
 
 
 def tiled(batch: int, device: wp.Device) -> bool:
-    """Whether products are computed in tiles."""
+    """True if products are computed in tiles."""
     return device.is_cuda and batch >= TILED_FROM
 
 
 @wp.struct
 class Inside:
-    """Where nodes are in the vectors of the patches.
+    """Positions of nodes in the vectors of the patches.
 
     ``unknown`` (N,): first unknown of a node inside a patch, or −1.    ``patch_out`` (N,): where the first product leaves K_pp⁻¹ r of it.
     ``twin_start`` (N + 1,): the patches that an interface node borders on; ``twin_out`` is where the first product leaves Eᵀ r,
@@ -322,7 +322,7 @@ class RestInverse:
         """The two products of the patches, all of one padded size: [K_pp⁻¹, E_p] and E_pᵀ."""
         inner = padded(max((3 * len(p.nodes) for p in patches), default=0))
         border = padded(max((3 * len(p.border) for p in patches), default=0))
-        there, back = (
+        forward, backward = (
             np.zeros((len(patches), inner, inner + border), np.float32),
             np.zeros((len(patches), border, inner), np.float32),
         )
@@ -330,7 +330,11 @@ class RestInverse:
         twins, outs, ins = [], [], []
         for p, patch in enumerate(patches):
             n, g = patch.extension.shape
-            there[p, :n, :n], there[p, :n, inner : inner + g], back[p, :g, :n] = patch.inverse, patch.extension, patch.extension.T
+            forward[p, :n, :n], forward[p, :n, inner : inner + g], backward[p, :g, :n] = (
+                patch.inverse,
+                patch.extension,
+                patch.extension.T,
+            )
             unknown[patch.nodes] = p * inner + 3 * np.arange(len(patch.nodes))
             patch_out[patch.nodes] = p * (inner + border) + 3 * np.arange(len(patch.nodes))
             twins.append(patch.border)
@@ -351,7 +355,7 @@ class RestInverse:
         self.x_inside, self.y_inside = self._vectors(len(patches) * inner, len(patches) * (inner + border))
         self.x_back, self.y_back = self._vectors(len(patches) * border, len(patches) * inner)
         if patches:
-            matrices = [wp.array(m, dtype=wp.float32, device=self.device) for m in (there, back)]
+            matrices = [wp.array(m, dtype=wp.float32, device=self.device) for m in (forward, backward)]
             self.to_interface = Product(matrices[0], self.x_inside, self.y_inside, 0, 0, self.batch)
             self.from_interface = Product(matrices[1], self.x_back, self.y_back, 0, 0, self.batch)
 

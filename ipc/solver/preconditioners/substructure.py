@@ -60,7 +60,7 @@ def partition(layout: Layout, nodes: Ints, parts: int) -> Ints:
     """Patch of every node of the layout, −1 where there is none: ``nodes`` cut in halves until there are ``parts`` (a power of two).
 
     Each cut is across the longest side, just after the median coordinate, and the nodes just before it become interface. A patch that
-    is only a few nodes long may be left without any.
+    is only a few nodes long may lose all of them.
     """
     label = np.full(len(layout.node_rest), -1)
     label[nodes] = 0
@@ -98,7 +98,7 @@ def _single(inverse: NDArray[np.floating]) -> Singles:
 
 
 def condense(layout: Layout, blocks: Floats, nodes: Ints, label: Ints) -> Substructure:
-    """The substructure of the matrix between ``nodes``, all others held.
+    """The substructure of the matrix between ``nodes``, all others fixed.
 
     Args:
         layout, blocks: the matrix (K, 3, 3) in the layout's pattern.
