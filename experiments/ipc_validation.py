@@ -90,12 +90,12 @@ PAD_SPHERE = 50 * PAD_CONTACT
 def press_pad(cells: int, tool: str, cut: ipc.Cut, device: str) -> tuple[Pressed, float]:
     """A flat pad of 20 × 20 × 4 mm of cubic cells, ``cells`` to its thickness, bonded below; and the oracle's force at that depth."""
     mesh = ipc.domed_pad((5 * PAD, 5 * PAD), PAD, (np.inf, np.inf), (5 * cells, 5 * cells, cells), cut=cut)
-    held = ipc.vertices_in_box(mesh, (-1, -1, -PAD), (1, 1, -PAD))
+    bonded = ipc.vertices_in_box(mesh, (-1, -1, -PAD), (1, 1, -PAD))
     layer = BondedLayer(PAD_SOLID, PAD)
     rings = 2 * round(cells * PAD_CONTACT / PAD) + 6
     surface = ball_tool(1.5 * PAD_CONTACT, rings, PAD_SPHERE) if tool == "ball" else flat_tool(PAD_CONTACT, max(4, rings // 2))
     depth = layer.sphere(PAD_SPHERE, PAD_CONTACT)[0]
-    pressed = press(mesh, held, surface, depth, solid=PAD_SOLID, far_force=None, device=device)
+    pressed = press(mesh, bonded, surface, depth, solid=PAD_SOLID, far_force=None, device=device)
     if tool == "ball":
         return pressed, layer.sphere_force(PAD_SPHERE, pressed.depth)
     return pressed, float(layer.punch_force(PAD_CONTACT, pressed.depth))
@@ -138,14 +138,14 @@ def causes(device: str) -> dict[str, Metric]:
         "hertz.kappa_100": {"kappa": 100.0},
     }.items():
         note(name, hertz_error(press_sphere(n, device=device, **options)))
-    mesh, held = even_block(CONTACT, n, growth(n), REACH * CONTACT)
+    mesh, bonded = even_block(CONTACT, n, growth(n), REACH * CONTACT)
     guess = float(hertz_force(SOLID, SPHERE, DEPTH))
     for name, inscribed in (("hertz.tool_as_coarse", False), ("hertz.tool_as_coarse_inscribed", True)):
         tool = ball_tool(1.6 * CONTACT, round(1.6 * n), SPHERE, inscribed)
-        note(name, hertz_error(press(mesh, held, tool, DEPTH, far_force=guess, device=device)))
+        note(name, hertz_error(press(mesh, bonded, tool, DEPTH, far_force=guess, device=device)))
     r2, top = (mesh.vertices[:, :2] ** 2).sum(axis=1), np.isclose(mesh.vertices[:, 2], 0)
     limit = np.where(top & (r2 < (2 * CONTACT) ** 2), r2 / (2 * SPHERE) - DEPTH, np.inf)
-    note("hertz.no_barrier", nodal_press(mesh, held, SOLID, limit) / guess - 1)
+    note("hertz.no_barrier", nodal_press(mesh, bonded, SOLID, limit) / guess - 1)
 
     for name, options in {
         "punch": {},
@@ -155,14 +155,14 @@ def causes(device: str) -> dict[str, Metric]:
     }.items():
         note(name, punch_error(press_punch(n, device=device, **options)))
     around = round(2 * np.pi * n)
-    rim, held_rim = rim_block(CONTACT, n, growth(n), REACH * CONTACT)
+    rim, bonded_rim = rim_block(CONTACT, n, growth(n), REACH * CONTACT)
     under = np.isclose(rim.vertices[:, 2], 0) & (np.hypot(*rim.vertices[:, :2].T) < 1.001 * CONTACT * equal_area(around))
     exact = float(punch_force(SOLID, CONTACT, DEPTH))
-    note("punch.no_barrier", nodal_press(rim, held_rim, SOLID, np.where(under, -DEPTH, np.inf)) / exact - 1)
+    note("punch.no_barrier", nodal_press(rim, bonded_rim, SOLID, np.where(under, -DEPTH, np.inf)) / exact - 1)
     # A rim between the rings of an even mesh: the force is that of a wider punch.
     for quarters in (-2, -1, 0, 1, 2):
         radius = CONTACT * (1 + quarters / (4 * n))
-        pressed = press(mesh, held, flat_tool(radius, n), DEPTH, far_force=exact, device=device)
+        pressed = press(mesh, bonded, flat_tool(radius, n), DEPTH, far_force=exact, device=device)
         where = f"{abs(quarters)}_quarters_{'inside' if quarters < 0 else 'outside'}" if quarters else "on_a_ring"
         note(f"punch.even_mesh_rim_{where}", pressed.force / float(punch_force(SOLID, radius, pressed.depth)) - 1)
     return {f"causes.{name}": value for name, value in errors.items()}
@@ -222,11 +222,11 @@ def curves(device: str, cells: int = 6) -> tuple[plt.Figure, dict[str, Metric]]:
         for share in (0.25, 0.5, 0.75, 1.0):
             depth = share * DEPTH
             if name == "Sphere":
-                mesh, held = even_block(CONTACT, cells, growth(cells), REACH * CONTACT)
+                mesh, bonded = even_block(CONTACT, cells, growth(cells), REACH * CONTACT)
                 tool = ball_tool(1.6 * CONTACT, round(3.2 * cells), SPHERE)
             else:
-                (mesh, held), tool = rim_block(CONTACT, cells, growth(cells), REACH * CONTACT), flat_tool(CONTACT, cells)
-            points.append(press(mesh, held, tool, depth, far_force=float(exact(depth)), device=device))
+                (mesh, bonded), tool = rim_block(CONTACT, cells, growth(cells), REACH * CONTACT), flat_tool(CONTACT, cells)
+            points.append(press(mesh, bonded, tool, depth, far_force=float(exact(depth)), device=device))
             metrics[f"curve.{name.split()[-1].lower()}.{share}.error"] = points[-1].error(lambda d, f=exact: float(f(d)))
         axis.plot(line * 1e6, exact(line) * 1e3, "k-", lw=1, label="closed form")
         depths, forces = np.array([(p.depth, p.force) for p in points]).T

@@ -14,7 +14,7 @@ import warp as wp
 from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
-from ipc.contact import ccd, friction, normal
+from ipc.contact import ccd, contacts, friction, normal
 from ipc.reduce import SUM, Reducer
 
 __all__ = ["Collision"]
@@ -126,7 +126,7 @@ class Collision:
         self.candidates = lists.Candidates()
         self.candidates.pt_count, self.candidates.ee_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self._size_candidates(512, 1024)
-        self.contacts = normal.Contacts()
+        self.contacts = contacts.Contacts()
         self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self.lagged, self._old = friction.Lagged(), friction.Lagged()
         self.lagged.count, self._old.count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
@@ -153,7 +153,7 @@ class Collision:
         }.items():
             setattr(self.contacts, name, wp.zeros((self.batch, pairs), dtype=dtype, device=self.device))
         self.contacts.row_verts = wp.zeros((self.batch, rows), dtype=wp.vec4i, device=self.device)
-        self.contacts.row = wp.zeros((self.batch, rows), dtype=normal.mat34d, device=self.device)
+        self.contacts.row = wp.zeros((self.batch, rows), dtype=contacts.mat34d, device=self.device)
         fields = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "limit": wp.float64, "pair": wp.int32}
         room = pairs if self.friction else 1
         for lagged in (self.lagged, self._old):
@@ -261,7 +261,7 @@ class Collision:
         What does not fit sets ``overflow``.
         """
         device = self.device
-        wp.launch(normal.clear, dim=x.shape, inputs=[active], outputs=[gradient, energy, self.contacts], device=device)
+        wp.launch(contacts.clear, dim=x.shape, inputs=[active], outputs=[gradient, energy, self.contacts], device=device)
         outputs = [gradient, energy, self.contacts]
         if self._meshes:
             for kernel in (normal.contact_pt, normal.contact_ee):
@@ -273,7 +273,7 @@ class Collision:
             inputs = [x, start, self.lagged, friction_eps, active]
             outputs = [gradient, self.contacts]
             self._each(friction.friction_rows, inputs, outputs)
-        wp.launch(normal.check_contacts, dim=self.batch, inputs=[self.contacts], outputs=[self.overflow], device=device)
+        wp.launch(contacts.check_contacts, dim=self.batch, inputs=[self.contacts], outputs=[self.overflow], device=device)
 
     def energy_change(
         self,

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact.normal import Contacts, push_row
+from ipc.contact.contacts import Contacts, push_row
 
 __all__ = [
     "Lagged",

@@ -19,48 +19,18 @@ import warp as wp
 
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
+from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
 from ipc.contact.distance import edge_edge_coefficients, pair_coefficients, point_triangle_coefficients, separation
 
 __all__ = [
-    "Contacts",
-    "check_contacts",
-    "clear",
     "contact_ee",
     "contact_plane",
     "contact_pt",
     "energy_pairs",
     "energy_plane",
-    "mat34d",
-    "rows_of",
 ]
 
 wp.set_module_options({"enable_backward": False})
-
-
-class mat34d(wp.types.matrix(shape=(3, 4), dtype=wp.float64)):
-    """Four vectors of three, one for each vertex of a pair."""
-
-
-@wp.struct
-class Contacts:
-    """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused."""
-
-    verts: wp.array2d(dtype=wp.vec4i)
-    coef: wp.array2d(dtype=wp.vec4d)
-    normal: wp.array2d(dtype=wp.vec3d)
-    force: wp.array2d(dtype=wp.float64)
-    gap: wp.array2d(dtype=wp.float64)
-    pair: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    row_verts: wp.array2d(dtype=wp.vec4i)
-    row: wp.array2d(dtype=mat34d)
-    row_count: wp.array(dtype=wp.int32)
-
-
-@wp.func
-def rows_of(contacts: Contacts, env: wp.int32) -> wp.int32:
-    """Rows of an environment that are stored."""
-    return wp.min(contacts.row_count[env], contacts.row.shape[1])
 
 
 @wp.func
@@ -84,33 +54,6 @@ def edge_weight(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float64:
 def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
     """κ d̂ / D̂² = κ / d̂³ [Pa/m³]."""
     return kappa / (surface.d_hat * surface.d_hat * surface.d_hat)
-
-
-@wp.func
-def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d):
-    slot = wp.atomic_add(out.row_count, env, 1)
-    if slot < out.row.shape[1]:
-        out.row_verts[env, slot] = verts
-        out.row[env, slot] = row
-
-
-@wp.func
-def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
-    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3))
-
-
-@wp.func
-def push_contact(
-    out: Contacts, env: wp.int32, verts: wp.vec4i, coef: wp.vec4d, n: wp.vec3d, d: wp.float64, force: wp.float64, pair: wp.int32
-):
-    slot = wp.atomic_add(out.count, env, 1)
-    if slot < out.force.shape[1]:
-        out.verts[env, slot] = verts
-        out.coef[env, slot] = coef
-        out.normal[env, slot] = n
-        out.force[env, slot] = force
-        out.gap[env, slot] = d
-        out.pair[env, slot] = pair
 
 
 @wp.func
@@ -216,33 +159,6 @@ def push_mollified(
 
 
 @wp.kernel
-def clear(
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """No forces, contacts or rows in the active environments."""
-    env, v = wp.tid()
-    if active[env] == 0:
-        return
-    gradient[env, v] = wp.vec3d()
-    if v == 0:
-        energy[env] = wp.float64(0.0)
-        out.count[env] = 0
-        out.row_count[env] = 0
-
-
-@wp.kernel
-def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
-    """Raises the flag if contacts or rows did not fit."""
-    env = wp.tid()
-    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
-        overflow[0] = 1
-
-
-@wp.kernel
 def contact_pt(
     x: wp.array2d(dtype=wp.vec3d),
     surface: Surface,
@@ -334,21 +250,9 @@ def contact_plane(
         d = wp.dot(n, x[env, v] - frame_t[env, body])
         if d < surface.d_hat:
             scale = surface.vert_area[v] * scale_of(surface, kappa[env])
-            zero = wp.float64(0.0)
+            zero, Dh, verts = wp.float64(0.0), surface.d_hat * surface.d_hat, wp.vec4i(v, -1, -1, -1)
             coef = wp.vec4d(wp.float64(1.0), zero, zero, zero)
-            push_simple(
-                out,
-                gradient,
-                energy,
-                env,
-                wp.vec4i(v, -1, -1, -1),
-                coef,
-                d * n,
-                d * d,
-                surface.d_hat * surface.d_hat,
-                scale,
-                surface.plane_pair[i],
-            )
+            push_simple(out, gradient, energy, env, verts, coef, d * n, d * d, Dh, scale, surface.plane_pair[i])
 
 
 @wp.func

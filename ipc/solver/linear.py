@@ -16,8 +16,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.contact.normal import Contacts, mat34d, rows_of
-from ipc.solver.dynamics import VertexMap
+from ipc.contact.contacts import Contacts, mat34d, rows_of
+from ipc.solver.frames import VertexMap
 
 __all__ = [
     "BlockJacobi",

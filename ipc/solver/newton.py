@@ -31,11 +31,11 @@ from ipc.bodies.layout import Layout
 from ipc.errors import SolverError
 from ipc.reduce import MIN
 from ipc.settings import Settings
-from ipc.solver import decisions, dynamics
-from ipc.solver.decisions import StepState
+from ipc.solver import decisions, dynamics, frames
 from ipc.solver.pcg import Pcg
 from ipc.solver.potential import Potential
 from ipc.solver.preconditioners import make_preconditioner
+from ipc.solver.step_state import StepState
 
 __all__ = ["Newton"]
 
@@ -133,7 +133,7 @@ class Newton:
     def _begin(self) -> None:
         pot, state = self.potential, self.state
         inputs = [pot.frame_q, pot.frame_p, pot.goal_q, pot.goal_p, pot.frame_moves]
-        pot.launch(dynamics.compare_frames, self.batch, inputs, [state.decisions.progress])
+        pot.launch(frames.compare_frames, self.batch, inputs, [state.decisions.progress])
         state.launch(decisions.start_step, self._friction)
         pot.set_frames(state.decisions.progress, pot.R, pot.t)
         pot.place_grips(pot.y, pot.R, pot.t)
@@ -248,13 +248,13 @@ class Newton:
         """Take the step p as far as contacts, energy and inversion allow."""
         pot, state = self.potential, self.state
         d = state.decisions
-        pot.launch(dynamics.vertex_motion, pot.x.shape, [pot.p, pot.R, pot.verts], [pot.dx])
+        pot.launch(frames.vertex_motion, pot.x.shape, [pot.p, pot.R, pot.verts], [pot.dx])
         with self._stage("broad"):
             pot.collision.refresh(pot.x, pot.dx, d.plain)
         with self._stage("ccd"):
             state.launch(decisions.start_limit, self.settings.ccd_slack)
-            frames = (pot.R, pot.t)
-            pot.collision.limit_step(pot.x, pot.dx, frames, frames, d.slack, d.floor, pot.reach, d.plain, d.alpha)
+            Rt = (pot.R, pot.t)
+            pot.collision.limit_step(pot.x, pot.dx, Rt, Rt, d.slack, d.floor, pot.reach, d.plain, d.alpha)
         with self._stage("line_search"):
             pot.slope(d.plain, d.slope, d.noise)
             state.launch(decisions.start_search, pot.reach)

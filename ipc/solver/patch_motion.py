@@ -4,8 +4,8 @@ The linear body at rest: with C the compliance between the patch's nodes and R t
 K = Rᵀ C⁻¹ R. The rest of the body follows by the deflection that K belongs to, u = C_:P C⁻¹ R, and moves with the mass uᵀ M u (R. J. Guyan,
 Reduction of stiffness and mass matrices, AIAA Journal 3, 1965). A deformed body is taken to be as stiff as at rest, turned with the patch,
 and as a string besides: under a force T its energy grows by T (6/5 x²/L + 2/15 L θ² ± 1/5 x θ) / 2 across it (the geometric stiffness
-of a beam, J. S. Przemieniecki, Theory of Matrix Structural Analysis, 1968), here bounded by 1.3 T/L and 7/30 T L along and about all axes, with L the
-least distance from what is bonded.
+of a beam, J. S. Przemieniecki, Theory of Matrix Structural Analysis, 1968). Here that is bounded by 1.3 T/L and 7/30 T L along and about
+all axes, with L the least distance from the bonded nodes.
 """
 
 from __future__ import annotations

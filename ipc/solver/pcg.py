@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from ipc.contact.normal import Contacts
+from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block

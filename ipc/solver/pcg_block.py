@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact.normal import Contacts, rows_of
+from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.linear import SystemView, add_row, block_row
 
 __all__ = ["THREADS", "Scalars", "solve_in_one_block"]

@@ -17,7 +17,7 @@ from ipc.bodies.layout import Layout
 from ipc.contact.collision import Collision
 from ipc.reduce import MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
-from ipc.solver import dynamics, elasticity
+from ipc.solver import dynamics, elasticity, frames
 from ipc.solver.linear import SystemView, push_blocks, push_rows, slice_rows
 
 __all__ = ["Potential"]
@@ -40,7 +40,7 @@ class Potential:
     def __init__(self, layout: Layout, settings: Settings, batch: int, d_hat: float, kappa: float, device: wp.Device) -> None:
         self.layout, self.settings, self.batch, self.device = layout, settings, batch, device
         nodes, verts, elements = len(layout.node_rest), int(layout.vert_start[-1]), len(layout.tets)
-        frames = len(layout.frame_names)
+        count = len(layout.frame_names)
 
         def ints(values: np.ndarray) -> wp.array:
             return wp.array(values, dtype=wp.int32, device=device)
@@ -84,7 +84,7 @@ class Potential:
         self.frame_moves = ints(layout.frame_moves)
         self.part_start, self.part = ints(layout.part_start), ints(layout.part)
         self.corner_start, self.corner = ints(layout.corner_start), ints(layout.corner)
-        self.verts = dynamics.VertexMap()
+        self.verts = frames.VertexMap()
         self.verts.body, self.verts.count, self.verts.nodes = (
             ints(layout.vert_body),
             ints(layout.vert_count),
@@ -97,9 +97,9 @@ class Potential:
 
         # State: node positions in their bodies' frames, world velocities, frames as they are, and their goals.
         self.y, self.v = vectors(nodes), vectors(nodes)
-        self.frame_q, self.goal_q, self.now_q = (wp.zeros((batch, frames), dtype=wp.quatd, device=device) for _ in range(3))
-        self.frame_p, self.goal_p = vectors(frames), vectors(frames)
-        self.R, self.R1, self.t, self.t1 = matrices(frames), matrices(frames), vectors(frames), vectors(frames)
+        self.frame_q, self.goal_q, self.now_q = (wp.zeros((batch, count), dtype=wp.quatd, device=device) for _ in range(3))
+        self.frame_p, self.goal_p = vectors(count), vectors(count)
+        self.R, self.R1, self.t, self.t1 = matrices(count), matrices(count), vectors(count), vectors(count)
         self.kappa = wp.full(batch, kappa, dtype=wp.float64, device=device)
         self.acceleration = wp.full(batch, wp.vec3d(*settings.gravity), dtype=wp.vec3d, device=device)
 
@@ -156,20 +156,20 @@ class Potential:
     def set_frames(self, progress: wp.array, R: wp.array, t: wp.array) -> None:
         """Frames at a share ``progress`` (B,) of the motion from the start of the step to their goals."""
         inputs = [self.frame_q, self.frame_p, self.goal_q, self.goal_p, progress]
-        self.launch(dynamics.frames_at, self.frame_q.shape, inputs, [R, t, self.now_q])
+        self.launch(frames.frames_at, self.frame_q.shape, inputs, [R, t, self.now_q])
 
     def place_grips(self, y: wp.array, R: wp.array, t: wp.array) -> None:
         """Move the gripped nodes to their places in their frames."""
         if self.grips:
-            self.launch(dynamics.place_grips, (self.batch, self.grips), [*self.grip, R, t], [y])
+            self.launch(frames.place_grips, (self.batch, self.grips), [*self.grip, R, t], [y])
 
     def place_vertices(self, y: wp.array, R: wp.array, t: wp.array, x: wp.array) -> None:
         """World positions of the vertices."""
-        self.launch(dynamics.vertex_positions, x.shape, [y, R, t, self.verts], [x])
+        self.launch(frames.vertex_positions, x.shape, [y, R, t, self.verts], [x])
 
     def place_nodes(self, out: wp.array) -> None:
         """World positions of the nodes."""
-        self.launch(dynamics.node_world, out.shape, [self.y, self.R, self.t, self.node_body], [out])
+        self.launch(frames.node_world, out.shape, [self.y, self.R, self.t, self.node_body], [out])
 
     def aim_inertia(self, R: wp.array, t: wp.array) -> None:
         """Inertia's target and the start of the step, in the given frames."""
@@ -188,7 +188,7 @@ class Potential:
         if self.grips:
             wp.copy(self.y1, self.y)
             self.place_grips(self.y1, self.R1, self.t1)
-            self.launch(dynamics.lift_grips, (self.batch, self.grips), [self.grip[0], self.y, self.y1], [self.lift])
+            self.launch(frames.lift_grips, (self.batch, self.grips), [self.grip[0], self.y, self.y1], [self.lift])
         self.place_vertices(self.y1 if self.grips else self.y, self.R1, self.t1, self.x1)
         self.launch(dynamics.difference, self.x.shape, [self.x1, self.x], [self.dx])
         self.aim_inertia(self.R1, self.t1)

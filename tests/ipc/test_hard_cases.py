@@ -56,7 +56,7 @@ def test_slow_cases_pass(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["beam_twist", "mat_twist"])
 def test_large_twists_pass(name: str) -> None:
-    """Where a mat snaps, rounding decides how many iterations it takes (173 to 321, for 1e-10 of its stiffness); the mean is steady."""
+    """A mat snaps: rounding decides the number of iterations (173 to 321, for 1e-10 of its stiffness); the mean is steady."""
     worst = CASES[name](Setup(large=True))
     check(name, worst, most=3 * MAX_NEWTON)
     assert worst.newton <= 30 * worst.steps, f"{worst.newton / worst.steps:.3g} Newton iterations a step"

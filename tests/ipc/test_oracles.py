@@ -1,4 +1,4 @@
-"""The oracles of the closed-form tests, checked by routes of their own: they must not be wrong in the way the solver might be."""
+"""The oracles of the closed-form tests, checked by routes of their own: they must not share an error with the solver."""
 
 from __future__ import annotations
 

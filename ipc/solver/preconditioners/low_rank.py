@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.contact.normal import Contacts, mat34d, rows_of
+from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
 
 __all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
@@ -65,7 +65,8 @@ class Small:
     """The contact nodes of each environment and their systems; m is the room.
 
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
-    ``count`` (B,): contact nodes; more than m do not fit.    ``node`` (B, m).    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
+    ``count`` (B,): contact nodes; more than m do not fit.    ``node`` (B, m).
+    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
     """
 

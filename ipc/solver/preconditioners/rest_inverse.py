@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from ipc.bodies.layout import Layout
-from ipc.contact.normal import Contacts
+from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
 from ipc.solver.linear import BlockJacobi, SystemView
 from ipc.solver.preconditioners.low_rank import LANES, LowRank, Rest, Small, fits, rest_entry, sum_of_parts

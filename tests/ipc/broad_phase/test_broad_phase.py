@@ -1,4 +1,4 @@
-"""Broad phase: lists and hierarchies find the same pairs, all that come within d̂ on the way, and steps do not tell them apart."""
+"""Broad phase: lists and hierarchies find the same pairs, all that come within d̂ on the path, and steps are the same with either."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def look(collision: Collision, x: np.ndarray, dx: np.ndarray, active: np.ndarray
     """Point-triangle and edge-edge pairs of each environment, with room for all of them."""
     device, batch = collision.device, len(x)
     mask = np.ones(batch, np.int32) if active is None else active.astype(np.int32)
-    here, way = (wp.array(a, dtype=wp.vec3d, device=device) for a in (x, dx))
+    here, search = (wp.array(a, dtype=wp.vec3d, device=device) for a in (x, dx))
     for _ in range(2):
-        collision.refresh(here, way, wp.array(mask, dtype=wp.int32, device=device))
+        collision.refresh(here, search, wp.array(mask, dtype=wp.int32, device=device))
         if collision.overflow.numpy()[0]:
             collision.grow()
-    found = []
+    pairs_seen = []
     for env in range(batch):
         kinds = []
         for items, counts in (
@@ -57,12 +57,12 @@ def look(collision: Collision, x: np.ndarray, dx: np.ndarray, active: np.ndarray
             listed = [(int(a), int(b), int(c)) for a, b, c in items.numpy()[env, :count]]
             assert len(set(listed)) == len(listed) == count  # no pair twice
             kinds.append(set(listed))
-        found.append((kinds[0], kinds[1]))
-    return found
+        pairs_seen.append((kinds[0], kinds[1]))
+    return pairs_seen
 
 
-def make(layout: Layout, batch: int, way: str, device: str = "cpu", deterministic: bool = False) -> Collision:
-    return Collision(layout, batch, D_HAT, D_HAT, deterministic, wp.get_device(device), way)
+def make(layout: Layout, batch: int, search: str, device: str = "cpu", deterministic: bool = False) -> Collision:
+    return Collision(layout, batch, D_HAT, D_HAT, deterministic, wp.get_device(device), search)
 
 
 def soup(layout: Layout, rng: np.random.Generator, batch: int, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -113,23 +113,23 @@ def near_pairs(layout: Layout, low: np.ndarray, high: np.ndarray) -> tuple[Pairs
 def test_lists_and_hierarchies_find_the_same_pairs(layout: Layout, rng: np.random.Generator, kind: str, device: str) -> None:
     batch = 5
     x, dx = soup(layout, rng, batch, 0.7) if kind == "soup" else scattered(layout, rng, batch)
-    by_lists, by_trees = (look(make(layout, batch, way, device), x, dx) for way in ("lists", "bvh"))
+    by_lists, by_trees = (look(make(layout, batch, search, device), x, dx) for search in ("lists", "bvh"))
     assert by_lists == by_trees
     lower, upper = np.minimum(x, x + dx) - D_HAT, np.maximum(x, x + dx) + D_HAT  # the boxes' margin is d̂ too
     for env in range(batch):
         expected = near_pairs(layout, lower[env], upper[env])
         assert by_trees[env] == expected
         assert min(map(len, expected)) > 100
-    found = {pair for pt, ee in by_trees for pair in (*{p for _, _, p in pt}, *{p for _, _, p in ee})}
+    pairs_seen = {pair for pt, ee in by_trees for pair in (*{p for _, _, p in pt}, *{p for _, _, p in ee})}
     meshes = {i for i, (_, b) in enumerate(layout.pairs) if not layout.half_space[b]}
-    assert found == meshes  # every pair of bodies that may touch, selves among them
+    assert pairs_seen == meshes  # every pair of bodies that may touch, selves among them
 
 
 def to_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distance of points from segments; (n, 3) each."""
-    way = b - a
-    share = np.clip(((p - a) * way).sum(axis=1) / (way * way).sum(axis=1), 0.0, 1.0)
-    return np.linalg.norm(p - a - share[:, None] * way, axis=1)
+    search = b - a
+    share = np.clip(((p - a) * search).sum(axis=1) / (search * search).sum(axis=1), 0.0, 1.0)
+    return np.linalg.norm(p - a - share[:, None] * search, axis=1)
 
 
 def point_triangle(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -154,11 +154,11 @@ def edge_edge(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.
     return np.min([lines, to_segment(a, c, d), to_segment(b, c, d), to_segment(c, a, b), to_segment(d, a, b)], axis=0)
 
 
-@pytest.mark.parametrize("way", ["lists", "bvh"])
-def test_nothing_within_d_hat_is_missed_anywhere_on_the_way(layout: Layout, rng: np.random.Generator, way: str) -> None:
+@pytest.mark.parametrize("search", ["lists", "bvh"])
+def test_nothing_within_d_hat_is_missed_anywhere_on_the_way(layout: Layout, rng: np.random.Generator, search: str) -> None:
     """Distances of everything from everything that it may touch, at five moments of a motion."""
     x, dx = scattered(layout, rng, 1)
-    found = look(make(layout, 1, way), x, dx)[0]
+    pairs_seen = look(make(layout, 1, search), x, dx)[0]
     everything = near_pairs(layout, np.full_like(x[0], -10.0), np.full_like(x[0], 10.0))
     for kind, first, second, distance in (
         (0, np.arange(len(x[0]))[:, None], layout.faces, point_triangle),
@@ -170,8 +170,8 @@ def test_nothing_within_d_hat_is_missed_anywhere_on_the_way(layout: Layout, rng:
             now = x[0] + moment * dx[0]
             corners = [now[verts] for verts in (*first[listed[:, 0]].T, *second[listed[:, 1]].T)]
             close |= {(int(a), int(b), int(pair)) for a, b, pair in listed[distance(*corners) < D_HAT]}
-        assert close <= found[kind]
-        assert 20 < len(close) < len(found[kind])
+        assert close <= pairs_seen[kind]
+        assert 20 < len(close) < len(pairs_seen[kind])
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
@@ -196,7 +196,7 @@ def test_a_vertex_that_is_nowhere_hides_no_other_pair(layout: Layout, rng: np.ra
     for verts in ((0, 1), (45,)):
         x[0, verts, 1] = bad
     dx[0] = 0.0
-    by_lists, by_trees = (look(make(layout, 2, way), x, dx) for way in ("lists", "bvh"))
+    by_lists, by_trees = (look(make(layout, 2, search), x, dx) for search in ("lists", "bvh"))
     assert by_lists == by_trees and len(by_trees[0][1]) > 100
 
 
@@ -217,7 +217,7 @@ def test_pairs_agree_to_the_last_bit_of_where_boxes_touch(exponent: int) -> None
             height[k] = np.nextafter(height[k], np.inf if k > batch // 2 else -np.inf)
     x[:, :3, 2] = offset
     x[:, 3:, 2] = height[:, None]
-    by_lists, by_trees = (look(make(layout, batch, way), x, np.zeros_like(x)) for way in ("lists", "bvh"))
+    by_lists, by_trees = (look(make(layout, batch, search), x, np.zeros_like(x)) for search in ("lists", "bvh"))
     assert by_lists == by_trees
     assert len({len(pt) > 0 for pt, _ in by_lists}) == 2  # the last places of the height decide it
 
@@ -252,14 +252,14 @@ def test_boxes_are_rounded_outward(rng: np.random.Generator) -> None:
     assert (upper.astype(float) - lower <= 1e-6 * size + 3 * float(TINY)).all()
 
 
-def twisted_mat(way: str, device: str = "cpu", num_envs: int = 1) -> ipc.World:
+def twisted_mat(search: str, device: str = "cpu", num_envs: int = 1) -> ipc.World:
     """A thin strip that is wound up at one end, beside a pad and a ball that is pressed in."""
     strip = ipc.box_mesh(np.linspace(0, 12e-3, 13), np.linspace(-1e-3, 1e-3, 3), np.linspace(-0.2e-3, 0.2e-3, 2))
     base, end = (ipc.vertices_in_box(strip, (x - 1e-6, -1, -1), (x + 1e-6, 1, 1)) for x in (0.0, 12e-3))
     soft = ipc.SoftBody("strip", strip, ipc.Material(1e5, 0.4), bonded=base, grips={"end": end}, self_contact=True)
     ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((20e-3, 0, 4e-3 + 1.2e-4)))
     pad = bonded_pad(small_pad((4, 4, 2)), pose=ipc.Pose((20e-3, 0, 0)))
-    settings = ipc.Settings(d_hat=1e-4, velocity_tolerance=1e-6, linear_tolerance=1e-6, friction=0.3, broad_phase=way)  # type: ignore[arg-type]
+    settings = ipc.Settings(d_hat=1e-4, velocity_tolerance=1e-6, linear_tolerance=1e-6, friction=0.3, broad_phase=search)  # type: ignore[arg-type]
     return ipc.World([soft, ball, pad], settings, num_envs=num_envs, device=device)
 
 
@@ -276,10 +276,10 @@ def wind(world: ipc.World, steps: int) -> np.ndarray:
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_steps_are_the_same_with_lists_and_hierarchies(device: str) -> None:
-    """On CUDA the hierarchies are refitted inside the recorded step; the buffers grow on the way."""
+    """On CUDA the hierarchies are refitted inside the recorded step; the buffers grow meanwhile."""
     results, pairs = [], []
-    for way in ("lists", "bvh"):
-        world = twisted_mat(way, device, num_envs=2)
+    for search in ("lists", "bvh"):
+        world = twisted_mat(search, device, num_envs=2)
         world._potential.collision._size_candidates(16, 16)
         results.append(wind(world, 6))
         pairs.append(len(world.contacts().force))

@@ -45,7 +45,7 @@ def segments_meet(p: Point, q: Point, a: Point, b: Point) -> bool:
 
 
 def expected_of(p: Point, q: Point, a: Point, b: Point, c: Point) -> int:
-    """How segment and triangle meet, by the point where the line goes through the plane."""
+    """Relation of segment and triangle, by the point where the line goes through the plane."""
     n = cross(minus(b, a), minus(c, a))
     if not any(n):
         return APART
@@ -95,9 +95,9 @@ def test_meetings_are_those_of_rational_arithmetic(
     rng: np.random.Generator, stencils: Callable[[np.random.Generator], np.ndarray]
 ) -> None:
     x = stencils(rng)
-    found = meet(*(x[:, k] for k in range(5)))
+    relation = meet(*(x[:, k] for k in range(5)))
     expected = [expected_of(*rational(s)) for s in x]
-    assert found.tolist() == expected
+    assert relation.tolist() == expected
     kinds = {APART, TOUCHING, CROSSING} if stencils is coarse else {APART, CROSSING}
     assert kinds <= set(expected)
 

@@ -128,7 +128,7 @@ def test_barrier_mollifier_and_friction_functions_match_ipctk() -> None:
 
 
 def test_ccd_never_passes_and_rarely_stops_early(rng: np.random.Generator) -> None:
-    """No distance on the way falls below the slack; a stencil that is stopped came close to it; ipctk agrees that the way is free."""
+    """No distance on the path falls below the slack; a stencil that is stopped came close to it; ipctk agrees that the path is free."""
     x = rng.standard_normal((300, 4, 3))
     d = 3 * rng.standard_normal((300, 4, 3))
     out = wp.zeros((300, 2), dtype=wp.float64, device="cpu")
@@ -274,7 +274,7 @@ def test_steps_never_put_surfaces_through_each_other(rng: np.random.Generator) -
     for edges in (True, False):
         start = crossing_edges(rng, angle, gap) if edges else points_over_slivers(rng, angle, gap)
         c, normal = coefficients(start)[int(edges)], coefficients(start)[2][:, int(edges)]
-        met = (np.abs(c if edges else c[:, 1:]) > 0.02).all(axis=1)  # the insides of both, so that no way leads around
+        met = (np.abs(c if edges else c[:, 1:]) > 0.02).all(axis=1)  # the insides of both, so that no path leads around
         start, normal, reach = start[met], normal[met], float(np.abs(start).max())
         assert met.sum() > n // 4
         push = np.zeros_like(start)

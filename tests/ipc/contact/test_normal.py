@@ -69,10 +69,10 @@ class Scene:
         return Q.T @ Q
 
     def collisions(self, x: np.ndarray) -> ipctk.NormalCollisions:
-        found = ipctk.NormalCollisions()
-        found.use_area_weighting = True
-        found.build(self.mesh, np.asfortranarray(x), D_HAT)
-        return found
+        pairs = ipctk.NormalCollisions()
+        pairs.use_area_weighting = True
+        pairs.build(self.mesh, np.asfortranarray(x), D_HAT)
+        return pairs
 
 
 TILTS = {"flat": (0.0, 0.0, 0.0), "turned": (0.0, 0.0, 0.4), "corner": (0.5, 0.4, 0.3), "edge": (0.3, 0.0, 0.0)}
@@ -83,11 +83,11 @@ TILTS = {"flat": (0.0, 0.0, 0.0), "turned": (0.0, 0.0, 0.4), "corner": (0.5, 0.4
 def test_energy_and_gradient_match_ipctk(tilt: str, gap: float) -> None:
     scene = Scene(gap, TILTS[tilt])
     energy, gradient = scene.evaluate(scene.x)
-    found = scene.collisions(scene.x)
+    pairs = scene.collisions(scene.x)
     x = np.asfortranarray(scene.x)
-    expected = scene.potential(found, scene.mesh, x)
-    expected_gradient = scene.potential.gradient(found, scene.mesh, x).reshape(-1, 3)
-    assert len(found) > 0 and np.linalg.norm(gradient) > 1e-8
+    expected = scene.potential(pairs, scene.mesh, x)
+    expected_gradient = scene.potential.gradient(pairs, scene.mesh, x).reshape(-1, 3)
+    assert len(pairs) > 0 and np.linalg.norm(gradient) > 1e-8
     assert energy == pytest.approx(expected, rel=1e-10)
     assert np.abs(gradient - expected_gradient).max() < 1e-10 * np.abs(expected_gradient).max()
     assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
@@ -96,7 +96,7 @@ def test_energy_and_gradient_match_ipctk(tilt: str, gap: float) -> None:
 ATTITUDES = TILTS | {"nearly parallel": (0.0, 0.0, 0.01), "nearly parallel, tilted": (0.008, 0.005, 0.012)}
 
 
-def terms_of_hessian(scene: Scene, found: ipctk.NormalCollisions, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def terms_of_hessian(scene: Scene, pairs: ipctk.NormalCollisions, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """From ipctk's distances and mollifiers, pair by pair: the terms that are kept, the same clamped, and those that are dropped.
 
     A pair stores m(c) f(d); with ∇ over its vertices and w = a × b, c = ‖w‖², its Hessian is
@@ -106,8 +106,8 @@ def terms_of_hessian(scene: Scene, found: ipctk.NormalCollisions, x: np.ndarray)
     kept, clamped, dropped = (np.zeros((size, size)) for _ in range(3))
     b, Dh = ipctk.ClampedLogBarrier(), D_HAT**2
     edges, faces = scene.layout.edges, scene.layout.faces
-    for i in range(len(found)):
-        pair = found[i]
+    for i in range(len(pairs)):
+        pair = pairs[i]
         at = pair.dof(x, edges, faces)
         dof = (3 * np.array(pair.vertex_ids(edges, faces)[: len(at) // 3])[:, None] + np.arange(3)).ravel()
         block = np.ix_(dof, dof)
@@ -120,7 +120,7 @@ def terms_of_hessian(scene: Scene, found: ipctk.NormalCollisions, x: np.ndarray)
         f1, f2 = scale * 2 * d * b1, scale * (2 * b1 + 4 * D * b2)
         m, m1, m2, J, W = 1.0, 0.0, 0.0, gd[:, None], np.zeros((3, len(at)))
         H = np.array([[f2]])
-        if found.is_edge_edge(i):
+        if pairs.is_edge_edge(i):
             a0, a1, b0, b1_ = at.reshape(4, 3)
             c, eps = ipctk.edge_edge_cross_squarednorm(a0, a1, b0, b1_), pair.eps_x
             m, m1 = ipctk.edge_edge_mollifier(c, eps), ipctk.edge_edge_mollifier_gradient(c, eps)
@@ -149,9 +149,9 @@ def test_hessian_is_the_gauss_newton_part_of_ipctks(attitude: str, gap: float) -
     scene.evaluate(scene.x)
     rows = scene.hessian()
     x = np.asfortranarray(scene.x)
-    found = scene.collisions(scene.x)
-    exact = scipy.sparse.csr_matrix(scene.potential.hessian(found, scene.mesh, x)).toarray()
-    kept, clamped, dropped = terms_of_hessian(scene, found, x)
+    pairs = scene.collisions(scene.x)
+    exact = scipy.sparse.csr_matrix(scene.potential.hessian(pairs, scene.mesh, x)).toarray()
+    kept, clamped, dropped = terms_of_hessian(scene, pairs, x)
     size = np.abs(exact).max()
     assert size > 1e-3 and np.abs(dropped).max() > 1e-6 * size
     assert np.abs(kept + dropped - exact).max() < 1e-8 * size
@@ -159,7 +159,7 @@ def test_hessian_is_the_gauss_newton_part_of_ipctks(attitude: str, gap: float) -
     values = np.linalg.eigvalsh(rows)
     assert values[0] > -1e-12 * values[-1]
     # Along the force what is dropped and what clamping adds hardly count, but for nearly parallel edges.
-    u = scene.potential.gradient(found, scene.mesh, x)
+    u = scene.potential.gradient(pairs, scene.mesh, x)
     assert np.linalg.eigvalsh(rows - kept)[0] > -1e-12 * values[-1]
     assert u @ rows @ u == pytest.approx(u @ exact @ u, rel=0.1 if "nearly" in attitude else 1e-3)
 
@@ -188,9 +188,9 @@ def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
     moved += 0.05 * slide * rng.standard_normal(moved.shape)
     energy0, _ = scene.evaluate(moved, start=scene.x)
     friction = scene.solver.vert_gradient.numpy()[0] - barrier_gradient(moved)
-    found = scene.collisions(scene.x)
+    pairs = scene.collisions(scene.x)
     tangential = ipctk.TangentialCollisions()
-    tangential.build(scene.mesh, np.asfortranarray(scene.x), found, scene.potential, MU)
+    tangential.build(scene.mesh, np.asfortranarray(scene.x), pairs, scene.potential, MU)
     potential = ipctk.FrictionPotential(EPS)
     expected = potential.gradient(tangential, scene.mesh, np.asfortranarray(moved - scene.x)).reshape(-1, 3)
     assert np.linalg.norm(expected) > 1e-6 and energy0 >= 0

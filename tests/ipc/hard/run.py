@@ -1,4 +1,4 @@
-"""How a hard case is run and judged: the worst figures over its steps, and what must have come about."""
+"""Runs of hard cases: the worst figures over their steps, and checks of their outcome."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ G = 9.81
 
 @dataclass(frozen=True)
 class Setup:
-    """Where a case runs, and whether the twists have finer meshes and more turns."""
+    """Device of a case, and finer meshes and more turns for the twists."""
 
     device: str = "cpu"
     large: bool = False
@@ -37,7 +37,7 @@ class Worst:
     """Newton iterations of all steps."""
     unconverged: int = 0
     jams: bool = False
-    """Whether steps may end without having converged: what moves is pushed against what cannot give way."""
+    """True if steps may end without having converged: what moves is pushed against what cannot yield."""
     steps: int = 0
     blocked: float = 0.0
     touched: int = 0
@@ -83,14 +83,14 @@ class Worst:
         return self
 
     def passed(self) -> bool:
-        """Whether surfaces stayed apart and elements upright after every step, steps converged within their iterations (unless the case
+        """True if surfaces stayed apart and elements upright after every step, steps converged within their iterations (unless the case
         ``jams``), and what was expected came about."""
         sound = self.finite and self.crossed == 0 and self.min_gap > 0 and self.min_det > 0
         return sound and (self.jams or self.unconverged == 0) and not self.notes
 
 
 class Mechanics:
-    """What holds of every converged step of backward Euler: a free body's momentum changes by gravity and its contact forces alone, and,
+    """Laws of every converged step of backward Euler: a free body's momentum changes by gravity and its contact forces alone, and,
     where nothing is driven, the energy of all bodies never rises.
 
     Args:

@@ -62,9 +62,9 @@ def sliding(mesh: ipc.TetMesh, setup: Setup, steps: int = 16) -> Worst:
     if mesh is CUBE:
         dt, half = world.settings.dt, steps // 2
         speeds = np.diff(ways) / dt
-        found = (speeds[-1] - speeds[half]) / ((steps - 1 - half) * dt)
+        rate = (speeds[-1] - speeds[half]) / ((steps - 1 - half) * dt)
         expected = G * (math.sin(angle) - 0.1 * math.cos(angle))
-        worst.expect(abs(found / expected - 1) < 0.05, f"slid at {found:.3g} m/s², not {expected:.3g}: it was caught")
+        worst.expect(abs(rate / expected - 1) < 0.05, f"slid at {rate:.3g} m/s², not {expected:.3g}: it was caught")
     return worst
 
 
@@ -242,8 +242,8 @@ def squeeze(setup: Setup) -> Worst:
     heights: list[float] = []
 
     def move(k: int) -> None:
-        way = max(min(k + 1, 24 - k), 0) / 12
-        world.set_target("high", (0, 0, SIZE + 0.002 + gap - 0.5 * SIZE * way))
+        shift = max(min(k + 1, 24 - k), 0) / 12
+        world.set_target("high", (0, 0, SIZE + 0.002 + gap - 0.5 * SIZE * shift))
         heights.append(float(np.ptp(world.positions("soft")[0, :, 2])))
 
     worst = run(world, 40, move, driven=True)
@@ -267,16 +267,16 @@ def folded(setup: Setup) -> Worst:
     world = world_of(bodies, setup, dt=0.02, gravity=(0, 0, 0), friction=0.2)
 
     def move(k: int) -> None:
-        way = 0.0036 * (k + 1) / 15
-        world.set_target("left", (-0.0125 + way, 0, 0.017))
-        world.set_target("right", (0.0125 - way, 0, 0.017))
+        shift = 0.0036 * (k + 1) / 15
+        world.set_target("left", (-0.0125 + shift, 0, 0.017))
+        world.set_target("right", (0.0125 - shift, 0, 0.017))
 
     worst = run(world, 15, move, driven=True)
     return worst.expect(("fork", "fork") in world.contacts().bodies, "the arms never met")
 
 
 def blocked(setup: Setup) -> Worst:
-    """A ball driven through the pad into the bonded base: it stops, and the report says how much was left."""
+    """A ball driven through the pad into the bonded base: it stops, and the report says how much remained."""
     mesh = ipc.domed_pad((12e-3, 12e-3), 3e-3, (math.inf, math.inf), (4, 4, 2))
     pad = ipc.SoftBody("pad", mesh, ipc.Material(1e5, 0.45), bonded=ipc.vertices_in_box(mesh, (-1, -1, -3e-3), (1, 1, -3e-3)))
     ball = ipc.KinematicBody("ball", ipc.icosphere(3e-3, 2), ipc.Pose((0, 0, 3.1e-3 + D_HAT)))
@@ -304,9 +304,9 @@ def twisted(setup: Setup, mesh: ipc.TetMesh, turns: float, length: float) -> Wor
 
     worst = run(world, steps, turn, driven=True)
     x = world.positions("twisted")[0]
-    for held, side in zip(ends, (-1.0, 1.0), strict=True):
-        off = np.abs(x[held] - mesh.vertices[held] @ rotation_matrix(half_turn(steps - 1, side)).T).max()
-        worst.expect(off < 1e-12, f"a held end is off by {off:.3g} m")
+    for ids, side in zip(ends, (-1.0, 1.0), strict=True):
+        off = np.abs(x[ids] - mesh.vertices[ids] @ rotation_matrix(half_turn(steps - 1, side)).T).max()
+        worst.expect(off < 1e-12, f"a gripped end is off by {off:.3g} m")
     worst.expect(("twisted", "twisted") in world.contacts().bodies, "it never touched itself")
     return worst.expect(worst.blocked == 0, f"a share of {worst.blocked:.3g} of a turn was not followed")
 

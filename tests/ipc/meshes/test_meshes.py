@@ -38,11 +38,11 @@ def test_inner_faces_are_shared_by_two_cells_on_either_side(cells: tuple[int, in
     mesh = ipc.box_mesh(*(np.linspace(0, n, n + 1) for n in cells), cut=cut)
     faces = np.sort(mesh.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     apex = mesh.vertices[mesh.tets.ravel()]
-    found, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
-    middles = mesh.vertices[found].mean(axis=1)
+    unique, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    middles = mesh.vertices[unique].mean(axis=1)
     outer = ((middles < 1e-9) | (middles > np.array(cells) - 1e-9)).any(axis=1)
     assert (count[outer] == 1).all() and (count[~outer] == 2).all() and outer.any() and (~outer).any()
-    a, b, c = (mesh.vertices[found[which.ravel(), k]] for k in range(3))
+    a, b, c = (mesh.vertices[unique[which.ravel(), k]] for k in range(3))
     side = np.sign(np.einsum("fi,fi->f", np.cross(b - a, c - a), apex - a))
     assert (np.bincount(which.ravel(), weights=side)[~outer] == 0).all()
 
@@ -60,7 +60,7 @@ def test_neighbouring_cells_are_mirror_images() -> None:
             inside = middles[(middles[:, axis] > k) & (middles[:, axis] < k + 1)].copy()
             inside[:, axis] -= k + 0.5
             sets.append({tuple(np.round(m * (flip if k % 2 else 1.0), 9) + 0.0) for m in inside})
-        return all(found == sets[0] for found in sets)
+        return all(unique == sets[0] for unique in sets)
 
     for axis in range(3):
         assert halves_match(axis, "mirrored")

@@ -99,11 +99,11 @@ def test_what_is_no_file_is_replaced_and_not_waited_for(tmp_path: Path, fills: l
 
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path, fills: list[float]) -> None:
     (tmp_path / "file").write_text("")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         for _ in range(3):
             assert len(tetrahedralize(BOX, 0.5, tmp_path / "file" / "tets").tets) == 6
-    assert len(fills) == 3 and len(told) == 1 and "cannot be written (Not a directory)" in str(told[0].message)
+    assert len(fills) == 3 and len(caught) == 1 and "cannot be written (Not a directory)" in str(caught[0].message)
 
 
 def test_a_full_disk_leaves_no_half(tmp_path: Path, fills: list[float], monkeypatch: pytest.MonkeyPatch) -> None:

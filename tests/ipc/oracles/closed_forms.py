@@ -1,4 +1,4 @@
-"""What a frictionless press must give, by routes that share nothing with the solver: closed forms and a small integral equation.
+"""Forces and sinks of a frictionless press by routes that share nothing with the solver: closed forms and a small integral equation.
 
 A rigid, axisymmetric tool on an elastic half-space or on a layer bonded to a rigid base, at small strain. Lengths [m], forces [N],
 moduli [Pa]; E* = E/(1 − ν²).
@@ -114,8 +114,8 @@ class BondedLayer:
         """Force [N] of a paraboloid at ``depth`` [m]."""
         contact = np.sqrt(sphere_radius * depth)
         for _ in range(60):
-            found, force = self.sphere(sphere_radius, contact)
-            if abs(found - depth) < 1e-12 * depth:
+            reached, force = self.sphere(sphere_radius, contact)
+            if abs(reached - depth) < 1e-12 * depth:
                 return force
-            contact *= np.sqrt(depth / found)  # depth grows about as a², on a half-space and on a thin layer
+            contact *= np.sqrt(depth / reached)  # depth grows about as a², on a half-space and on a thin layer
         raise ArithmeticError(f"no contact radius found for a depth of {depth} m")

@@ -31,31 +31,31 @@ def stiffness(mesh: ipc.TetMesh, solid: Elastic) -> sparse.csc_matrix:
     return sparse.csc_matrix((blocks.ravel(), (rows.ravel(), cols.ravel())), shape=(size, size))
 
 
-def nodal_press(mesh: ipc.TetMesh, held: NDArray, solid: Elastic, limit: Floats, far_field: bool = True) -> float:
+def nodal_press(mesh: ipc.TetMesh, bonded: NDArray, solid: Elastic, limit: Floats, far_field: bool = True) -> float:
     """Force [N] that keeps every vertex at or below ``limit``.
 
     Args:
         mesh: its upper side is z = 0.
-        held: vertices that carry the far field of the press, or nothing if ``far_field`` is false.
+        bonded: vertices that carry the far field of the press, or nothing if ``far_field`` is false.
         solid: the material.
         limit: highest displacement along z of each vertex [m], (N,); infinite where the tool does not reach.
-        far_field: see ``held``.
+        far_field: see ``bonded``.
 
-    The vertices in contact are found by adding those that cross and dropping those that are pulled, until neither is left.
+    The search for the vertices in contact adds those that cross and drops those that are pulled, until there are neither.
     """
     n = len(mesh.vertices)
     K = stiffness(mesh, solid)
     fixed = np.zeros(3 * n, bool)
-    fixed[(3 * held[:, None] + np.arange(3)).ravel()] = True
+    fixed[(3 * bonded[:, None] + np.arange(3)).ravel()] = True
     free = np.flatnonzero(~fixed)
     factor = splu(K[np.ix_(free, free)], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
     place = np.full(3 * n, -1)
     place[free] = np.arange(len(free))
     unit = np.zeros(3 * n)
-    unit[(3 * held[:, None] + np.arange(3)).ravel()] = boussinesq_displacement(solid, 1.0, mesh.vertices[held]).ravel()
+    unit[(3 * bonded[:, None] + np.arange(3)).ravel()] = boussinesq_displacement(solid, 1.0, mesh.vertices[bonded]).ravel()
     from_far = (
         factor.solve(-(K @ unit)[free]) if far_field else np.zeros(len(free))
-    )  # what a unit force does by way of the far field
+    )  # effect of a unit force through the far field
     candidates = np.flatnonzero(np.isfinite(limit) & (place[2::3] >= 0))
     rows = place[3 * candidates + 2]
     right = np.zeros((len(free), len(candidates)))

@@ -25,7 +25,7 @@ REACH = 8.0
 
 @dataclass(frozen=True)
 class Pressed:
-    """What a press came to: force [N], depth with the stand-off added [m], number of vertices, seconds."""
+    """The result of a press: force [N], depth with the stand-off added [m], number of vertices, seconds."""
 
     force: float
     depth: float
@@ -39,7 +39,7 @@ class Pressed:
 
 def press(
     mesh: ipc.TetMesh,
-    held: NDArray,
+    bonded: NDArray,
     tool: ipc.TriMesh,
     depth: float,
     *,
@@ -53,40 +53,40 @@ def press(
 
     Args:
         mesh: upper side at z = 0.
-        held: bonded vertices.
+        bonded: bonded vertices.
         tool: its lowest point at z = 0.
         depth: [m], stand-off included.
         solid: the material.
         d_hat: [m].
         kappa: barrier stiffness as a multiple of Young's modulus.
-        far_force: a first guess of the force [N]: held vertices carry the displacement that Boussinesq gives for the force, found again
+        far_force: a first guess of the force [N]: bonded vertices carry the displacement that Boussinesq gives for the force, repeated
             with the force that came out until that changes by less than 0.1 %. None keeps them at rest.
         device: Warp device.
     """
     begin = time.perf_counter()
-    body = ipc.SoftBody("block", mesh, ipc.Material(solid.young, solid.poisson), bonded=held)
+    body = ipc.SoftBody("block", mesh, ipc.Material(solid.young, solid.poisson), bonded=bonded)
     settings = ipc.Settings(
         dt=1e3, d_hat=d_hat, kappa=kappa * solid.young, velocity_tolerance=1e-14, linear_tolerance=1e-4, max_newton=200
     )
     start = ipc.Pose((0.0, 0.0, 1.01 * d_hat))
     world = ipc.World([body, ipc.KinematicBody("tool", tool, start)], settings, device=device)
-    force, found = (0.0 if far_force is None else far_force), np.inf
+    force, measured = (0.0 if far_force is None else far_force), np.inf
     while True:
         if far_force is not None:
             state = world.save()
-            state.y[0, held] = mesh.vertices[held] + boussinesq_displacement(solid, force, mesh.vertices[held])
+            state.y[0, bonded] = mesh.vertices[bonded] + boussinesq_displacement(solid, force, mesh.vertices[bonded])
             world.restore(state)
         world.set_target("tool", (0.0, 0.0, d_hat - depth))
         report = world.step()
         if not report.converged[0]:
             raise ArithmeticError(f"the press did not converge: {report}")
-        found = float(world.wrench("tool").force[0, 2])
-        if far_force is None or abs(found - force) < 1e-3 * found:
+        measured = float(world.wrench("tool").force[0, 2])
+        if far_force is None or abs(measured - force) < 1e-3 * measured:
             break
-        force = found
+        force = measured
     pairs = world.contacts()
     gap = float(pairs.force @ pairs.gap / pairs.force.sum())
-    return Pressed(found, depth - d_hat + gap, len(mesh.vertices), time.perf_counter() - begin)
+    return Pressed(measured, depth - d_hat + gap, len(mesh.vertices), time.perf_counter() - begin)
 
 
 def growth(cells: float) -> float:
@@ -96,17 +96,17 @@ def growth(cells: float) -> float:
 
 def press_sphere(cells: int, reach: float = REACH, **options: float | str | None) -> Pressed:
     """A ball on a half-space, ``cells`` to the contact radius."""
-    mesh, held = even_block(CONTACT, cells, growth(cells), reach * CONTACT)
+    mesh, bonded = even_block(CONTACT, cells, growth(cells), reach * CONTACT)
     tool = ball_tool(1.6 * CONTACT, round(3.2 * cells), SPHERE)
     guess = {"far_force": float(hertz_force(SOLID, SPHERE, DEPTH))} | options
-    return press(mesh, held, tool, DEPTH, **guess)  # type: ignore[arg-type]
+    return press(mesh, bonded, tool, DEPTH, **guess)  # type: ignore[arg-type]
 
 
 def press_punch(cells: int, reach: float = REACH, **options: float | str | None) -> Pressed:
     """A flat punch on a half-space, ``cells`` to its radius."""
-    mesh, held = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
+    mesh, bonded = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
     guess = {"far_force": float(punch_force(SOLID, CONTACT, DEPTH))} | options
-    return press(mesh, held, flat_tool(CONTACT, cells), DEPTH, **guess)  # type: ignore[arg-type]
+    return press(mesh, bonded, flat_tool(CONTACT, cells), DEPTH, **guess)  # type: ignore[arg-type]
 
 
 def hertz_error(pressed: Pressed) -> float:

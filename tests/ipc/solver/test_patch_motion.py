@@ -25,7 +25,7 @@ def column(grip: bool) -> ipc.World:
 
 
 @pytest.fixture(scope="module")
-def found() -> ipc.PatchMotion:
+def patch() -> ipc.PatchMotion:
     world = column(grip=False)
     body = world.bodies[0]
     assert isinstance(body, ipc.SoftBody)
@@ -33,45 +33,45 @@ def found() -> ipc.PatchMotion:
     return RestPatches(world.layout, world.settings, 0).motion(world._potential, 0, top)
 
 
-def test_the_stiffness_is_what_the_solver_answers_with(found: ipc.PatchMotion) -> None:
+def test_the_stiffness_is_what_the_solver_answers_with(patch: ipc.PatchMotion) -> None:
     turn, origin = (a[0] for a in column(grip=False).frame("column"))
-    np.testing.assert_allclose(found.centre, origin + turn @ [0.0, 0.0, HEIGHT], atol=1e-12)
-    way = 1e-6
+    np.testing.assert_allclose(patch.centre, origin + turn @ [0.0, 0.0, HEIGHT], atol=1e-12)
+    shift = 1e-6
     for axis in range(6):
         world = column(grip=True)
         position, rotation = (a[0] for a in world.frame("column.top")[::-1])
         if axis < 3:
-            world.set_target("column.top", position + way * np.eye(3)[axis])
+            world.set_target("column.top", position + shift * np.eye(3)[axis])
         else:
-            angle = way / WIDTH
+            angle = shift / WIDTH
             spin = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * np.eye(3)[axis - 3]])
             # About the patch's centre, not the grip's origin.
-            arm = position - found.centre
-            moved = found.centre + arm + angle * np.cross(np.eye(3)[axis - 3], arm)
+            arm = position - patch.centre
+            moved = patch.centre + arm + angle * np.cross(np.eye(3)[axis - 3], arm)
             world.set_target("column.top", moved, _times(spin, _of(rotation)))
         assert world.step().converged[0]
         wrench = world.wrench("column.top")
         force = wrench.force[0]
-        torque = wrench.torque[0] + np.cross(world.frame("column.top")[1][0] - found.centre, force)
-        expected = -found.stiffness[:, axis] * (way if axis < 3 else way / WIDTH)
+        torque = wrench.torque[0] + np.cross(world.frame("column.top")[1][0] - patch.centre, force)
+        expected = -patch.stiffness[:, axis] * (shift if axis < 3 else shift / WIDTH)
         scale = np.abs(expected[:3]).max() + np.abs(expected[3:]).max() / WIDTH
         np.testing.assert_allclose(force, expected[:3], atol=5e-3 * scale)
         np.testing.assert_allclose(torque, expected[3:], atol=5e-3 * scale * WIDTH)
 
 
-def test_a_slender_column_bends_and_weighs_as_a_beam_does(found: ipc.PatchMotion) -> None:
+def test_a_slender_column_bends_and_weighs_as_a_beam_does(patch: ipc.PatchMotion) -> None:
     turn = column(grip=False).frame("column")[0][0]
     along, across = turn[:, 2], turn[:, 0]
     area, second = WIDTH**2, WIDTH**4 / 12.0
-    give = np.linalg.inv(found.stiffness)[:3, :3]
-    # Long along z, and a short one: the held ends cannot widen, linear tetrahedra bend too stiffly, shear makes it softer.
+    give = np.linalg.inv(patch.stiffness)[:3, :3]
+    # Long along z, and a short one: the bonded ends cannot widen, linear tetrahedra bend too stiffly, shear makes it softer.
     assert 1.0 / (along @ give @ along) == pytest.approx(YOUNG * area / HEIGHT, rel=0.2)
     assert 1.0 / (across @ give @ across) == pytest.approx(3.0 * YOUNG * second / HEIGHT**3, rel=0.4)
     weight = 1000.0 * area * HEIGHT
     assert (
-        0.2 * weight < found.mass < 0.5 * weight
+        0.2 * weight < patch.mass < 0.5 * weight
     )  # a third where the body stretches evenly, about as much where its end moves parallel
-    assert np.linalg.eigvalsh(found.inertia).min() > 0.0 and not found.velocity.any()
+    assert np.linalg.eigvalsh(patch.inertia).min() > 0.0 and not patch.velocity.any()
 
 
 def test_a_body_too_large_or_too_badly_shaped_to_be_inverted_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ import warp as wp
 
 import ipc
 from ipc.bodies import Layout, build_layout, rotation_matrix
-from ipc.contact.normal import Contacts, mat34d
-from ipc.solver.dynamics import VertexMap
+from ipc.contact.contacts import Contacts, mat34d
+from ipc.solver.frames import VertexMap
 from ipc.solver.linear import BlockJacobi, SystemView
 from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
