@@ -1,4 +1,4 @@
-"""Incremental potential contact for soft gel pads: a package of its own that never imports ``raytac``.
+"""Incremental potential contact for soft gel pads; never imports ``raytac``.
 
 Bodies go into a :class:`World`, ``World.step`` returns a :class:`StepReport`, and positions, forces and contacts come out as NumPy
 arrays whose first axis is the environment. SI units; see ``ipc/README.md``.
@@ -83,7 +83,7 @@ __all__ = [
 ]
 
 RAYTAC_IPC_MARKER = "raytac-ipc"
-"""Tells this package from the other ``ipc`` packages that can be installed; ``raytac`` looks for it."""
+"""Mark by which ``raytac`` tells this package from others named ``ipc``."""
 
 __version__ = "0.1.0"
 

@@ -105,7 +105,7 @@ class Wrench:
 
 @dataclass(frozen=True)
 class PatchMotion:
-    """A patch of a bonded body that moves as a whole, in one environment, world frame (see ``ipc/solver/patch_motion.py``).
+    """A patch of a bonded body that moves as a whole, in one environment, world frame.
 
     Attributes:
         mass: of the patch and of what moves with it [kg].

@@ -1,4 +1,4 @@
-"""Snapshots of a world, frames that are moved at once, and values that a caller gives for every environment."""
+"""Snapshots of a world, frames moved at once, and a caller's values for environments."""
 
 from __future__ import annotations
 
@@ -59,7 +59,9 @@ def teleported(
     rotation: Floats | None,
     mask: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Move a frame, and all that is bonded to it, in the environments of the mask; velocities become zero. Changes ``state``.
+    """Move a frame, and all that is bonded to it, in the environments of the mask.
+
+    Changes ``state``; velocities become zero.
 
     Args:
         body: owner of the frame.
@@ -98,7 +100,7 @@ def _carry_grips(state: State, layout: Layout, body: int, mask: NDArray[np.bool_
 
 
 def _quaternions(rotations: Floats) -> Floats:
-    """Unit quaternions (w, x, y, z) of rotation matrices, (..., 3, 3) to (..., 4): the eigenvector of Bar-Itzhack's matrix."""
+    """Unit quaternions (..., 4) of rotation matrices, eigenvectors of Bar-Itzhack's matrix."""
     m = np.moveaxis(rotations, (-2, -1), (0, 1))
     zero = m[0, 0] * 0
     rows = [
@@ -112,7 +114,7 @@ def _quaternions(rotations: Floats) -> Floats:
 
 
 def per_env(values: ArrayLike, shape: tuple[int, ...], what: str, num_envs: int) -> NDArray:
-    """Finite values of a shape, the same for every environment or with the environment first; (B, \\*shape)."""
+    """Finite values (B, \\*shape), given for all environments or for each."""
     array = np.asarray(values, dtype=float)
     if array.shape not in (shape, (num_envs, *shape)):
         raise IpcError(f"{what} has shape {array.shape}: it must be {shape} or {(num_envs, *shape)}")
@@ -122,7 +124,7 @@ def per_env(values: ArrayLike, shape: tuple[int, ...], what: str, num_envs: int)
 
 
 def unit_pose(position: ArrayLike | None, rotation: ArrayLike | None, num_envs: int) -> tuple[Floats | None, Floats | None]:
-    """Position (B, 3) and unit quaternion (w, x, y, z) (B, 4) of every environment, where given."""
+    """Position (B, 3) and unit quaternion (w, x, y, z) (B, 4), where given."""
     p = None if position is None else per_env(position, (3,), "position", num_envs)
     if rotation is None:
         return p, None

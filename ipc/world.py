@@ -99,7 +99,7 @@ class World:
         raise IpcError(f"no body or grip is named {name!r}: choose from {choices}")
 
     def set_target(self, name: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None) -> None:
-        """Set the pose of a driven frame at the end of the next step; it stays there until it is set again.
+        """Set the pose of a driven frame from the end of the next step on.
 
         Args:
             name: a kinematic body, a half-space, a soft body with bonded vertices, a grip ``"<body>.<grip>"``, or an affine body with
@@ -120,7 +120,7 @@ class World:
         self._potential.acceleration.assign(np.ascontiguousarray(per_env(gravity, (3,), "gravity", self.num_envs)))
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
-        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame."""
+        """Set the world velocity of a soft or affine body's nodes [m/s], shape (3,) or (B, 3)."""
         body = self._index(name)
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
@@ -174,18 +174,18 @@ class World:
 
     @property
     def timers(self) -> dict[str, float]:
-        """Seconds spent in ``step`` so far, and in each of its stages (on CUDA only with ``Settings.cuda_graph`` off)."""
+        """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
         return dict(self._newton.timers)
 
     # --- outputs ---------------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
-        """Rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or a grip's frame in the world."""
+        """World rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or grip's frame."""
         body = self._frame(name)
         return host(self._potential.R)[:, body].copy(), host(self._potential.t)[:, body].copy()
 
     def positions(self, name: str, frame: str = "world") -> Floats:
-        """Positions [m] of a body, (B, n, 3): all vertices of a soft body's mesh, else its surface's vertices.
+        """Positions [m] (B, n, 3) of all vertices of a soft body's mesh, or of another's surface.
 
         Args:
             name: the body.
@@ -209,7 +209,7 @@ class World:
         return host(solver.x)[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
 
     def velocities(self, name: str) -> Floats:
-        """World velocities [m/s] of a soft body's vertices, (B, n, 3), or of an affine body's four reference corners (B, 4, 3)."""
+        """World velocities [m/s] of a soft body's vertices or an affine body's corners, (B, n, 3)."""
         body = self._index(name)
         first, last = self.layout.node_start[body : body + 2]
         if first == last:
@@ -229,7 +229,7 @@ class World:
         return A, y[:, 0] - A @ corner
 
     def surface(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """A body's surface: mesh vertex of each surface vertex (n,), and triangles (F, 3) in surface vertex numbers."""
+        """Mesh vertex of each surface vertex (n,), and triangles (F, 3) of surface vertices."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
         faces = self.layout.faces[self.layout.face_start[body] : self.layout.face_start[body + 1]] - first
@@ -238,7 +238,7 @@ class World:
         return np.arange(last - first, dtype=np.int32), faces
 
     def contact_forces(self, name: str) -> Floats:
-        """Contact and friction force on each surface vertex [N], world frame, (B, n, 3); order as in :meth:`surface`."""
+        """Contact and friction force on each vertex of :meth:`surface` [N], world frame, (B, n, 3)."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
         return -host(self._potential.vert_gradient)[:, first:last]
@@ -250,7 +250,7 @@ class World:
         return self.contact_forces(name) / area[None, :, None]
 
     def wrench(self, name: str) -> Wrench:
-        """Force and torque of the others on a body: contact forces, or the pull of a soft body's bond on its frame.
+        """Force and torque on a body by the others, or on a frame by the nodes bonded to it.
 
         For a soft body with bonded vertices this is the force of the pad on what holds it, and ``"<body>.<grip>"`` gives the force on
         that grip; for a free soft body it is the sum of its contacts.
@@ -274,18 +274,18 @@ class World:
         return contact_pairs(self.layout, self._potential, env)
 
     def pressing(self) -> dict[tuple[str, str], PairForces]:
-        """Forces at the end of the last step by names of the two bodies; pairs that touch in no environment are left out."""
+        """Forces at the end of the last step by names of two bodies that touch in any environment."""
         return pair_forces(self.layout, self._potential)
 
     def rigid_motion(self, name: str) -> RigidMotion:
-        """Mass, centre, inertia and velocities of a soft or affine body as if it moved as a whole at this instant; world frame."""
+        """Mass, centre, inertia and velocities of a soft or affine body as if it were rigid now."""
         body = self._index(name)
         if self.layout.node_start[body] == self.layout.node_start[body + 1]:
             raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
         return rigid_motion(self.layout, self._potential, body)
 
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
-        """The part of a bonded soft body under contact forces at the end of the last step, as if it moved as a whole.
+        """The part of a bonded soft body under contact forces, as if it moved as a whole.
 
         None where nothing touches its free nodes, as before any step. The first call for a body inverts its rest matrix.
 
@@ -300,11 +300,11 @@ class World:
         return self._patches[body].loaded(self._potential, env)
 
     def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
-        """Bodies closer than d̂ to a body at the end of the last step, (B,) by name; those that never were are left out."""
+        """Masks (B,) of other bodies that were closer than d̂ at the end of the last step, by name."""
         return touching(self.layout, self._potential, self._index(name))
 
     def overlap(self, env: int = 0) -> str | None:
-        """Describe the first surfaces that cross, touch or contain each other in one environment; None where all are apart.
+        """Describe surfaces that cross, touch or contain each other; None where all are apart.
 
         Edges and triangles are compared exactly, on the host: a check for tests and experiments, not for every step of a batch. Only
         pairs of bodies that may touch are looked at, a body with itself where it has ``self_contact``.
@@ -379,7 +379,7 @@ class World:
     def teleport(
         self, name: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None, envs: ArrayLike | None = None
     ) -> None:
-        """Move a driven body's frame at once, with all that is bonded to it; its velocities become zero.
+        """Move a driven frame at once, with all that is bonded to it; velocities become zero.
 
         Its target becomes that pose; those of other bodies stay. An affine body is put there, undeformed.
 

@@ -1,4 +1,4 @@
-"""Bodies of a world: soft, affine and kinematic ones, half-spaces, and queries for the vertices to bond."""
+"""Bodies of a world: soft, affine, kinematic, half-spaces; queries for vertices to bond."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class SoftBody:
 
 @dataclass(frozen=True)
 class AffineBody:
-    """A near-rigid solid with twelve unknowns: x = A X + p, A kept orthogonal by a stiff energy (Lan et al. 2022).
+    """A near-rigid solid with twelve unknowns, x = A X + p (Lan et al. 2022).
 
     Attributes:
         name: unique name.
@@ -153,14 +153,14 @@ Body = SoftBody | AffineBody | KinematicBody | HalfSpace
 
 
 def vertices_in_box(mesh: TetMesh, low: ArrayLike, high: ArrayLike, tolerance: float = 1e-9) -> NDArray[np.int64]:
-    """Vertices of ``mesh`` inside the box from ``low`` to ``high`` [m], to within ``tolerance`` [m]; use ±inf for an open side."""
+    """Vertices of ``mesh`` in a box [m], to within ``tolerance`` [m]; ±inf opens a side."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     inside = ((mesh.vertices >= low - tolerance) & (mesh.vertices <= high + tolerance)).all(axis=1)
     return np.flatnonzero(inside)
 
 
 def vertices_near(mesh: TetMesh, what: TriMesh | ArrayLike, distance: float) -> NDArray[np.int64]:
-    """Vertices of ``mesh`` within ``distance`` [m] of a surface, or of any of the points ``what`` [m], shape (P, 3)."""
+    """Vertices of ``mesh`` within ``distance`` [m] of a surface or of points [m] (P, 3)."""
     if not distance >= 0:
         raise IpcError(f"distance = {distance}: it cannot be negative")
     if isinstance(what, TriMesh):
@@ -174,7 +174,7 @@ def vertices_near(mesh: TetMesh, what: TriMesh | ArrayLike, distance: float) -> 
 
 
 def _squared_distance(points: NDArray[np.float64], *corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared distances of points (V, 3) to one triangle: of its plane where the foot lies inside, else the least of its edges."""
+    """Squared distances of points (V, 3) to a triangle, by its plane and its edges."""
     squared = np.full(len(points), np.inf)
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
         edge, rel = end - start, points - start

@@ -23,12 +23,12 @@ __all__ = ["Layout", "build_layout"]
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
 Arrays = dict[str, NDArray]
-"""Arrays of one body by the names of :class:`Layout`, with nodes counted from the body's first."""
+"""Arrays of one body by the names of :class:`Layout`; nodes count from its first."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The flat arrays; sizes: bodies, N nodes, T elements, K matrix blocks, V vertices, E edges, F faces, P body pairs.
+    """Flat arrays of N nodes, T elements, K blocks, V vertices, E edges, F faces, P pairs.
 
     Attributes:
         names: body names, in order.    half_space: body is a half-space (bodies,).
@@ -127,7 +127,7 @@ def _corner_gradients(x: Floats) -> Floats:
 
 
 def _affine_mass(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
-    """Corners of the reference tetrahedron (4, 3), barycentric weights of the vertices (V, 4), masses (4, 4) and volume."""
+    """Reference corners (4, 3), barycentric weights of vertices (V, 4), masses (4, 4), volume."""
     v, f = body.surface.vertices, body.surface.faces
     low, high = v.min(axis=0), v.max(axis=0)
     middle, size = (low + high) / 2, (high - low).max()
@@ -160,7 +160,7 @@ def _affine_mass(body: AffineBody) -> tuple[Floats, Floats, Floats, float]:
 
 
 def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
-    """Surface and arrays: nodes are the vertices of the mesh, and each vertex of the surface follows one."""
+    """Surface and arrays: nodes are the vertices of the mesh; surface vertices follow one."""
     x, tets = body.mesh.vertices, body.mesh.tets
     placed = x if len(body.bonded) else x @ rotation_matrix(body.pose.rotation).T + body.pose.position
     volume = np.linalg.det(x[tets][:, 1:] - x[tets][:, :1]) / 6
@@ -193,7 +193,7 @@ def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
 
 
 def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
-    """Surface and arrays: nodes are the corners of a tetrahedron around the body, and each vertex follows all four."""
+    """Surface and arrays: nodes are four corners around the body; all vertices follow them."""
     corners, weights, mass, volume = _affine_mass(body)
     row, col = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
     return body.surface, {
@@ -218,7 +218,7 @@ def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
 
 
 def _arrays(body: Body) -> tuple[TriMesh | None, Arrays]:
-    """Surface and arrays of a body; a kinematic one has no nodes, a half-space no surface either."""
+    """Surface and arrays of a body; kinematic ones have no nodes, half-spaces no surface."""
     if isinstance(body, SoftBody):
         return _soft(body)
     if isinstance(body, AffineBody):

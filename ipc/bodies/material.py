@@ -1,4 +1,4 @@
-"""Elastic materials: the numbers a user gives, and the coefficients that the stored energies take."""
+"""Elastic materials: a user's moduli, and the coefficients of the stored energies."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Material:
         return self.young / (2 * (1 + self.poisson)), self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
 
     def coefficients(self) -> tuple[float, float]:
-        """μ and λ [Pa] of the stored energy whose linearisation at rest has the Lamé constants of :meth:`lame`.
+        """μ and λ [Pa] of the stored energy with the Lamé constants of :meth:`lame` at rest.
 
         ``stable``: μ = μ_L, λ = λ_L + μ_L. ``stable_log``: μ = 4/3 μ_L, λ = λ_L + 5/6 μ_L (Smith, de Goes, Kim 2018,
         "Stable Neo-Hookean Flesh Simulation", section 3.4).
@@ -61,7 +61,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Stiff:
-    """The material of an affine body: Ψ = κ ‖F Fᵀ − 1‖² keeps the map orthogonal (Lan et al. 2022, "Affine Body Dynamics", eq. 6).
+    """The material of an affine body: Ψ = κ ‖F Fᵀ − 1‖² (Lan et al. 2022, eq. 6).
 
     Attributes:
         stiffness: κ [Pa]; for small strain it acts like a shear modulus of 4κ.

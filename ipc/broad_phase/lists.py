@@ -1,4 +1,4 @@
-"""Broad phase: pairs of primitives whose boxes overlap, kept for as long as no vertex leaves its box.
+"""Broad phase: pairs of primitives whose boxes overlap, until a vertex leaves its box.
 
 Every vertex has a box around the last motion that was checked, widened by a margin; a primitive's box is the union of its vertices'
 boxes widened by d̂/2. Two primitives whose boxes do not overlap stay farther apart than d̂ as long as their vertices stay inside their
@@ -52,7 +52,7 @@ class Surface:
 
 @wp.struct
 class Candidates:
-    """Pairs that may come within d̂, each (first, second, body pair); counts may exceed what fits, which asks for larger buffers."""
+    """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits."""
 
     pt: wp.array2d(dtype=wp.vec3i)
     ee: wp.array2d(dtype=wp.vec3i)
@@ -62,7 +62,7 @@ class Candidates:
 
 @wp.func
 def pairs_of(candidates: Candidates, ee: wp.bool, env: wp.int32) -> wp.int32:
-    """Candidates of two edges (``ee``) or of a vertex and a face that an environment has stored."""
+    """Number of stored candidates of two edges (``ee``) or of a vertex and a face."""
     if ee:
         return wp.min(candidates.ee_count[env], candidates.ee.shape[1])
     return wp.min(candidates.pt_count[env], candidates.pt.shape[1])
@@ -96,7 +96,7 @@ def leaves_box(
     stale: wp.array(dtype=wp.int32),
     any_stale: wp.array(dtype=wp.int32),
 ):
-    """Marks environments in which x or x + dx lies outside its vertex's box, and whether there is one."""
+    """Marks environments in which x or x + dx lies outside its vertex's box."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -223,7 +223,7 @@ def add_point_triangle(
     pair: wp.int32,
     candidates: Candidates,
 ):
-    """Adds vertex v, whose box is ``lo`` to ``hi``, and face f if their boxes overlap and v is no corner of f."""
+    """Adds vertex v, with box ``lo`` to ``hi``, and face f if their boxes overlap, but for its corners."""
     if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
         if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
             slot = wp.atomic_add(candidates.pt_count, env, 1)
@@ -244,7 +244,7 @@ def add_edge_edge(
     pair: wp.int32,
     candidates: Candidates,
 ):
-    """Adds edge a, whose box is ``lo`` to ``hi``, and edge b if their boxes overlap and they share no vertex."""
+    """Adds edge a, with box ``lo`` to ``hi``, and edge b if boxes overlap, but for neighbours."""
     if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
         a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
         b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
@@ -326,7 +326,7 @@ def find_ee(
     # outputs
     candidates: Candidates,
 ):
-    """Edges of list ``first`` against edges of list ``second``; of one body with itself, each pair once."""
+    """Edges of list ``first`` against those of ``second``; within one body each pair once."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= list_count[env, first]:
         return
@@ -351,7 +351,7 @@ def rank_candidates(
     # outputs
     ordered: wp.array2d(dtype=wp.vec3i),
 ):
-    """Sorts the pairs. They are unique, so the result does not depend on the order in which threads wrote them."""
+    """Sorts the pairs, which are unique, so that their order does not depend on scheduling."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= count[env]:
         return

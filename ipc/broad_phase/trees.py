@@ -1,4 +1,4 @@
-"""Broad phase by bounding volume hierarchies: one over faces and one over edges, with a subtree for each body of each environment.
+"""Broad phase by bounding volume hierarchies over faces and edges, a subtree for each body.
 
 A vertex searches the faces of every body that it may touch, and an edge that body's edges. Time grows with n log n and with the number of
 pairs, that of :mod:`ipc.broad_phase.lists` with the product of the lengths. Two launches serve all pairs of bodies.
@@ -34,7 +34,7 @@ ROUNDING = wp.constant(wp.float32(2.4e-7))
 TINY = wp.constant(wp.float32(1e-37))
 FAR = wp.constant(wp.float64(1e37))
 WIDER = wp.constant(wp.float64(1.0 + 1e-6))
-"""Queries reach a little farther than d̂, so that rounding of a sum never hides a pair that double precision finds."""
+"""Queries reach a little farther than d̂, so that rounding never hides a pair."""
 
 
 @wp.func
@@ -69,7 +69,7 @@ def corner_up(corner: wp.vec3d) -> wp.vec3:
 
 @wp.struct
 class Tree:
-    """A hierarchy over n primitives of each environment; item env·n + k is primitive ``prim[k]``."""
+    """A hierarchy over n primitives an environment; item env·n + k is primitive ``prim[k]``."""
 
     id: wp.uint64
     prim: wp.array(dtype=wp.int32)  # (n,)
@@ -78,7 +78,7 @@ class Tree:
 
 @wp.struct
 class Partners:
-    """Queries: the primitives ``asking`` of a body search each ``body`` from its ``start`` on, for the body pair ``pair``."""
+    """Queries of the primitives ``asking`` to each ``body`` from a body's ``start`` on."""
 
     asking: wp.array(dtype=wp.int32)
     start: wp.array(dtype=wp.int32)  # (bodies + 1,)
@@ -165,7 +165,7 @@ def query_edges(
     # outputs
     candidates: Candidates,
 ):
-    """Edges against those of the bodies that theirs may touch; of one body with itself, each pair once."""
+    """Edges against those of bodies that theirs may touch; within one body each pair once."""
     env, i = wp.tid()
     if stale[env] == 0:
         return
@@ -193,7 +193,7 @@ _CPU, _CUDA = (300, 2e6, 3), (700, 3e6, 10)
 
 
 def trees_pay(layout: Layout, pairs: Sequence[tuple[int, int, int]], cuda: bool) -> bool:
-    """Expect hierarchies to be faster than lists for the body pairs (index, a, b); docs/ipc-broad-phase.md has figures."""
+    """Expect hierarchies to be faster than lists for the body pairs (index, a, b)."""
     own, product, most = _CUDA if cuda else _CPU
     edges = np.diff(layout.edge_start).astype(float)
     return len(pairs) >= most or any(edges[a] >= own if a == b else edges[a] * edges[b] >= product for _, a, b in pairs)
@@ -292,7 +292,7 @@ class Trees:
         stale: wp.array,
         candidates: Candidates,
     ) -> None:
-        """Add the pairs of the stale environments to ``candidates``; does not allocate or wait for the device.
+        """Add the pairs of the stale environments to ``candidates``, without allocation or wait.
 
         Args:
             boxes: lower and upper corners of the vertices' boxes [m] (B, V), then those of the bodies' (B, bodies, 3).

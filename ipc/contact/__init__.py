@@ -1,4 +1,4 @@
-"""Contact: distances, barrier, friction, continuous collision detection, and the exact test of overlap."""
+"""Contact: distances, barrier, friction, continuous collision detection, overlap."""
 
 from ipc.contact.collision import Collision
 

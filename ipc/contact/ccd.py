@@ -1,4 +1,4 @@
-"""Additive continuous collision detection: the largest share of a step that keeps every pair apart.
+"""Additive continuous collision detection: the largest step that keeps every pair apart.
 
 Li, Kaufman, Jiang 2021, "Codimensional Incremental Potential Contact", algorithm 1. After the mean displacement is taken out, no
 distance can shrink faster than l = max‖δ_A‖ + max‖δ_B‖ per unit of t, so t may always advance by d/l times a safety factor. The
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 SAFETY = wp.constant(wp.float64(0.9))
 MAX_ADVANCES = wp.constant(500)
 RESOLUTION = wp.constant(wp.float64(1.0e-13))
-"""Least distance that a step may leave, over the largest coordinate; some hundred times what rounding moves a point."""
+"""Least distance after a step over the largest coordinate; some hundred times rounding."""
 
 
 @wp.func
@@ -51,7 +51,7 @@ def additive_ccd(
     least: wp.float64,
     t_max: wp.float64,
 ) -> wp.float64:
-    """The largest t in [0, t_max] for the pair; t_max if its distance stays above ``slack`` of the one at t = 0.
+    """The largest t in [0, t_max] that keeps ``slack`` of the distance of the pair.
 
     Nor may it fall below ``floor`` [m]; a pair that is already there may hardly come closer. At t it is not below ``least`` [m]; a pair
     that is already there is no closer than it was.
@@ -144,7 +144,7 @@ def ccd_plane(
     # outputs
     alpha: wp.array(dtype=wp.float64),
 ):
-    """Lowers alpha[env] to what the half-spaces allow; they go from frame 0 to frame 1 meanwhile."""
+    """Lowers alpha[env] to what half-spaces allow, which move from frame 0 to frame 1."""
     env, i = wp.tid()
     if active[env] == 0:
         return

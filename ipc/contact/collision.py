@@ -1,4 +1,4 @@
-"""Contact of a batch of environments: candidate lists, contact forces and rows, friction, and the limits of steps.
+"""Contact of a batch: candidate lists, forces and rows, friction, and limits of steps.
 
 Nothing here waits for the device: launches cover the buffers, counts are read by the kernels, and what did not fit raises the flag
 ``overflow``. The caller then discards its work, calls ``grow`` and repeats it.
@@ -167,7 +167,7 @@ class Collision:
                 setattr(lagged, name, new)
 
     def grow(self) -> None:
-        """Make room for what did not fit, and for as much again; new lists are made at the next check."""
+        """Make room for twice what did not fit; new lists are made at the next check."""
         counts = (self.candidates.pt_count, self.candidates.ee_count, self.contacts.count, self.contacts.row_count)
         rooms = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
         most = [int(c.numpy().max()) for c in counts]
@@ -189,7 +189,7 @@ class Collision:
         self._low.assign(low)
 
     def refresh(self, x: wp.array, dx: wp.array, active: wp.array) -> None:
-        """Make the candidate lists hold for every position from x to x + dx (B, V), or set ``overflow``."""
+        """Make the candidates valid for all positions from x to x + dx (B, V), or set ``overflow``."""
         if not self._meshes:
             return
         self._stale.zero_()
@@ -256,7 +256,7 @@ class Collision:
         gradient: wp.array,
         energy: wp.array,
     ) -> None:
-        """Contacts, rows, ``gradient`` (B, V) [N] and barrier ``energy`` (B,) [J] at x; lagged friction against ``start``.
+        """Contacts, rows, ``gradient`` (B, V) [N] and ``energy`` (B,) [J] of barrier and friction.
 
         What does not fit sets ``overflow``.
         """
@@ -308,7 +308,9 @@ class Collision:
         active: wp.array,
         alpha: wp.array,
     ) -> None:
-        """Lower ``alpha`` (B,) to the share of dx at which a distance falls to ``slack`` (B,) of what it is, or to ``floor`` (B,) [m].
+        """Lower ``alpha`` (B,) to the share of dx that leaves ``slack`` of every distance.
+
+        No distance falls below ``floor`` (B,) [m] either.
 
         ``reach`` (B,) is the largest coordinate [m]: no step ends with distances that rounding could close.
         """

@@ -1,4 +1,4 @@
-"""Buffers of contacts and of the rows of their Hessian; counts may exceed what fits, which asks for larger buffers."""
+"""Buffers of contacts and of the rows of their Hessian; counts may exceed what fits."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

@@ -1,4 +1,4 @@
-"""Closest points of a point and a triangle and of two edges, in float64, as coefficients of the four vertices.
+"""Closest points of a point and a triangle and of two edges, as vertex coefficients.
 
 Every distance is that of t = Σ_i c_i x_i. Near a closest point the coefficients do not change the distance to first order (the envelope
 theorem), so ∂D/∂x_i = 2 c_i t for D = ‖t‖², whichever features are closest.
@@ -102,5 +102,5 @@ def pair_coefficients(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3:
 
 @wp.func
 def separation(c: wp.vec4d, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.vec3d:
-    """t = Σ c_i x_i [m]; the coefficients sum to zero, so differences to x0 keep the digits far from the origin."""
+    """t = Σ c_i x_i [m], from differences to x0, which keep digits far from the origin."""
     return c[1] * (x1 - x0) + c[2] * (x2 - x0) + c[3] * (x3 - x0)

@@ -102,7 +102,7 @@ def push_mollified(
     eps: wp.float64,
     pair: wp.int32,
 ):
-    """Force, contact and rows of two nearly parallel edges along u and v; ``scale`` is A κ/d̂³."""
+    """Force, contact and rows of nearly parallel edges along u and v; ``scale`` is A κ/d̂³."""
     zero, two = wp.float64(0.0), wp.float64(2.0)
     d = wp.sqrt(D)
     n = t / d
@@ -282,7 +282,7 @@ def energy_pairs(
     # outputs
     change: wp.array(dtype=wp.float64),
 ):
-    """Adds the change of the energy of edge-edge (``ee``) or point-triangle pairs from x0 to x1 [J]."""
+    """Adds the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
     env, lane = wp.tid()
     if active[env] == 0:
         return

@@ -1,4 +1,4 @@
-"""Surfaces that cross, touch or contain each other: which primitives, and how deep. Plain NumPy, on the host.
+"""Surfaces that cross, touch or contain each other, by primitives. NumPy, on the host.
 
 Edges are tested against triangles exactly: every result is the sign of a determinant of the coordinates. A sign of which float64 leaves
 no doubt is taken (after Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"). The few others
@@ -23,13 +23,13 @@ Signs = NDArray[np.int8]
 APART, TOUCHING, CROSSING = 0, 1, 2
 
 _ROUNDING = 16 * 2.0**-53
-"""More than the relative error of either determinant against the sum of the sizes of its terms."""
+"""Bound of the relative error of a determinant against the sum of its terms' sizes."""
 _UNDERFLOW = 1e-280
 """Terms below this may have lost digits to underflow."""
 
 
 def _whole(x: Floats) -> NDArray[np.object_]:
-    """Coordinates (n, k, dim) as whole numbers, each of the n sets times a power of two of its own."""
+    """Coordinates (n, k, dim) as integers, each of the n sets times a power of two."""
     mantissa, exponent = np.frexp(x)
     digits = np.ldexp(mantissa, 53).astype(np.int64)
     exponent = np.where(digits == 0, np.iinfo(exponent.dtype).max, exponent)
@@ -38,7 +38,7 @@ def _whole(x: Floats) -> NDArray[np.object_]:
 
 
 def _terms(x: NDArray) -> tuple[NDArray, ...]:
-    """Terms whose sum is the determinant of the last points (n, dim + 1, dim) less the first, each (n,)."""
+    """Terms (n,) of the determinant of the last points (n, dim + 1, dim) less the first."""
     d = [x[:, k] - x[:, 0] for k in range(1, x.shape[1])]
     if len(d) == 2:
         return d[0][:, 0] * d[1][:, 1], -(d[0][:, 1] * d[1][:, 0])
@@ -49,7 +49,7 @@ def _terms(x: NDArray) -> tuple[NDArray, ...]:
 
 
 def orientation(*points: Floats) -> Signs:
-    """Exact sign of the area of triangles a, b, c in the plane, or of the volume (b − a) × (c − a) · (d − a) in space.
+    """Exact sign of the area of triangles in the plane, or of (b − a) × (c − a) · (d − a).
 
     Args:
         points: three arrays (n, 2), or four (n, 3), of finite float64.
@@ -66,7 +66,7 @@ def orientation(*points: Floats) -> Signs:
 
 
 def meet(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDArray[np.int8]:
-    """``APART``, ``TOUCHING`` or ``CROSSING`` for the closed segments pq and triangles abc, exactly, shape (n,).
+    """``APART``, ``TOUCHING`` or ``CROSSING`` (n,) for segments pq and triangles abc, exactly.
 
     Crossing is to pass from one side of the triangle to the other through its inside; all else that meets is touching. A triangle without
     area meets nothing: its edges are those of others.
@@ -90,7 +90,7 @@ def meet(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDArray[np.in
 
 
 def _meet_in_plane(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDArray[np.bool_]:
-    """True for segments that meet triangles of the same plane: no side of either separates the two."""
+    """True for segments that meet triangles of their plane: no side separates the two."""
     meeting, done = np.zeros(len(p), bool), np.zeros(len(p), bool)
     for axes in ((0, 1), (1, 2), (2, 0)):  # a triangle with area has one in the projection on some coordinate plane
         rows = np.flatnonzero(~done)
@@ -108,7 +108,7 @@ def _meet_in_plane(p: Floats, q: Floats, a: Floats, b: Floats, c: Floats) -> NDA
 
 
 def world_vertices(layout: Layout, y: Floats, rotation: Floats, position: Floats) -> Floats:
-    """World positions [m] of all surface vertices (V, 3) of one environment: nodes y (N, 3), frames (bodies, 4) and (bodies, 3)."""
+    """World positions [m] of all vertices (V, 3) of an environment, from nodes and frames."""
     local = np.where(
         (layout.vert_count == 0)[:, None], layout.vert_local, np.einsum("vk,vki->vi", layout.vert_weight, y[layout.vert_nodes])
     )
@@ -131,7 +131,7 @@ def _box_pairs(a_low: Floats, a_high: Floats, b_low: Floats, b_high: Floats) -> 
 
 
 def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int, float | None] | None:
-    """The deepest crossing of an edge and a triangle: edge, face, and how far it ends behind the face [m], None if they only touch."""
+    """The deepest crossing: edge, face, and depth behind the face [m], None for a touch."""
     ends, corners = x[edges], x[faces]
     i, j = _box_pairs(ends.min(axis=1), ends.max(axis=1), corners.min(axis=1), corners.max(axis=1))
     apart = (edges[i][:, :, None] != faces[j][:, None, :]).all(axis=(1, 2))
@@ -152,7 +152,7 @@ def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int
 
 
 def _contains(x: Floats, faces: NDArray, point: Floats) -> bool:
-    """True if a closed surface winds around the point (van Oosterom, Strackee 1983); false for an open one seen from outside."""
+    """True if a closed surface winds around the point (van Oosterom, Strackee 1983)."""
     a, b, c = (x[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     top = (a * np.cross(b, c)).sum(axis=1)
@@ -203,7 +203,7 @@ def find_overlap(layout: Layout, x: Floats, normal: Floats, origin: Floats) -> s
 
 
 def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None:
-    """Refuse surfaces that cross in the environments of the mask; those that look alike are checked once.
+    """Refuse surfaces that cross in the environments of the mask; equal ones are checked once.
 
     Raises:
         OverlapError: names the environment and the surfaces.

@@ -1,4 +1,4 @@
-"""Tetrahedral and triangle meshes: structured pads, simple solids, surfaces and their areas."""
+"""Tetrahedral and triangle meshes: pads, simple solids, surfaces and their areas."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def tet_volumes(vertices: ArrayLike, tets: ArrayLike) -> NDArray[np.float64]:
 
 
 def graded(length: float, count: int, ratio: float = 1.0) -> NDArray[np.float64]:
-    """Coordinates [m] of ``count`` cells from 0 to ``length``, each cell ``ratio`` times as long as the one before; (count + 1,)."""
+    """Coordinates [m] (count + 1,) from 0 to ``length``; each cell is ``ratio`` times the last."""
     if count < 1 or not length > 0 or not ratio > 0:
         raise IpcError(f"graded(length={length}, count={count}, ratio={ratio}): all three must be positive")
     steps = ratio ** np.arange(count)
@@ -98,7 +98,7 @@ _KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4,
 
 
 def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, cut: Cut = "mirrored") -> TetMesh:
-    """A box of tetrahedra on the grid of the three rising coordinate lists [m]; six tetrahedra a cell.
+    """A box of six tetrahedra a cell on the grid of three rising coordinate lists [m].
 
     Vertex (i, j, k) has index (k·ny + j)·nx + i.
 
@@ -148,7 +148,7 @@ def domed_pad(
     grading: float = 1.0,
     cut: Cut = "mirrored",
 ) -> TetMesh:
-    """A pad whose outer surface z = 0 at the centre falls off as a toroidal cap; the base is flat at z = −``thickness``.
+    """A pad with a toroidal cap, z = 0 at its centre, on a flat base at z = −``thickness``.
 
     Args:
         size: extent in x and y [m].
@@ -181,7 +181,7 @@ def domed_pad(
 
 
 def surface_of(tets: ArrayLike) -> NDArray[np.int32]:
-    """Boundary triangles of a tetrahedral mesh, outward, in the mesh's own vertex numbers; shape (F, 3)."""
+    """Boundary triangles of tetrahedra, outward, in the mesh's own vertex numbers, (F, 3)."""
     t = np.asarray(tets)
     faces = t[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
@@ -204,7 +204,7 @@ class SurfaceTopology:
 
 
 def surface_topology(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> SurfaceTopology:
-    """Edges, and the areas that weigh contacts (Li et al. 2023, "Convergent Incremental Potential Contact", section 3)."""
+    """Edges, and the areas that weigh contacts (Li et al. 2023, section 3)."""
     x = vertices[faces]
     area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)

@@ -36,7 +36,7 @@ np.savez("tets.npz", vertices=np.asarray(found[0], np.float64), tets=np.asarray(
 
 
 def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = None) -> TetMesh:
-    """Fill a closed surface with tetrahedra of about ``edge_length`` [m] (fTetWild, Hu et al. 2020).
+    """Tetrahedra of about ``edge_length`` [m] in a closed surface (fTetWild, Hu et al. 2020).
 
     Args:
         surface: the closed surface.
@@ -63,7 +63,7 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
 
 
 def _fill(surface: TriMesh, edge_length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and tetrahedra, from a process of its own: fTetWild leaves a file in the working directory and may abort."""
+    """Vertices and tetrahedra, from a child process: fTetWild writes a file and may abort."""
     if importlib.util.find_spec("pytetwild") is None:
         raise IpcError('tetrahedralize needs pytetwild: pip install "raytac[ipc]", or pass tetrahedra')
     with tempfile.TemporaryDirectory() as folder:
@@ -77,7 +77,7 @@ def _fill(surface: TriMesh, edge_length: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def default_cache() -> Path | None:
-    """``raytac-ipc/tets`` in ``XDG_CACHE_HOME`` or in ``~/.cache``; None for a user without a home folder."""
+    """``raytac-ipc/tets`` in ``XDG_CACHE_HOME`` or ``~/.cache``; None without a home folder."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "raytac-ipc" / "tets"
     except RuntimeError:
@@ -93,7 +93,7 @@ def tets_name(surface: TriMesh, edge_length: float) -> str:
 
 
 def read_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMesh | None:
-    """The mesh stored at ``path``; None if there is none, or, with a warning, if it is damaged or of another surface or length."""
+    """The mesh stored at ``path``; None without one, and with a warning for a wrong one."""
     if path is None:
         return None
     try:
@@ -113,7 +113,7 @@ def read_tets(path: Path | None, surface: TriMesh, edge_length: float) -> TetMes
 
 
 def write_tets(path: Path | None, mesh: TetMesh, surface: TriMesh, edge_length: float) -> None:
-    """Write a mesh beside ``path``, synchronise it with the disk, and rename it; a warning where that cannot be."""
+    """Write a mesh to ``path`` by way of a partial file; warns where that fails."""
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, vertices=mesh.vertices, tets=mesh.tets, **_request(surface, edge_length))
     data = stream.getvalue()

@@ -1,1 +1,1 @@
-"""The time step: incremental potential, Newton's method, conjugate gradients, and forces of a solved step."""
+"""The time step: incremental potential, Newton's method, conjugate gradients, forces."""

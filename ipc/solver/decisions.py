@@ -1,4 +1,4 @@
-"""Decisions of a step, taken on the device, one thread an environment: what each environment of a batch does next.
+"""Decisions of a step, taken on the device, one thread an environment.
 
 Flags of one element say whether any environment needs a branch; they are the conditions of the graph's ``if`` and ``while`` nodes. While
 ``halt`` is set (a buffer was too small) nothing is decided and no state changes, so that the iteration can be repeated.
@@ -96,7 +96,7 @@ def choose_lagging(d: Decisions, f: Flags):
 
 @wp.kernel
 def after_lag(tolerance: wp.float64, d: Decisions, f: Flags):
-    """Minimise (again) where friction was lagged for the first time or changed by more than the tolerance."""
+    """Minimises (again) where friction is new or changed by more than the tolerance."""
     env = wp.tid()
     if d.lagging[env] == 0:
         return
@@ -113,7 +113,7 @@ def after_lag(tolerance: wp.float64, d: Decisions, f: Flags):
 
 @wp.kernel
 def choose_advancing(d: Decisions, f: Flags):
-    """Frames that have not arrived advance, unless the last advance was poor and the unknowns have not rested since."""
+    """Advances frames that have not arrived, but for poor ones until the unknowns rest."""
     env = wp.tid()
     d.pcg_iterations[env] = 0
     go = 0
@@ -135,7 +135,7 @@ def after_solve(
     d: Decisions,
     f: Flags,
 ):
-    """Counts iterations; environments that met negative curvature shall have a definite matrix."""
+    """Counts iterations and asks for a definite matrix after negative curvature."""
     env = wp.tid()
     again = 0
     if mask[env] != 0 and f.halt[0] == 0:
@@ -149,7 +149,7 @@ def after_solve(
 
 @wp.kernel
 def judge_direction(dt: wp.float64, d: Decisions, f: Flags):
-    """Drops environments that are not finite; the others advance their frames or take a plain step."""
+    """Drops environments that are not finite; others advance frames or take a plain step."""
     env = wp.tid()
     d.plain[env] = 0
     if f.halt[0] != 0:
@@ -202,7 +202,7 @@ def try_advance(slack: wp.float64, floor: wp.float64, d: Decisions, f: Flags):
 
 @wp.kernel
 def judge_advance(most: wp.int32, d: Decisions, f: Flags):
-    """Shortens the advance where a gap would close or an element invert; energies at different frames are not comparable."""
+    """Shortens the advance where a gap would close or an element invert."""
     env = wp.tid()
     if d.shorten[env] == 0:
         return
@@ -228,7 +228,7 @@ def judge_advance(most: wp.int32, d: Decisions, f: Flags):
 
 @wp.kernel
 def conclude_advance(blocked: wp.float64, poor: wp.float64, d: Decisions, f: Flags):
-    """Accepts the advance; frames that hardly advance although the unknowns had rested are blocked."""
+    """Accepts the advance; frames that hardly move after the unknowns rested are blocked."""
     env = wp.tid()
     d.accepted[env] = 0
     if f.halt[0] != 0 or d.advancing[env] == 0:
@@ -256,7 +256,7 @@ def start_limit(slack: wp.float64, d: Decisions, f: Flags):
 
 @wp.kernel
 def start_search(reach: wp.array(dtype=wp.float64), d: Decisions, f: Flags):
-    """Starts the line search. Rounding of positions moves the energy by force × size × 1e-16; a step may raise it by that much."""
+    """Starts the line search, which allows for rounding of positions by force × size × 1e-15."""
     env = wp.tid()
     d.trials[env] = 0
     d.searching[env] = 0
@@ -276,7 +276,7 @@ def clear_det(d: Decisions, f: Flags):
 
 @wp.kernel
 def judge_energy(armijo: wp.float64, most: wp.int32, d: Decisions, f: Flags):
-    """Ends the search of an environment whose energy fell enough (Armijo), else halves its step."""
+    """Ends the search where the energy fell enough (Armijo), else halves the step."""
     env = wp.tid()
     if d.searching[env] == 0:
         return

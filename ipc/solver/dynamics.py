@@ -38,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Masses:
-    """Entries of the mass matrix in the block pattern: ``mass`` [kg], ``inertia`` with the drives on top [kg], ``drag`` [kg/s²]."""
+    """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s²]."""
 
     row_start: wp.array(dtype=wp.int32)
     col: wp.array(dtype=wp.int32)
@@ -97,8 +97,9 @@ def node_gradient(
     residual: wp.array2d(dtype=wp.vec3d),
     force_size: wp.array2d(dtype=wp.float64),
 ):
-    """Adds inertia, drag and contact to the elastic gradient; the residual is its negative on the unknowns, zero on bonded nodes.
+    """Adds inertia, drag and contact to the elastic gradient.
 
+    The residual is its negative on the unknowns, zero on bonded nodes.
     ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
     """
     env, i = wp.tid()
@@ -135,7 +136,7 @@ def inertia_change(
     # outputs
     change: wp.array2d(dtype=wp.float64),
 ):
-    """Change of the inertial and drag energy from y0 to y1 [J], (y1 − y0)·M((y1 + y0)/2 − ỹ)/h² node by node."""
+    """Change of the inertial and drag energy [J], (y1 − y0)·M((y1 + y0)/2 − ỹ)/h² by node."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -202,7 +203,7 @@ def aim_bodies(
     # outputs
     target: wp.array2d(dtype=wp.vec3d),
 ):
-    """x̃ ← (x̃ + s x_aim)/(1 + s): inertia towards x̃ and a drive of strength s towards x_aim are one quadratic of 1 + s times the mass."""
+    """x̃ ← (x̃ + s x_aim)/(1 + s), the target of inertia and a drive of strength s together."""
     env, i = wp.tid()
     frame = node_aim[i]
     if frame >= 0:

@@ -1,4 +1,4 @@
-"""Stored energies of a tetrahedron, their first and second derivatives, and the kernels that gather them into nodes and blocks.
+"""Stored energies of a tetrahedron and their derivatives, gathered into nodes and blocks.
 
 With F = Σ_a x_a ∇w_aᵀ and J = det F:
 
@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Elements:
-    """Tetrahedra: nodes, ∇w of each corner [1/m], volume [m³], energy code and its coefficients [Pa]."""
+    """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa]."""
 
     tets: wp.array2d(dtype=wp.int32)
     grads: wp.array2d(dtype=wp.vec3d)
@@ -122,7 +122,7 @@ def first_piola(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, la
 
 @wp.func
 def stretch_block_definite(s: wp.vec3d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.bool:
-    """True if the 3×3 block of the stretch modes is positive semi-definite (all leading minors are non-negative)."""
+    """True if the block of the stretch modes is semi-definite (leading minors ≥ 0)."""
     p = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
     a00 = m + k * s[0] * s[0] + lam * p[0] * p[0]
     a11 = m + k * s[1] * s[1] + lam * p[1] * p[1]
@@ -137,7 +137,7 @@ def stretch_block_definite(s: wp.vec3d, m: wp.float64, k: wp.float64, lam: wp.fl
 
 @wp.func
 def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.float64:
-    """The c' between 0 and c closest to c for which the element's second derivative is positive semi-definite."""
+    """The c' between 0 and c, closest to c, with a semi-definite second derivative."""
     _U, s, _V = wp.svd3(F)
     top = wp.max(wp.max(wp.abs(s[0]), wp.abs(s[1])), wp.abs(s[2]))
     limit = m / wp.max(top, wp.float64(1.0e-30))  # twist and flip modes: m ± c s_i ≥ 0
@@ -156,7 +156,7 @@ def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64
 
 @wp.func
 def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that near rest it is not the small difference of large numbers."""
+    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that it keeps its digits near rest."""
     one, half = wp.float64(1.0), wp.float64(0.5)
     G = F1 - F0
     if model == 2:
@@ -299,7 +299,7 @@ def element_energy_change(
     change: wp.array2d(dtype=wp.float64),
     det: wp.array2d(dtype=wp.float64),
 ):
-    """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; a sum of differences keeps digits that a difference of sums loses."""
+    """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; sums of differences keep digits."""
     env, e = wp.tid()
     if active[env] == 0:
         return

@@ -1,4 +1,4 @@
-"""Forces and motions after a solved step, summed by body and by pair of bodies; world frame, on the host."""
+"""Forces and motions after a step, by body and by pair; world frame, on the host."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def host(array: wp.array) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class _Forces:
-    """C forces between two primitives, those of all environments in one list: coef · force acts on a vertex."""
+    """C forces between primitives, of all environments; coef · force acts on a vertex."""
 
     env: Ints
     pair: Ints
@@ -38,7 +38,7 @@ class _Forces:
     """[N] (C, 3)."""
 
     def side(self, layout: Layout) -> Floats:
-        """+1 where the first vertex is of the pair's first body, else −1, (C,): the force on that body is side · force."""
+        """+1 or −1 (C,): the force on the pair's first body is side · force."""
         return np.where(layout.vert_body[self.verts[:, 0]] == layout.pairs[self.pair, 0], 1.0, -1.0)
 
     def points(self, layout: Layout, x: Floats) -> Floats:
@@ -59,7 +59,7 @@ def _normal_forces(potential: Potential) -> _Forces:
 
 
 def _friction_forces(potential: Potential) -> _Forces:
-    """Friction forces of the lagged contacts: −μ λ f1(|u|) u / |u|, with u their sliding in the step (see ``ipc/contact/friction.py``)."""
+    """Friction forces −μ λ f1(|u|) u / |u| of the lagged contacts, u their sliding in the step."""
     lagged = potential.collision.lagged
     pair = host(lagged.pair)
     at = np.nonzero(np.arange(pair.shape[1]) < host(lagged.count)[:, None])
@@ -77,7 +77,7 @@ def _all_forces(potential: Potential) -> list[_Forces]:
 
 
 def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wrench:
-    """Force and torque of a body's bonded ``nodes`` on the frame that carries them, about its origin."""
+    """Force and torque of a body's bonded ``nodes`` on their frame, about its origin."""
     R, t = host(potential.R)[:, body], host(potential.t)
     forces = -np.einsum("bij,bnj->bni", R, host(potential.gradient)[:, nodes])
     points = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None, body]
@@ -85,7 +85,7 @@ def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wre
 
 
 def contact_wrench(layout: Layout, potential: Potential, body: int) -> Wrench:
-    """Contact and friction forces on a body, about the origin of its frame, or of the world for a body without one.
+    """Contact and friction forces on a body, about its frame's origin or the world's.
 
     Those on a half-space are the reactions on the vertices that touch it.
     """
@@ -162,7 +162,7 @@ def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion
 
 
 def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:
-    """Bodies closer than d̂ to a body at the end of the last step, (B,) by name; those that never were are left out."""
+    """Masks (B,) of other bodies that were closer than d̂ at the end of the last step, by name."""
     contacts = potential.collision.contacts
     pair = host(contacts.pair)
     near = np.zeros((len(pair), len(layout.pairs)), bool)

@@ -1,4 +1,7 @@
-"""Driven frames, and the maps between nodes (unknowns, in their body's frame) and vertices (surface points, in the world)."""
+"""Driven frames, and the maps between nodes and vertices.
+
+Nodes are unknowns, in the frame of their body; vertices are surface points, in the world.
+"""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -24,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class VertexMap:
-    """Nodes that the vertices follow, and the vertices that follow a node; names as in :class:`ipc.bodies.layout.Layout`."""
+    """Nodes that vertices follow, and the inverse; see :class:`ipc.bodies.layout.Layout`."""
 
     body: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -48,7 +51,7 @@ def frames_at(
     t: wp.array2d(dtype=wp.vec3d),
     now_q: wp.array2d(dtype=wp.quatd),
 ):
-    """Frames at a share of the motion from start to end: positions along a line, rotations along the shorter arc."""
+    """Frames at a share of the motion: positions on a line, rotations on the shorter arc."""
     env, b = wp.tid()
     s = progress[env]
     q0 = start_q[env, b]
@@ -151,7 +154,7 @@ def place_grips(
     # outputs
     y: wp.array2d(dtype=wp.vec3d),
 ):
-    """Positions y of gripped nodes, which move with the frame of their grip, in the frame of their body."""
+    """Positions y of gripped nodes, moved by their grip, in the frame of their body."""
     env, g = wp.tid()
     node, frame = grip_node[g], grip_frame[g]
     body = node_body[node]

@@ -1,4 +1,4 @@
-"""The Newton matrix: H = blocks + Σ q qᵀ, a block matrix of one pattern for every environment, and the contact rows.
+"""The Newton matrix H = blocks + Σ q qᵀ: a block matrix of one pattern, and contact rows.
 
 Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
 dimensions, counts are read on the device.
@@ -93,7 +93,7 @@ def multiply_blocks(
     out: wp.array2d(dtype=wp.vec3d),
     partial: wp.array2d(dtype=wp.float64),
 ):
-    """out = blocks p on the unknowns, zero elsewhere, and the shares of p·out; blocks of threads (B, chunks, ``threads``)."""
+    """out = blocks p on the unknowns, else 0, and shares of p·out; threads (B, chunks, n)."""
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
     if active[env] != 0:
@@ -212,7 +212,7 @@ def push_blocks(
     # outputs
     residual: wp.array2d(dtype=wp.vec3d),
 ):
-    """residual −= blocks · lift on the unknowns: gripped nodes, whose motion is prescribed, take their neighbours along."""
+    """residual −= blocks · lift on the unknowns, for the prescribed motion of gripped nodes."""
     env, i = wp.tid()
     if active[env] != 0 and system.free[i] != 0:
         residual[env, i] = residual[env, i] - block_row(system, env, i, lift)
@@ -251,7 +251,7 @@ def diagonal_rows(
 
 @wp.kernel
 def invert_blocks(free: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), blocks: wp.array2d(dtype=wp.mat33d)):
-    """Inverts in place; a block that is not positive (an unprojected Hessian may hold one) becomes the inverse of its mean diagonal."""
+    """Inverts in place; one that is not positive becomes the inverse of its mean diagonal."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -294,7 +294,7 @@ class Preconditioner(Protocol):
 
 
 class BlockJacobi:
-    """Inverses of the 3×3 diagonal blocks, contact rows included; ``lanes`` threads share the rows of an environment."""
+    """Inverses of the 3×3 diagonal blocks with contact rows, shared by ``lanes`` threads."""
 
     def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
         self.lanes = lanes

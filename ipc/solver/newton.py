@@ -1,4 +1,4 @@
-"""One time step: driven bodies advance as far as they can, and projected Newton minimises the incremental potential.
+"""One time step: driven bodies advance, and Newton minimises the incremental potential.
 
 A Newton iteration has four parts:
 (i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
@@ -77,7 +77,7 @@ class Newton:
         self.timers[name] = self.timers.get(name, 0.0) + time.perf_counter() - start
 
     def _run(self, body: Callable[[], None]) -> None:
-        """Run ``body``: from a recording on CUDA, made at the first call and after a buffer has grown."""
+        """Run ``body``, on CUDA from a recording made at the first call and after buffers grow."""
         if not (self.device.is_cuda and self.settings.cuda_graph):
             body()
             return
@@ -96,7 +96,7 @@ class Newton:
     # --- the step --------------------------------------------------------------------------------------------------------------
 
     def step(self, alive: NDArray[np.bool_]) -> dict[str, NDArray]:
-        """Advance the environments of ``alive`` (B,) by one time step; returns the decisions, by name, each (B,)."""
+        """Advance the environments of ``alive`` (B,) by a step; returns decisions (B,) by name."""
         since = time.perf_counter()
         self.state.write_alive(alive)
         self._run(self._whole)
@@ -281,7 +281,7 @@ class Newton:
             self._note_extremes(state.decisions.good)
 
     def _end(self) -> None:
-        """Velocities, and frames where the next step begins; environments that failed go back to where they were."""
+        """Velocities and frames for the next step; failed environments return to their start."""
         pot, state = self.potential, self.state
         d = state.decisions
         with self._stage("end"):

@@ -1,4 +1,4 @@
-"""A patch on the surface of a bonded body that moves as a whole: the stiffness of its support, and its mass.
+"""A surface patch of a bonded body that moves as a whole: its support and its mass.
 
 The linear body at rest: with C the compliance between the patch's nodes and R their rigid motions about the patch's centre (6 columns),
 K = Rᵀ C⁻¹ R. The rest of the body follows by the deflection that K belongs to, u = C_:P C⁻¹ R, and moves with the mass uᵀ M u (R. J. Guyan,
@@ -60,7 +60,7 @@ class RestPatches:
         self._mass = np.bincount(rows, weights=layout.mass, minlength=len(layout.node_rest))
 
     def loaded(self, potential: Potential, env: int) -> PatchMotion | None:
-        """Motion of the free nodes under contact forces of the last step; None where there are none."""
+        """Motion of the free nodes under contact forces of the last step; None without any."""
         layout = self._layout
         first, last = layout.vert_start[self._body : self._body + 2]
         forces = potential.vert_gradient.numpy()[env, first:last]
@@ -69,7 +69,7 @@ class RestPatches:
         return self.motion(potential, env, nodes, float(np.linalg.norm(forces.sum(axis=0)))) if len(nodes) else None
 
     def motion(self, potential: Potential, env: int, patch: NDArray[np.integer], force: float = 0.0) -> PatchMotion:
-        """Motion of the nodes ``patch`` (n,), numbers of the layout, in one environment; bonded ones are ignored.
+        """Motion of the nodes ``patch`` (n,) of the layout in one environment, without bonded ones.
 
         ``force``: size of the force on the patch [N].
 
@@ -120,7 +120,7 @@ class RestPatches:
 
 
 def _rigid(arm: Floats) -> Floats:
-    """Rigid motions of points (n, 3): three translations and three rotations about the origin; (3 n, 6)."""
+    """Rigid motions of points (n, 3): three translations, three rotations; (3 n, 6)."""
     x, y, z = arm.T
     motions = np.zeros((len(arm), 3, 6))
     motions[:, :, :3] = np.eye(3)
@@ -131,7 +131,7 @@ def _rigid(arm: Floats) -> Floats:
 
 
 def _rotation(before: Floats, after: Floats) -> Floats:
-    """The rotation that best maps points (n, 3) to others; the identity where they lie on a line or in a point."""
+    """The rotation that best maps points (n, 3) to others; the identity for points on a line."""
     u, size, v = np.linalg.svd(after.T @ before)
     if size[1] <= 1e-6 * max(size[0], 1e-300):
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients of one environment by one block of threads, all iterations in one launch.
+"""Conjugate gradients of an environment by one block of threads, in one launch.
 
 A launch costs more than an iteration of a small system; a block can wait for its own threads at no such cost. One block has one
 multiprocessor's bandwidth, so a single large system is better served by the launches of :mod:`ipc.solver.pcg`. On a CPU a block is one
@@ -26,7 +26,7 @@ THREADS = 256
 
 @wp.struct
 class Scalars:
-    """Per environment: r·z (of even and odd iterations), ‖r‖² at the start, iterations, and the negative-curvature flag."""
+    """r·z of even and odd iterations, ‖r‖² at the start, iterations, negative curvature."""
 
     rz: wp.array2d(dtype=wp.float64)
     rr0: wp.array(dtype=wp.float64)
@@ -65,7 +65,7 @@ def solve_in_one_block(
     x: wp.array2d(dtype=wp.vec3d),
     s: Scalars,
 ):
-    """``threads`` of a block work on one environment, and ``lanes`` of them on its contact rows; on a CPU both are 1."""
+    """``threads`` work on an environment, ``lanes`` of them on its contact rows; CPU: 1."""
     env, lane = wp.tid()
     if active[env] == 0:
         return

@@ -1,4 +1,4 @@
-"""The incremental potential of a batch of environments: its state, its value, its gradient and its Hessian.
+"""The incremental potential of a batch: its state, its value, its gradient and its Hessian.
 
     E(x) = ½ ‖x − x̃‖²_M / h² + elastic energy + contact barrier + lagged friction      (Li et al. 2020, equation 3, divided by h²)
 
@@ -154,7 +154,7 @@ class Potential:
     # --- places ----------------------------------------------------------------------------------------------------------------
 
     def set_frames(self, progress: wp.array, R: wp.array, t: wp.array) -> None:
-        """Frames at a share ``progress`` (B,) of the motion from the start of the step to their goals."""
+        """Frames at a share ``progress`` (B,) of their motion in this step."""
         inputs = [self.frame_q, self.frame_p, self.goal_q, self.goal_p, progress]
         self.launch(frames.frames_at, self.frame_q.shape, inputs, [R, t, self.now_q])
 
@@ -183,7 +183,7 @@ class Potential:
             self.launch(dynamics.aim_bodies, self.xw.shape, [self.goal_q, self.goal_p, *self.drive], [self.target])
 
     def prescribe(self, progress: wp.array) -> None:
-        """Prescribed motion up to ``progress`` (B,): ``dx`` of its vertices, ``lift`` of gripped nodes, and inertia there."""
+        """Prescribed motion to ``progress`` (B,): ``dx``, ``lift`` of gripped nodes, inertia."""
         self.set_frames(progress, self.R1, self.t1)
         if self.grips:
             wp.copy(self.y1, self.y)
@@ -194,7 +194,7 @@ class Potential:
         self.aim_inertia(self.R1, self.t1)
 
     def push_prescribed(self, mask: wp.array) -> None:
-        """Residual −= H times the prescribed motion, with the matrix filled: driven bodies push the unknowns ahead of them."""
+        """Residual −= H times the prescribed motion, which pushes the unknowns ahead."""
         contacts = self.collision.contacts
         lanes = self.collision.lanes
         self.launch(push_rows, (self.batch, lanes), [self.system, contacts, self.dx, mask, lanes], [self.residual])
@@ -216,7 +216,7 @@ class Potential:
         )
 
     def assemble(self, active: wp.array) -> None:
-        """Forces, contacts and energies at y; ``gradient`` holds bonded nodes too, ``residual`` is minus it on the unknowns."""
+        """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns."""
         self.evaluate_elements(active)
         inputs = [self.corner_start, self.corner, self.elements, self.el_P, active]
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
@@ -228,7 +228,7 @@ class Potential:
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
     def fill_matrix(self, active: wp.array) -> None:
-        """The block matrix of inertia and elasticity, from the results of :meth:`evaluate_elements`."""
+        """The blocks of inertia and elasticity, from results of :meth:`evaluate_elements`."""
         inputs = [
             *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
             *(self.el_F, self.el_mck, active),
@@ -241,7 +241,7 @@ class Potential:
         self.place_vertices(self.y1, self.R, self.t, self.x1)
 
     def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
-        """Change of the elements' energy from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
+        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
         inputs = [self.y, self.y1, self.elements, active]
         self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, [self.el_change, self.el_J1])
         self.reduce(self.el_J1, active, MIN, min_det)
@@ -259,7 +259,7 @@ class Potential:
         )
 
     def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:
-        """``slope`` (B,) ← g·p [J]; ``noise`` (B,) ← Σ ‖force‖ [N], which scales the rounding of energies."""
+        """``slope`` (B,) ← g·p [J]; ``noise`` (B,) ← Σ ‖force‖ [N], for rounding of energies."""
         slope.zero_()
         noise.zero_()
         self.launch(dynamics.slope_of, self.p.shape, [self.p, self.gradient], [self.node_change])

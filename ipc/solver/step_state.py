@@ -82,7 +82,7 @@ class Flags:
 
 
 class StepState:
-    """The decisions of a batch and the flags made from them; each type lies in one array, so that a step is read in one copy.
+    """The decisions and flags of a batch; each type lies in one array, read in one copy.
 
     Args:
         batch: environments, B.
@@ -113,7 +113,7 @@ class StepState:
         self._flags.zero_()
 
     def launch(self, kernel: Any, *inputs: object) -> None:
-        """Launch a kernel of :mod:`ipc.solver.decisions`, one thread an environment; decisions and flags come last."""
+        """Launch a kernel of :mod:`ipc.solver.decisions`; decisions and flags come last."""
         wp.launch(kernel, dim=self.batch, inputs=[*inputs, self.decisions, self.flags], device=self.device)
 
     def read(self) -> dict[str, NDArray]:

@@ -16,14 +16,14 @@ from ipc.solver.preconditioners.substructure import MAX_ENTRIES, choose_partitio
 __all__ = ["RestInverse", "make_preconditioner", "pays"]
 
 _TIGHT = 1e-4
-"""Linear tolerance from which on the iterations of block-Jacobi count for more than the cost of one."""
+"""Linear tolerance up to which the number of iterations decides."""
 _FEW_NODES, _MANY_NODES, _FEW_ENVIRONMENTS = 700, 3000, 16
 _NEARLY_INCOMPRESSIBLE = 1 / (1 - 2 * 0.47)
 """λ/μ of the energy at ν = 0.47."""
 
 
 def pays(layout: Layout, settings: Settings, batch: int, device: wp.Device) -> bool:
-    """Expect the rest inverse to make a step faster than block-Jacobi (``docs/ipc-preconditioners.md`` has the figures).
+    """Expect the rest inverse to be faster than block-Jacobi (``docs/ipc-preconditioners.md``).
 
     On CUDA with a tight linear tolerance it does for pads of 700 free nodes or more, and for smaller ones in few environments. With a loose
     one it does for 700 to 3,000 free nodes, and for more from ν = 0.47 on, if no other body is free. On a CPU applying a dense inverse
@@ -42,7 +42,7 @@ def pays(layout: Layout, settings: Settings, batch: int, device: wp.Device) -> b
 
 
 def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: int, device: wp.Device) -> Preconditioner:
-    """Make the preconditioner that ``settings`` name; ``"auto"`` takes the rest inverse where it pays and can be had.
+    """Make the preconditioner of ``settings``; ``"auto"`` takes the rest inverse where it pays.
 
     Its products of matrices add up in another order for another number of environments, so a deterministic world does without.
 

@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 REGULAR = 1e-6
 """Stiffness added to every contact node, as a share of its elastic one."""
 LANES = 256
-"""Threads that share the small system of an environment on CUDA; the size of all blocks, so that a module is compiled once."""
+"""Threads on CUDA for the small system of an environment; the size of all blocks."""
 
 
 @wp.func_native("""
@@ -43,7 +43,7 @@ def wait_for_lanes():
 
 @wp.struct
 class Rest:
-    """K_0⁻¹ between the interface nodes of every bonded body, the s nodes of its surface among them.
+    """K_0⁻¹ between the interface nodes of every bonded body, s of them on its surface.
 
     ``inverse`` holds the matrices one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix of width[p]
     that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix, ``surface`` (N,) its number among
@@ -106,7 +106,7 @@ def forget_contacts(active: wp.array(dtype=wp.int32), small: Small):
 
 @wp.func
 def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
-    """Surface number of the node that vertex v follows, or −1: other bodies' vertices follow four nodes or none."""
+    """Surface number of the only node that vertex v follows, or −1."""
     if v < 0:
         return -1
     if system.verts.count[v] != 1:
@@ -132,7 +132,7 @@ def mark_contacts(
 
 @wp.kernel
 def place_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
-    """The places of the contact nodes, in the order of their numbers, so that they do not depend on scheduling."""
+    """Numbers the contact nodes in the order of the surface."""
     env, s = wp.tid()
     if active[env] == 0 or small.touched[env, s] == 0:
         return
@@ -173,7 +173,7 @@ def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.arra
 
 @wp.func
 def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
-    """The inverse of the blocks ``a``, in place (Gauss-Jordan; no pivots are needed where a matrix is positive definite).
+    """Inverts the positive definite blocks ``a`` in place (Gauss-Jordan, without pivoting).
 
     All lanes of the environment work on it and get the same result: False where a pivot is not positive.
     """
@@ -275,7 +275,7 @@ def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.arra
 
 
 class LowRank:
-    """Finds the contact nodes, factors their small systems, and applies W; all arrays keep their addresses.
+    """Contact nodes, their factored small systems W, and products with these.
 
     Args:
         rest: K_0⁻¹ on the surfaces.
@@ -317,5 +317,5 @@ class LowRank:
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, running: wp.array) -> None:
-        """``small.force`` = W J y for the running environments; y (parts, B, n) is given as parts to be summed."""
+        """``small.force`` = W J y for the running environments; y is the sum of (parts, B, n)."""
         self._launch(contact_forces, (self.batch, self.lanes), [self.rest, y, running, self.lanes, self.small], self.lanes)

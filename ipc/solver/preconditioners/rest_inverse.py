@@ -1,4 +1,4 @@
-"""A preconditioner made for bonded pads: the inverse of the rest matrix, corrected for the contacts of the moment.
+"""A preconditioner for bonded pads: the inverse of the rest matrix, corrected for contacts.
 
 A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
 (``substructure.py``), in single precision, and the contacts are added as a low-rank part (``low_rank.py``): M is exact as long as
@@ -29,11 +29,11 @@ __all__ = ["RestInverse"]
 wp.set_module_options({"enable_backward": False})
 
 TILE_ENVS, TILE_OUT, TILE_IN = 32, 64, 32
-"""Tile of the product of matrices: environments × outputs, summed over this many inputs at a time."""
+"""Tile of the product of matrices: environments × outputs, inputs summed at a time."""
 TILED_FROM = 8
-"""Number of environments from which tiles are used; fewer are as many products of matrix and vector."""
+"""Number of environments from which tiles are used instead of products with vectors."""
 THREADS = 200_000
-"""About how many threads a product of matrices and vectors is split into; a GPU needs many to read memory at its full rate."""
+"""Threads of a product with vectors; a GPU needs many to read memory at its full rate."""
 MAX_CONTACTS = 48
 """Contact nodes that an environment may have; factoring costs their number cubed."""
 
@@ -49,7 +49,7 @@ def multiply_vectors(
     # outputs
     y: wp.array3d(dtype=wp.float32),
 ):
-    """y[c] = what ``length`` inputs contribute to matrixᵀ x, patch by patch; neighbouring threads read neighbouring entries."""
+    """y[c] = the share of ``length`` inputs in matrixᵀ x, patch by patch."""
     c, env, e = wp.tid()
     if running[env] == 0:
         return
@@ -73,7 +73,7 @@ def multiply_tiles(
     # outputs
     y: wp.array2d(dtype=wp.float32),
 ):
-    """y = x · matrix in tiles, patch by patch; tiles without a running environment are skipped."""
+    """y = x · matrix in tiles, patch by patch, without those that have nothing running."""
     patch, i, j = wp.tid()
     some = wp.int32(0)
     for env in range(i * TILE_ENVS, wp.min((i + 1) * TILE_ENVS, running.shape[0])):
@@ -91,7 +91,7 @@ def multiply_tiles(
 
 
 class Product:
-    """A shared matrix for each patch times a vector for each environment: y = Σ_c y[c] = matrixᵀ x.
+    """A matrix for each patch times a vector for each environment: y = Σ_c y[c] = matrixᵀ x.
 
     Args:
         matrix: shape (patches, inputs, outputs), both a multiple of the tile.
@@ -250,7 +250,7 @@ def padded(n: int) -> int:
 
 
 class RestInverse:
-    """K_0⁻¹ of the bonded bodies with the contacts of the moment; block-Jacobi elsewhere (a ``Preconditioner``).
+    """K_0⁻¹ of the bonded bodies with their contacts, and block-Jacobi elsewhere.
 
     Args:
         layout: with a bonded body at least.
@@ -309,7 +309,7 @@ class RestInverse:
         self.jacobi = BlockJacobi(batch, count, lanes, device)
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
-        """Inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product, with the padding that tiles want."""
+        """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""
         parts, rows = 1, self.batch
         if tiled(self.batch, self.device):
             rows = -(-rows // TILE_ENVS) * TILE_ENVS

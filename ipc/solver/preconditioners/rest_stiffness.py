@@ -1,4 +1,4 @@
-"""The matrix of the Newton system at rest, without contact, on the host: what a bonded body has in every environment and every step.
+"""The matrix of the Newton system at rest, without contact, on the host.
 
 At F = 1 the second derivative of the energies in ``ipc/solver/elasticity.py`` couples the corners a and b of a tetrahedron by
 
@@ -22,7 +22,7 @@ Ints = NDArray[np.integer]
 
 
 def bonded_bodies(layout: Layout) -> list[int]:
-    """Soft bodies with bonded vertices: in their frame the rest state stays what it is, wherever the frame goes."""
+    """Soft bodies with bonded vertices, whose rest state is fixed in their moving frame."""
     return [b for b in range(len(layout.names)) if layout.framed[b] and layout.node_start[b] < layout.node_start[b + 1]]
 
 
@@ -33,7 +33,7 @@ def free_nodes(layout: Layout, body: int) -> Ints:
 
 
 def rest_blocks(layout: Layout, settings: Settings) -> Floats:
-    """Blocks of K_0 [N/m] in the pattern of the layout, shape (K, 3, 3); those of affine bodies mean nothing."""
+    """Blocks of K_0 [N/m] in the layout's pattern (K, 3, 3), except for affine bodies."""
     log = (layout.model == 1)[:, None, None]
     mu, lam = layout.mu[:, None, None], layout.lam[:, None, None]
     m, k = np.where(log, 0.75 * mu, mu), np.where(log, mu / 8, 0.0)

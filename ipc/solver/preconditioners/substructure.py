@@ -1,4 +1,4 @@
-"""Static condensation: the inverse of a sparse matrix as few dense ones, for meshes whose whole inverse would be too large.
+"""Static condensation: the inverse of a large sparse matrix as a few dense ones.
 
 The unknowns of a body are those of P patches of its inside, I_1 … I_P, that do not see each other, and of an interface Γ that holds
 every node of its surface (contacts act there) and the nodes between patches. With E_p = K_pp⁻¹ K_pΓ and the Schur complement
@@ -25,14 +25,14 @@ __all__ = ["MAX_ENTRIES", "Patch", "Substructure", "choose_partition", "condense
 Singles = NDArray[np.float32]
 
 MAX_ENTRIES = 60_000_000
-"""Numbers of four bytes up to which the rest inverse of a body is built; the host needs a minute for that many, and more for more."""
+"""Most entries of four bytes of a body's rest inverse; the host needs a minute for them."""
 MAX_PATCHES = 64
 """More than that many patches leave little inside them."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """One patch: its nodes (n,), the interface nodes it touches (g,), K_pp⁻¹ (3n, 3n) [m/N] and E_p (3n, 3g) [-]."""
+    """Nodes (n,), interface nodes beside them (g,), K_pp⁻¹ (3n, 3n) [m/N], E_p (3n, 3g) [-]."""
 
     nodes: Ints
     border: Ints
@@ -50,14 +50,14 @@ class Substructure:
 
 
 def _neighbours(layout: Layout, label: Ints) -> tuple[Ints, Ints]:
-    """Pairs of nodes that a block of the matrix couples, both with a label that is not negative."""
+    """Pairs of nodes that a block of the matrix couples, both with a non-negative label."""
     rows, cols = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start)), layout.col
     keep = (label[rows] >= 0) & (label[cols] >= 0)
     return rows[keep], cols[keep]
 
 
 def partition(layout: Layout, nodes: Ints, parts: int) -> Ints:
-    """Patch of every node of the layout, −1 where there is none: ``nodes`` cut in halves until there are ``parts`` (a power of two).
+    """Patch of each node, −1 for none: ``nodes`` are halved into ``parts``, a power of two.
 
     Each cut is across the longest side, just after the median coordinate, and the nodes just before it become interface. A patch that
     is only a few nodes long may lose all of them.
@@ -128,7 +128,7 @@ def condense(layout: Layout, blocks: Floats, nodes: Ints, label: Ints) -> Substr
 
 
 def entries(layout: Layout, nodes: Ints, label: Ints) -> int:
-    """Numbers that the inverse in this form holds, patches padded to the largest: what an application reads and multiplies."""
+    """Entries of the inverse in this form, patches padded to the largest."""
     interface = 3 * int((label[nodes] < 0).sum())
     inner = 3 * np.bincount(label[label >= 0], minlength=1)
     rows, cols = np.repeat(label, np.diff(layout.row_start)), layout.col
@@ -141,7 +141,7 @@ def entries(layout: Layout, nodes: Ints, label: Ints) -> int:
 
 
 def choose_partition(layout: Layout, body: int, patches: int | None = None) -> tuple[Ints, Ints]:
-    """The free nodes of a body, and the patch of every node of the layout (−1 for the interface).
+    """The free nodes of a body, and the patch of every node (−1 for the interface).
 
     Args:
         patches: a power of two, 0 for none, None for the number with the fewest entries; none if that saves less than half.
