@@ -87,6 +87,14 @@ class World:
             raise IpcError(f"no body is named {name!r}: choose from {', '.join(self.layout.names)}")
         return self.layout.names.index(name)
 
+    def _nodes(self, name: str) -> slice:
+        """Nodes of a soft or affine body."""
+        body = self._index(name)
+        nodes = slice(*self.layout.node_start[body : body + 2])
+        if nodes.start == nodes.stop:
+            raise IpcError(f"{name!r} has no unknowns: set_target prescribes its motion")
+        return nodes
+
     def _frame(self, name: str) -> int:
         """Frame of a driven body, of a grip, or the aim of a driven affine body."""
         names = self.layout.frame_names
@@ -121,13 +129,9 @@ class World:
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Set the world velocity of a soft or affine body's nodes [m/s], shape (3,) or (B, 3)."""
-        body = self._index(name)
-        first, last = self.layout.node_start[body : body + 2]
-        if first == last:
-            raise IpcError(f"{name!r} has no unknowns: drive it with set_target")
-        mask = env_mask(envs, self.num_envs)
+        mask, nodes = env_mask(envs, self.num_envs), self._nodes(name)
         v = host(self._potential.v).copy()
-        v[mask, first:last] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
+        v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
@@ -210,11 +214,7 @@ class World:
 
     def velocities(self, name: str) -> Floats:
         """World velocities [m/s] of a soft body's vertices or an affine body's corners, (B, n, 3)."""
-        body = self._index(name)
-        first, last = self.layout.node_start[body : body + 2]
-        if first == last:
-            raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return host(self._potential.v)[:, first:last].copy()
+        return host(self._potential.v)[:, self._nodes(name)].copy()
 
     def affine_pose(self, name: str) -> tuple[Floats, Floats]:
         """A (B, 3, 3) and p [m] (B, 3) of an affine body's map x = A X + p."""
@@ -279,10 +279,8 @@ class World:
 
     def rigid_motion(self, name: str) -> RigidMotion:
         """Mass, centre, inertia and velocities of a soft or affine body as if it were rigid now."""
-        body = self._index(name)
-        if self.layout.node_start[body] == self.layout.node_start[body + 1]:
-            raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return rigid_motion(self.layout, self._potential, body)
+        self._nodes(name)
+        return rigid_motion(self.layout, self._potential, self._index(name))
 
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
         """The part of a bonded soft body under contact forces, as if it moved as a whole.
