@@ -30,8 +30,8 @@ from bench_ipc_scenes import D_HAT, GAP, MATERIAL, RADIUS, SIZE, THICKNESS, ball
 from numpy.typing import NDArray
 
 import ipc
-from ipc.collision import Collision
-from ipc.layout import Layout, build_layout, rotation_matrix
+from ipc.bodies import Layout, build_layout, rotation_matrix
+from ipc.contact import Collision
 from ipc.meshes import surface_of
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics

@@ -85,7 +85,7 @@ print("matplotlib", matplotlib.__version__, "drew a figure; trimesh", trimesh.__
 
 _WARP = """
 import warp as wp
-from ipc.warp_start import start_warp
+from ipc import start_warp
 wp.config.log_level = wp.LOG_WARNING
 start_warp()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))

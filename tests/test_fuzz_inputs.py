@@ -22,7 +22,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ipc.errors import IpcError
+from ipc import IpcError
 from raytac import TactileSensor
 from raytac.assets import asset_root
 from raytac.errors import RaytacError

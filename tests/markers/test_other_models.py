@@ -19,7 +19,7 @@ from raytac.markers.tracker import MarkerTracker
 from raytac.physics.soft.bodies import pad_body
 from raytac.physics.soft.mesh import PadLevel, PadMesh, pad_mesh
 from raytac.specs import SensorSpec
-from tests.ipc.test_elasticity import energy_change, make_potential
+from tests.ipc.solver.test_elasticity import energy_change, make_potential
 from tests.markers.pads import BALL, MOTION, pose, pressed
 
 DEEP = 6e-4

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import ipc
-from ipc.layout import rotation_matrix
-from ipc.patch_motion import RestPatches
+from ipc.bodies import rotation_matrix
+from ipc.solver.patch_motion import RestPatches
 from raytac.physics.soft.bodies import scene_body
 from raytac.shapes.part import primitive
 from raytac.world.soft_answers import STIFFENING

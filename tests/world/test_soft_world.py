@@ -240,7 +240,7 @@ def test_a_soft_body_is_held_where_it_touches_its_holder(monkeypatch: pytest.Mon
         held_by="plate",
     )
     with monkeypatch.context() as patched:
-        patched.setattr("ipc.patch_motion.MAX_ENTRIES", 1000)
+        patched.setattr("ipc.solver.patch_motion.MAX_ENTRIES", 1000)
         with pytest.raises(SpecError, match=r"body\[1\]\.cell_mm = 3\.0: 'beam' has .* at most 1000"):
             TactileWorld(replace(UP, coupling="two_way", bodies=(plate, beam)))
         world = TactileWorld(replace(UP, bodies=(plate, beam)))  # one-way asks for no stiffness

@@ -37,7 +37,7 @@ def hush_solver() -> None:
         return
     import warp as wp
 
-    from ipc.warp_start import use_writable_cache
+    from ipc import use_writable_cache
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     use_writable_cache()
