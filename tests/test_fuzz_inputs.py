@@ -312,7 +312,7 @@ CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     TactileSensor: {
         "sensor": MINI, "physics": "rigid", "pad": None, "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
         "integrator": "fast",
-        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None, "marker_perturbation": None,
+        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
         "optics_options": None,
     },
     press: {"offsets": None, "depths": None, "rotations": None, "shears": None, "twists": None, "seeds": None},

@@ -10,16 +10,33 @@ from typing import NamedTuple
 
 import numpy as np
 
+from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.gel.components import find_edges, join_runs
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
 
-__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "contact_boxes"]
+__all__ = ["ContactCells", "ContactSamples", "ContactSettings", "ContactTracker", "Contacts", "contact_boxes"]
 
-CELL = 0.4e-3
-"""Largest cell over which a contact is averaged [m], unless the pad's grid is coarser; narrower gaps do not part two contacts."""
-_REACH = 1e-3
-"""How far a contact may be from where the object's motion would have carried it, beyond its own radius, and still be the same [m]."""
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Sampling of contacts, and tracking from one surface to the next."""
+
+    cell: float = 0.4e-3
+    """Largest side of a cell that a contact is averaged over [m], unless the pad's grid is coarser.
+
+    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size.
+    """
+    reach: float = 1e-3
+    """Distance from where the object's motion carries an earlier contact, beyond its radius, up to which a contact is that one [m].
+
+    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down.
+    """
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (is_number(value) and 0.0 < value < math.inf):
+                raise InputError(name, value=value, rule="must be finite and > 0 [m]")
 
 
 @dataclass(frozen=True)
@@ -35,8 +52,10 @@ class ContactCells:
     """Centres of the rows [m], shape (ny,)."""
 
     @classmethod
-    def over(cls, grid: PadGrid) -> ContactCells:
-        nodes = tuple(max(1, int(CELL / pitch + 1e-9)) for pitch in grid.pitch)
+    def over(cls, grid: PadGrid, settings: ContactSettings | None = None) -> ContactCells:
+        """Cells of a grid; ``settings``: None is the default ones."""
+        size = (settings or ContactSettings()).cell
+        nodes = tuple(max(1, int(size / pitch + 1e-9)) for pitch in grid.pitch)
         x, y = (
             first + pitch * (count * np.arange(-(-len(line) // count)) + 0.5 * (count - 1))
             for first, pitch, count, line in zip((grid.x[0], grid.y[0]), grid.pitch, nodes, (grid.x, grid.y), strict=True)
@@ -227,12 +246,13 @@ class ContactTracker:
     A contact is a connected piece of the contact. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
     frame); a contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's turn about z to its twist: the way of the
     object's material where it touches, so that rolling, in which that stands still, adds none. A contact is the same as one before if it
-    lies where D carries that one, to within its radius and 1 mm; otherwise it is new and starts from zero. Without contact the
+    lies where D carries that one, to within its radius and ``reach``; otherwise it is new and starts from zero. Without contact the
     history is gone.
     """
 
-    def __init__(self, batch: int) -> None:
-        self.batch = batch
+    def __init__(self, batch: int, settings: ContactSettings | None = None) -> None:
+        """For ``batch`` environments; ``settings``: None is the default ones."""
+        self.batch, self._reach = batch, (settings or ContactSettings()).reach
         self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
         self._pose: list[_Pose | None] = [None] * batch
 
@@ -261,7 +281,7 @@ class ContactTracker:
         now: list[_Pose | None] = [None] * len(chosen) if pose is None else np.asarray(pose).tolist()
         history = [(self._contacts[b], self._pose[b]) for b in chosen]
         contacts = [
-            _followed(found, before, _motion(last, at)) if found and before else found
+            _followed(found, before, _motion(last, at), self._reach) if found and before else found
             for found, (before, last), at in zip(_find(samples), history, now, strict=True)
         ]
         for b, found, at in zip(chosen, contacts, now, strict=True):
@@ -287,7 +307,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float, ...]) -> list[_Contact]:
+def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float, ...], reach: float) -> list[_Contact]:
     """``found`` with the histories of those contacts before that the motion carries to them."""
     xx, xy, xz, x, yx, yy, yz, y, turn = motion
     carried = [(c, xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y) for c in before]
@@ -295,7 +315,7 @@ def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float
     for now in found:
         at = now.x, now.y
         c, cx, cy = min(carried, key=lambda one: math.dist(at, one[1:]))
-        if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + _REACH:
+        if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + reach:
             followed.append(_Contact(*at, c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + turn, *now[5:]))
         else:
             followed.append(now)

@@ -7,7 +7,7 @@ import numpy as np
 from raytac.gel.surface import GelSurface
 from raytac.markers.contacts import Contacts
 
-__all__ = ["height_and_slope", "height_at", "object_way"]
+__all__ = ["height_and_slope", "height_at", "object_displacement"]
 
 
 def _corners(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, n
     return height_at(surface, xy), np.stack(slopes, axis=-1), touched
 
 
-def object_way(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
+def object_displacement(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
     """Tangential way since first touch [m], (B, M, 2), of the object at points ``xy`` (B, M, 2) [m]; that of the nearest contact.
 
     Δs + (R(Δθ) − 1)(M − G), as a rigid body moves; 0 in an environment without contact.

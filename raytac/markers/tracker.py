@@ -4,40 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker
+from raytac.markers.base import MarkersConfig
+from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
+from raytac.markers.registry import markers_config
 from raytac.markers.sampling import height_at
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MARKER_MODELS", "MarkerFrame", "MarkerModel", "MarkerTracker", "make_model"]
-
-MARKER_MODELS = ("fots", "surface", "superposition", "force_field")
-"""Names that ``markers=`` accepts."""
-
-
-class MarkerModel(Protocol):
-    """One way to move markers."""
-
-    name: str
-    needs_contacts: bool
-    """Whether it reads contact samples and the object's motion."""
-    device: str
-
-    def displacement(
-        self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
-    ) -> np.ndarray:
-        """Displacement [m] of markers at ``rest`` (B, M, 3): along x and y, (B, M, 2), or along x, y and z, (B, M, 3).
-
-        With two components the marker stays on the surface, whose height gives the third.
-        """
-        ...
+__all__ = ["MarkerFrame", "MarkerTracker"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -83,26 +63,24 @@ class MarkerTracker:
     def __init__(
         self,
         sensor: SensorSpec,
-        model: str | MarkerModel,
+        markers: str | MarkersConfig,
         grid: PadGrid,
         *,
         num_envs: int = 1,
         resolution: tuple[int, int] | None = None,
         device: str = "auto",
         seed: int = 0,
-        perturbation: MarkerPerturbation | None = None,
     ) -> None:
         """Place the pattern and build the model.
 
         Args:
             sensor: gives the pattern, the camera and, for fitted models, the marker motion.
-            model: one of ``MARKER_MODELS``, or a model that is built already.
-            grid: of the surfaces to come.
+            markers: name of a marker model, or its configuration.
+            grid: grid of the surfaces to come.
             num_envs: number of environments B.
-            resolution: (width, height) of the image that pixels are of [px]; None is the sensor's own.
-            device: ``auto``, ``cpu`` or ``cuda``; where ``fots`` computes.
-            seed: of ``perturbation``.
-            perturbation: noise, losses and shifts of the pattern; None is none.
+            resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
+            device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
+            seed: seed of the perturbation.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
@@ -110,14 +88,15 @@ class MarkerTracker:
             SpecError: a marker lies outside the camera's view.
             BackendError: the model's backend does not work here.
         """
+        config = markers_config(markers)
         self.sensor, self.grid, self.num_envs = sensor, grid, num_envs
         self._resolution = resolution
-        self._perturber = Perturber(perturbation or MarkerPerturbation(), seed, num_envs)
+        self._perturber = Perturber(config.perturbation or MarkerPerturbation(), seed, num_envs)
         self._shift, self._turn = np.zeros((num_envs, 2)), np.zeros(num_envs)
         self._place(range(num_envs))
-        self.model = make_model(model, sensor, grid, device) if isinstance(model, str) else model
-        self._cells = ContactCells.over(grid) if self.model.needs_contacts else None
-        self._contacts = ContactTracker(num_envs)
+        self.model = config.build(sensor, grid, num_envs=num_envs, device=device)
+        self._cells = ContactCells.over(grid, config.contacts) if self.model.needs_contacts else None
+        self._contacts = ContactTracker(num_envs, config.contacts)
 
     def _place(self, envs: range | list[int]) -> None:
         if not self._perturber.settings.moves_pattern:
@@ -212,29 +191,3 @@ class MarkerTracker:
         for lost in ([] if visible is None else [~visible]) + ([failed] if failed.any() else []):
             displacement[lost] = displacement_px[lost] = np.nan
         return MarkerFrame(displacement, displacement_px, rest, pixel, position, everything if visible is None else visible)
-
-
-def make_model(name: str, sensor: SensorSpec, grid: PadGrid, device: str = "auto") -> MarkerModel:
-    """The model of that name.
-
-    Raises:
-        InputError: an unknown name, or a sensor without the marker motion that the model needs.
-        BackendError: its backend does not work here.
-    """
-    if name not in MARKER_MODELS:
-        raise InputError("markers", value=name, rule="must be a known marker model", choices=MARKER_MODELS)
-    if name == "fots":
-        from raytac.markers.fots import FotsMarkers
-
-        return FotsMarkers(sensor, grid, device=device)
-    if name == "surface":
-        from raytac.markers.surface import SurfaceMarkers
-
-        return SurfaceMarkers()
-    if name == "superposition":
-        from raytac.markers.superposition import SuperpositionMarkers
-
-        return SuperpositionMarkers(sensor)
-    from raytac.markers.force_field import ForceFieldMarkers
-
-    return ForceFieldMarkers(sensor)

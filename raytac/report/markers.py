@@ -14,7 +14,6 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.markers.calibration import PUBLISHED
 from raytac.report.machine import machine
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.press import PADS
@@ -28,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from raytac.markers.tracker import MARKER_MODELS, MarkerFrame, MarkerTracker
+from raytac.markers.tracker import MarkerFrame, MarkerTracker
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +53,7 @@ __all__ = [
 
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Every file that a calibration writes."""
-TESTED = ("fots", PUBLISHED, "superposition", "force_field")
+TESTED = ("fots", "fots_published", "superposition", "force_field")
 """Models that are compared with surface tracking."""
 
 
@@ -167,7 +166,7 @@ def calibrate_markers(
     fitted = replace(sensor, marker_motion=motion)
     grid = fit[0].surface.grid
     errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
-    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", PUBLISHED), device=device)
+    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", "fots_published"), device=device)
     by_press = []
     for name, group in groupby([*fit, *held_out], key=lambda frame: str(frame.press)):
         rows, _ = model_errors(fitted, list(group), grid, models=("fots",), device=device)
@@ -199,8 +198,8 @@ def _provenance(
             *listed(held_out),
             f"Mean distance of FOTS, {report.probes} probes on a 1 mm grid, on the fit: {errors(report.fit_errors, 'fots')};",
             f"held out: {errors(report.errors, 'fots')}.",
-            f"Without [punch], as published, on the fit: {errors(report.fit_errors, PUBLISHED)};",
-            f"held out: {errors(report.errors, PUBLISHED)}.",
+            f"Without [punch], as published, on the fit: {errors(report.fit_errors, 'fots_published')};",
+            f"held out: {errors(report.errors, 'fots_published')}.",
         ]
     )
 
@@ -358,7 +357,7 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
     from raytac.markers.calibration_presses import LOADS
 
     probed = probe_sensor(sensor)
-    order = ("surface", *(name for name in MARKER_MODELS if name != "surface"))
+    order = ("surface", *(name for name in TESTED if name != "fots_published"))
     presses = [list(group) for _, group in groupby(frames, key=lambda frame: frame.press.name)]
     rows = []
     for load in LOADS:

@@ -10,8 +10,8 @@ import numpy as np
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.calibration_presses import Press, PressFrame
+from raytac.markers.config import Fots
 from raytac.markers.contacts import ContactCells, ContactTracker
-from raytac.markers.fots import FotsMarkers
 from raytac.specs import MarkerMotionSpec, SensorSpec, load_sensor
 
 PITCH = 0.1e-3
@@ -107,7 +107,7 @@ def fots_presses(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
 
 
 def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh: CoatMesh, found: list) -> list[PressFrame]:
-    model, cells, frames, last = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid), [], None
+    model, cells, frames, last = Fots().build(sensor, grid, num_envs=1, device="cpu"), ContactCells.over(grid), [], None
     for press, load, surface in found:
         if press is not last:
             tracker, last = ContactTracker(1), press

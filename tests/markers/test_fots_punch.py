@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import PadGrid
-from raytac.markers.calibration import PUBLISHED, model_errors
+from raytac.markers.calibration import model_errors
 from raytac.markers.contacts import ContactCells
-from raytac.markers.fots_kernel import FotsConstants, FotsKernel
+from raytac.markers.fots import FotsKernel
 from raytac.specs import PunchSpec, SensorSpec
 from tests.markers.pads import MOTION, fots_presses
 
@@ -41,8 +41,8 @@ def moved(
     nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
     samples = nothing if depth is None else depth[None].astype(np.float32)
     box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
-    constants = FotsConstants(gain, 1e5, 0.8e5, 1e-3, 1.2e5, 0.5, punch)
-    return kernel.displacement(markers[None], samples, box, table, constants)[0].astype(float)
+    motion = replace(MOTION, dilate_gain=gain, dilate_lambda=1e5, shear_max=1e-3, twist_max=0.5, punch=punch)
+    return kernel.displacement(markers[None], samples, box, table, motion)[0].astype(float)
 
 
 def limited(way: np.ndarray, theta: float, most: float, widest: float) -> tuple[np.ndarray, float]:
@@ -229,9 +229,9 @@ def test_alike_in_all_directions_and_as_published(grid: PadGrid) -> None:
 def test_errors_of_the_published_form_are_those_without_the_punch(sensor: SensorSpec, grid: PadGrid) -> None:
     with_punch = replace(sensor, marker_motion=replace(MOTION, punch=PAD))
     frames = fots_presses(with_punch, grid)
-    errors, times = model_errors(with_punch, frames, grid, models=("fots", PUBLISHED), device="cpu")
+    errors, times = model_errors(with_punch, frames, grid, models=("fots", "fots_published"), device="cpu")
     plain, _ = model_errors(sensor, frames, grid, models=("fots",), device="cpu")
     by = {(e.model, e.load): e.mean for e in errors}
     for row in plain:
-        assert by[PUBLISHED, row.load] == row.mean
-    assert by["fots", "shear"] < 0.1 * by[PUBLISHED, "shear"] and set(times) == {"surface", "fots", PUBLISHED}
+        assert by["fots_published", row.load] == row.mean
+    assert by["fots", "shear"] < 0.1 * by["fots_published", "shear"] and set(times) == {"surface", "fots", "fots_published"}

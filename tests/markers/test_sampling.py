@@ -7,7 +7,7 @@ import pytest
 
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.contacts import Contacts
-from raytac.markers.sampling import height_and_slope, height_at, object_way
+from raytac.markers.sampling import height_and_slope, height_at, object_displacement
 
 
 def test_height_is_bilinear_and_that_of_the_own_environment(grid: PadGrid) -> None:
@@ -54,8 +54,8 @@ def test_a_point_goes_with_the_nearest_contact_as_a_rigid_body(grid: PadGrid) ->
     row[0, 0, :6] = 1, 2e-3, 0.0, 3e-4, -1e-4, 0.4
     row[0, 1, :3] = 1, -6e-3, 0.0
     xy = np.array([[(3e-3, 1e-3), (2e-3, 0.0), (-5e-3, 1e-3)]] * 2)
-    way = object_way(Contacts(row), xy)
+    moved = object_displacement(Contacts(row), xy)
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     expected = np.array([turn @ (1e-3, 1e-3) - (1e-3, 1e-3), (0.0, 0.0)]) + np.array((3e-4, -1e-4))
-    np.testing.assert_allclose(way[0, :2], expected, atol=1e-15)
-    assert not way[0, 2].any() and not way[1].any()
+    np.testing.assert_allclose(moved[0, :2], expected, atol=1e-15)
+    assert not moved[0, 2].any() and not moved[1].any()

@@ -10,7 +10,7 @@ import pytest
 
 from raytac.cli import main
 from raytac.errors import InputError
-from raytac.markers import MarkerPerturbation
+from raytac.markers import MarkerPerturbation, SurfaceMarkers
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene
 from raytac.specs.press import ObjectSpec, StageSpec
@@ -87,8 +87,9 @@ def test_errors_come_early() -> None:
         TactileSensor(NAME, markers="surface", physics="rigid")
     with pytest.raises(InputError, match="has no markers"):
         TactileSensor("gelsight_mini", markers="fots")
-    with pytest.raises(InputError, match="needs a marker model"):
-        TactileSensor(NAME, marker_perturbation=MarkerPerturbation(noise_px=1.0))
+        TactileSensor(NAME, markers=SurfaceMarkers(), physics="rigid")
+    with pytest.raises(InputError, match=r"must be a known name or a MarkersConfig.*fots"):
+        TactileSensor(NAME, markers=MarkerPerturbation(noise_px=1.0))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="was not asked for"):
         TactileSensor(NAME).reset_markers()
 

@@ -7,7 +7,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers import MARKER_MODELS, MarkerPerturbation, MarkerTracker
+from raytac.markers import MARKERS, ForceField, MarkerPerturbation, MarkerTracker
 from raytac.specs import SensorSpec
 from tests.markers.pads import coat_mesh, pose, pressed, with_coat
 
@@ -19,7 +19,7 @@ def still(sensor: SensorSpec, grid: PadGrid, batch: int = 1) -> GelSurface:
     return with_coat(pressed(grid, *[[]] * batch), mesh, np.repeat(mesh.rest[None], batch, axis=0))
 
 
-@pytest.mark.parametrize("model", MARKER_MODELS)
+@pytest.mark.parametrize("model", MARKERS.names)
 def test_every_model_is_at_rest_on_a_pad_at_rest(model: str, sensor: SensorSpec, grid: PadGrid) -> None:
     frame = MarkerTracker(sensor, model, grid, num_envs=2, device="cpu").update(still(sensor, grid, 2))
     assert frame.displacement.shape == frame.displacement_px.shape == (2, 99, 2)
@@ -68,7 +68,7 @@ def test_a_broken_environment_is_nan_and_harms_no_other(sensor: SensorSpec, grid
 
 
 def test_noise(sensor: SensorSpec, grid: PadGrid) -> None:
-    tracker = MarkerTracker(sensor, "force_field", grid, perturbation=MarkerPerturbation(noise_px=0.5), seed=3)
+    tracker = MarkerTracker(sensor, ForceField(MarkerPerturbation(noise_px=0.5)), grid, seed=3)
     frames = [tracker.update(pressed(grid, [])) for _ in range(20)]
     found = np.concatenate([frame.displacement_px for frame in frames])
     assert found.std() == pytest.approx(0.5, rel=0.05) and abs(found.mean()) < 0.05
@@ -78,7 +78,7 @@ def test_noise(sensor: SensorSpec, grid: PadGrid) -> None:
 
 
 def test_dropout(sensor: SensorSpec, grid: PadGrid) -> None:
-    tracker = MarkerTracker(sensor, "force_field", grid, perturbation=MarkerPerturbation(dropout=0.1))
+    tracker = MarkerTracker(sensor, ForceField(MarkerPerturbation(dropout=0.1)), grid)
     frames = [tracker.update(pressed(grid, [])) for _ in range(30)]
     lost = np.concatenate([~frame.visible for frame in frames])
     assert lost.mean() == pytest.approx(0.1, abs=0.02)
@@ -88,7 +88,7 @@ def test_dropout(sensor: SensorSpec, grid: PadGrid) -> None:
 
 def test_the_pattern_is_placed_anew_at_a_reset(sensor: SensorSpec, grid: PadGrid) -> None:
     shifted = MarkerPerturbation(shift=3e-4, turn=0.02)
-    tracker = MarkerTracker(sensor, "force_field", grid, num_envs=2, perturbation=shifted)
+    tracker = MarkerTracker(sensor, ForceField(shifted), grid, num_envs=2)
     first = tracker.update(pressed(grid, [], [])).rest.copy()
     assert not np.array_equal(first[0], first[1])
     same = tracker.update(pressed(grid, [], [])).rest
@@ -104,7 +104,7 @@ def test_what_an_environment_draws_does_not_depend_on_how_many_there_are(sensor:
     everything = MarkerPerturbation(noise_px=0.3, dropout=0.05, shift=2e-4, turn=0.01)
 
     def run(batch: int, seed: int) -> np.ndarray:
-        tracker = MarkerTracker(sensor, "force_field", grid, num_envs=batch, seed=seed, perturbation=everything)
+        tracker = MarkerTracker(sensor, ForceField(everything), grid, num_envs=batch, seed=seed)
         balls = [[(0.0, 0.0, DEEP)]] * batch
         return np.stack([tracker.update(pressed(grid, *balls)).pixel for _ in range(2)], axis=1)
 
