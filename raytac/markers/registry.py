@@ -20,7 +20,7 @@ MARKERS: Registry[MarkersConfig] = Registry(
 )
 """Names that ``markers=`` accepts, each with the class of its configuration."""
 register = MARKERS.register
-"""Class decorator that gives a user's own configuration a name."""
+"""Class decorator that names a user's configuration."""
 
 
 def markers_config(markers: str | MarkersConfig) -> MarkersConfig:
