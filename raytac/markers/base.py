@@ -12,9 +12,10 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.contacts import Contacts, ContactSamples, ContactSettings
 from raytac.markers.perturbation import MarkerPerturbation
+from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MarkerModel", "MarkersConfig"]
+__all__ = ["MarkerModel", "MarkersConfig", "marker_motion_of"]
 
 
 class MarkerModel(Protocol):
@@ -61,3 +62,18 @@ class MarkersConfig(ABC):
             InputError: the sensor lacks what the model needs.
             BackendError: the model's backend does not work here.
         """
+
+
+def marker_motion_of(sensor: SensorSpec) -> MarkerMotionSpec:
+    """Fitted marker motion of a sensor.
+
+    Raises:
+        InputError: it was never fitted.
+    """
+    if sensor.marker_motion is None:
+        rule = (
+            "has no marker motion: `raytac calibrate markers --sensor NAME` fits one and writes marker_motion.toml, "
+            "which the sensor's file names as marker_motion"
+        )
+        raise InputError("sensor", value=sensor.name, rule=rule)
+    return sensor.marker_motion

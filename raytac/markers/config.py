@@ -6,30 +6,14 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from raytac.checks import check_known, check_whole
-from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.markers.base import MarkerModel, MarkersConfig
+from raytac.markers.base import MarkerModel, MarkersConfig, marker_motion_of
 from raytac.markers.contacts import ContactCells
 from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["ForceField", "Fots", "FotsPublished", "Superposition", "SurfaceMarkers", "marker_motion_of"]
-
-
-def marker_motion_of(sensor: SensorSpec) -> MarkerMotionSpec:
-    """Fitted marker motion of a sensor.
-
-    Raises:
-        InputError: it was never fitted.
-    """
-    if sensor.marker_motion is None:
-        rule = (
-            "has no marker motion: `raytac calibrate markers --sensor NAME` fits one and writes marker_motion.toml, "
-            "which the sensor's file names as marker_motion"
-        )
-        raise InputError("sensor", value=sensor.name, rule=rule)
-    return sensor.marker_motion
+__all__ = ["ForceField", "Fots", "FotsPublished", "Superposition", "SurfaceMarkers"]
 
 
 @dataclass(frozen=True)
@@ -72,10 +56,7 @@ class Superposition(MarkersConfig):
     level: str = "coarse"
     """Level of the soft pad whose unit-load fields are used; their memory grows with the square of its vertices."""
     rounds: int = 8
-    """Largest number of solutions a frame, after each of which vertices lose contact or slide; then they keep their load.
-
-    Contacts of the shipped scenes need fewer.
-    """
+    """Most solutions a frame, after each of which vertices lose contact or slide; it bounds the time of a frame."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
