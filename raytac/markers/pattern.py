@@ -32,16 +32,15 @@ def camera_of(sensor: SensorSpec, resolution: tuple[int, int] | None = None) -> 
 
 @dataclass(frozen=True)
 class MarkerPattern:
-    """Dots at rest, the same in B environments or shifted in each.
-
-    ``rest`` [m], shape (1 or B, M, 3), pad frame, on the surface at rest; ``pixel`` [px], shape (1 or B, M, 2): where ``camera``
-    shows them. ``radius`` [m]: of a dot.
-    """
+    """Dots at rest, the same in B environments or shifted in each."""
 
     rest: np.ndarray
+    """Positions on the surface at rest, pad frame [m], shape (1 or B, M, 3)."""
     pixel: np.ndarray
+    """Projections of ``rest`` by ``camera`` [px], shape (1 or B, M, 2)."""
     camera: Pinhole
     radius: float
+    """Radius of a dot [m]."""
 
     @classmethod
     def of(
@@ -52,7 +51,7 @@ class MarkerPattern:
         shift: np.ndarray | None = None,
         turn: np.ndarray | None = None,
     ) -> MarkerPattern:
-        """Place the sensor's dots, moved by ``shift`` (B, 2) [m] and turned by ``turn`` (B,) [rad] about the pad's centre if given.
+        """Place the sensor's dots, turned by ``turn`` (B,) [rad] about the pad's centre, then moved by ``shift`` (B, 2) [m].
 
         Raises:
             InputError: the sensor has no markers, or a shift takes one off the pad or out of the view.
@@ -63,7 +62,7 @@ class MarkerPattern:
             rule = "has no markers; give it a pattern ([markers] in its file), or take a sensor that has one, such as gelsight_mini_7x9"
             raise InputError("sensor", value=sensor.name, rule=rule)
         xy = marker_centres(spec)[None]
-        moved = shift is not None or turn is not None
+        is_moved = shift is not None or turn is not None
         if turn is not None:
             c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
             xy = np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
@@ -83,8 +82,10 @@ class MarkerPattern:
             at = tuple(round(float(v), 1) for v in pixel[b, m])
             width, height = camera.resolution
             rule = f"marker (row {row}, column {column}) lies outside the view: at pixel {at} of an image of {width} x {height}"
-            if moved:
-                raise InputError("shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its place in mm)")
+            if is_moved:
+                raise InputError(
+                    "shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its position in mm)"
+                )
             raise SpecError(rule, file=sensor.source, key="markers.pitch_mm", value=[1e3 * p for p in spec.pitch])
         return cls(rest, pixel, camera, spec.radius)
 

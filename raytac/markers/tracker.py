@@ -1,4 +1,4 @@
-"""``MarkerTracker``: surfaces in, marker displacements out, in metres on the pad and in pixels of the image."""
+"""``MarkerTracker``: marker displacements from surfaces, in metres on the pad and in pixels of the image."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ class MarkerFrame:
     """Markers of B pads at one instant, M each, row by row of the pattern."""
 
     displacement: np.ndarray
-    """Along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is not visible or an environment that failed."""
+    """Displacement along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is lost or an environment that failed."""
     displacement_px: np.ndarray
-    """Along u, v of the image [px], shape (B, M, 2), with what perspective adds where the coat moves along z; NaN likewise."""
+    """Displacement along u, v of the image [px], shape (B, M, 2), with the perspective of a motion along z; NaN likewise."""
     rest: np.ndarray
-    """Places at rest, pad frame [m], shape (B, M, 3)."""
+    """Positions at rest, pad frame [m], shape (B, M, 3)."""
     rest_px: np.ndarray
-    """Places at rest in the image [px], shape (B, M, 2)."""
+    """Positions at rest in the image [px], shape (B, M, 2)."""
     position: np.ndarray
-    """Places now, pad frame [m], shape (B, M, 3), without noise or losses: where the dots are printed."""
+    """Positions now, pad frame [m], shape (B, M, 3), without noise or losses; the dots of the image lie there."""
     visible: np.ndarray
-    """Whether the tracker finds the marker, shape (B, M), bool."""
+    """True for markers that the tracker detects, shape (B, M), bool."""
 
     def __repr__(self) -> str:
         return summary(self)
 
     @property
     def pixel(self) -> np.ndarray:
-        """Where the markers are found in the image [px], shape (B, M, 2)."""
+        """Detected positions in the image [px], shape (B, M, 2)."""
         return self.rest_px + self.displacement_px
 
 
@@ -56,8 +56,8 @@ class MarkerTracker:
             markers = tracker.update(surface)
             markers.displacement_px  # (B, M, 2)
 
-    ``update`` is called for every surface in order: models of pads whose height is all that is known need the object's way since first
-    touch. ``reset`` forgets it.
+    ``update`` is called for every surface in order: models that read contacts need the object's motion since first touch. ``reset`` drops
+    this history.
     """
 
     def __init__(
@@ -109,18 +109,18 @@ class MarkerTracker:
 
     def _set_pattern(self, pattern: MarkerPattern) -> None:
         self.pattern = pattern
-        self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models know it again
+        self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models recognise it
         self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
         self._all = np.broadcast_to(True, self._rest.shape[:2])
         self._grid_rest = self._height_at_rest()
 
     def _height_at_rest(self) -> np.ndarray:
-        """z of the grid's rest surface at the pattern [m], (1 or B, M), as ``height_at`` finds it."""
+        """z of the grid's rest surface at the pattern [m], (1 or B, M), by the interpolation of ``height_at``."""
         xy = self.pattern.rest[..., :2]
         return height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Start environments (a mask (B,), a list, or None for all) anew: no history of contact, a new placement of the pattern.
+        """Restart environments (a mask (B,), a list, or None for all): no history of contact, a new placement of the pattern.
 
         Raises:
             InputError: an environment that does not exist.
@@ -130,26 +130,26 @@ class MarkerTracker:
         self._place(which)
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Start the perturbations of environments anew, each from a seed; ``reset`` then draws from them."""
+        """Restart the perturbations of environments, each from a seed; ``reset`` then draws from them."""
         for b, seed in zip(envs, seeds, strict=True):
             self._perturber.reseed(b, seed)
 
     def at_rest(self, envs: Sequence[int] = (0,)) -> MarkerFrame:
-        """Markers of untouched pads, placed as in the environments named; changes no history and draws nothing."""
+        """Markers of untouched pads, placed as in environments ``envs``; changes no history and draws nothing."""
         rest, pixel = self._rest[list(envs)], self._pixel[list(envs)]
-        nothing = np.zeros(pixel.shape)
-        return MarkerFrame(nothing, nothing, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
+        zero = np.zeros(pixel.shape)
+        return MarkerFrame(zero, zero, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
 
     def follow(self, surface: GelSurface) -> None:
-        """Take note of a surface of the motion whose markers nobody asks for; as ``update``, for models that need the history."""
+        """Add a surface to the history without computing markers."""
         if self._cells is not None:
             self._contacts.update(surface, self._cells.sample(surface))
 
     def update(self, surface: GelSurface, envs: Sequence[int] | None = None) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
 
-        ``envs``: which environment each row of the surface is of; None is all of them. Others keep their history and draw nothing, and one
-        that is named twice goes on and draws once.
+        ``envs``: environment of each row of the surface; None is all of them. Others keep their history and draw nothing; one that is named
+        twice advances and draws once.
 
         Raises:
             InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
@@ -157,8 +157,8 @@ class MarkerTracker:
         count = self.num_envs if envs is None else len(envs)
         if surface.batch != count:
             raise InputError("surface", value=surface.batch, rule=f"must have {count} environments, as this tracker")
-        # One NaN makes the sum of squares one, and no height is so large that infinity does not: many times cheaper than asking every
-        # node. First of all, since it brings the heights into the cache for those who pick some.
+        # The sum of squares is finite if all heights are: many times cheaper than a test of every node. It comes first since it brings
+        # the heights into the cache for the interpolation.
         heights = surface.height.reshape(count, -1)
         failed = ~np.isfinite(np.vecdot(heights, heights))
         samples, contacts = None, None
@@ -172,14 +172,14 @@ class MarkerTracker:
         else:
             position = np.empty(rest.shape)
             xy = np.add(rest[..., :2], moved, out=position[..., :2])
-            # Differences of heights first, so that a marker at rest has moved by exactly nothing.
+            # Differences of heights come first, so that the displacement of a marker at rest is exactly zero.
             at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
             np.subtract(height_at(surface, xy), at_rest, out=position[..., 2])
             position[..., 2] += rest[..., 2]
         return self._frame(rest, position, failed, envs)
 
     def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray, envs: Sequence[int] | None) -> MarkerFrame:
-        pixel, everything = (values if envs is None else values[envs] for values in (self._pixel, self._all))
+        pixel, all_visible = (values if envs is None else values[envs] for values in (self._pixel, self._all))
         displacement = position[..., :2] - rest[..., :2]
         displacement_px = self.pattern.camera.project(position)
         displacement_px -= pixel
@@ -190,4 +190,4 @@ class MarkerTracker:
         visible = self._perturber.visible(self.pattern.count, envs)
         for lost in ([] if visible is None else [~visible]) + ([failed] if failed.any() else []):
             displacement[lost] = displacement_px[lost] = np.nan
-        return MarkerFrame(displacement, displacement_px, rest, pixel, position, everything if visible is None else visible)
+        return MarkerFrame(displacement, displacement_px, rest, pixel, position, all_visible if visible is None else visible)
