@@ -15,7 +15,7 @@ from raytac.markers.calibration_presses import LOADS, PressFrame
 from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
 from raytac.markers.force_field import contact_at
 from raytac.markers.pattern import marker_centres
-from raytac.markers.registry import MARKERS
+from raytac.markers.registry import models_without_coat
 from raytac.markers.surface import SurfaceModel
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
@@ -230,9 +230,10 @@ def model_errors(
 ) -> tuple[list[ModelError], dict[str, float]]:
     """Errors of every model by kind of load, and the median time of a frame of every model [ms] at the probes.
 
-    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: names of ``MARKERS``; None is all.
+    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: names of ``MARKERS``; None is all
+    that need no coat.
     """
-    models = MARKERS.names if models is None else models
+    models = models_without_coat() if models is None else models
     probed = probe_sensor(sensor)
     moved: dict[str, list[np.ndarray]] = {}
     pixels: dict[str, list[np.ndarray]] = {}

@@ -12,7 +12,7 @@ from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
 from raytac.markers.base import MarkersConfig
-from raytac.markers.registry import MARKERS, markers_config
+from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import INTEGRATORS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
 from raytac.specs.press import PADS, PHYSICS
@@ -94,9 +94,8 @@ def checked_markers(markers: str | MarkersConfig | None, physics: str | None) ->
     """Configuration of the marker model. Raises ``InputError`` for an unknown one, or one that needs what the physics does not have."""
     config = None if markers is None else markers_config(markers)
     if config is not None and config.needs_coat and physics == "rigid":
-        others = tuple(name for name in MARKERS.names if not MARKERS.config_class(name).needs_coat)
         rule = "tracks the surface of a soft pad; physics='rigid' has none"
-        raise InputError("markers", value=MARKERS.name_of(config), rule=rule, choices=others)
+        raise InputError("markers", value=MARKERS.name_of(config), rule=rule, choices=models_without_coat())
     return config
 
 

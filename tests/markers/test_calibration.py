@@ -11,6 +11,7 @@ from raytac.gel.surface import PadGrid
 from raytac.markers.calibration import ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
 from raytac.markers.calibration_presses import FIT, HELD_OUT, PressFrame
 from raytac.markers.pattern import MarkerPattern
+from raytac.markers.registry import models_without_coat
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import PunchSpec, SensorSpec, load_sensor, validate_press
 from raytac.specs.marker_motion import load_marker_motion, marker_motion_text
@@ -99,18 +100,18 @@ def test_the_file_of_a_fit_is_read_back(tmp_path) -> None:
 
 
 def test_the_report_tells_every_model_and_every_press(sensor: SensorSpec, frames: list[PressFrame]) -> None:
-    from raytac.report.markers import TESTED, calibrate_markers, error_table
+    from raytac.report.markers import calibrate_markers, error_table
 
     pytest.importorskip("warp")  # superposition's pad
     fit, held_out = frames[: len(frames) // 3], frames[len(frames) // 3 :]
-    report = calibrate_markers(sensor, fit, held_out, pad="coarse", device="cpu")
+    report = calibrate_markers(sensor, fit, held_out, level="coarse", device="cpu")
     names = list(dict.fromkeys(str(frame.press) for frame in frames))
     assert len(names) == 3 and [name for name, _ in report.by_press] == names
     # A press alone has the error that it has among others: all held-out twists are of the last press.
     (twist,) = (row for row in report.errors if (row.model, row.load) == ("fots", "twist"))
     assert report.by_press[-1][1].mean == pytest.approx(twist.mean, rel=1e-6)
     text = error_table(report)
-    for name in (*TESTED, *names):
+    for name in (*models_without_coat(), *names):
         assert f"| {name} |" in text
     assert text.count("| fit |") == 1 and text.count("| held out |") == 2
     assert f"{1e6 * twist.mean:.1f} um" in report.motion.provenance

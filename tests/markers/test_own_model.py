@@ -55,8 +55,9 @@ def test_it_presses_observes_and_views_by_name(own: type) -> None:
     assert view.snapshot().pads[NAME].markers_px is not None
 
 
-def test_it_is_compared_by_name(own: type, sensor: SensorSpec, grid: PadGrid) -> None:
-    errors, times = model_errors(sensor, fots_presses(sensor, grid)[:7], grid, models=("fots", "mean_shear"), device="cpu")
+def test_it_is_compared_with_the_others(own: type, sensor: SensorSpec, grid: PadGrid) -> None:
+    pytest.importorskip("warp")  # superposition's pad
+    errors, times = model_errors(sensor, fots_presses(sensor, grid)[:7], grid, device="cpu")
     by = {(row.model, row.load): row for row in errors}
     assert by["fots", "shear"].mean < by["mean_shear", "shear"].mean < by["mean_shear", "shear"].size
-    assert set(times) == {"surface", "fots", "mean_shear"}
+    assert set(times) == set(MARKERS.names)

@@ -105,7 +105,7 @@ def test_press_writes_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", "markers", "--pad", "finest", "--out", str(tmp_path)]) == 2
+    assert main(["calibrate", "markers", "--level", "finest", "--out", str(tmp_path)]) == 2
     assert "did you mean 'fine'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -114,14 +114,14 @@ def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.
 def test_calibrate_quickly_and_go_on_after_an_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import raytac.markers.calibration_presses as presses
+    import raytac.report.markers as report
     from raytac.io.metrics import read_metrics
     from raytac.report.markers import FILES
     from raytac.specs import load_marker_motion
 
     out, begun = tmp_path / "fit", []
-    args = ["calibrate", "markers", "--pad", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
-    simulate = presses.simulate_press
+    args = ["calibrate", "markers", "--level", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
+    simulate = report.simulate_press
 
     def interrupted(sensor, press, **options):
         begun.append(press.name)
@@ -129,7 +129,7 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
             raise KeyboardInterrupt
         return simulate(sensor, press, **options)
 
-    monkeypatch.setattr(presses, "simulate_press", interrupted)
+    monkeypatch.setattr(report, "simulate_press", interrupted)
     assert main(args) == 130
     assert "finished presses are kept" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["presses"] and len(list((out / "presses").iterdir())) == 2
