@@ -22,7 +22,7 @@ class MarkerModel(Protocol):
     """A model that moves the markers of B pads."""
 
     needs_contacts: bool
-    """Whether it reads contacts: their samples, and the object's motion at each since first touch."""
+    """True if it reads contacts: their samples, and the object's motion at each since first touch."""
     device: str
     """``cpu`` or ``cuda``: the device that it computes on."""
 
@@ -46,7 +46,7 @@ class MarkersConfig(ABC):
     contacts: ContactSettings = field(default_factory=ContactSettings)
     """Sampling and tracking of contacts, for models that need them."""
     needs_coat: ClassVar[bool] = False
-    """Whether it reads ``GelSurface.coat``, which only a soft pad has."""
+    """True if it reads ``GelSurface.coat``, which only a soft pad has."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.perturbation, (MarkerPerturbation, type(None))):

@@ -22,8 +22,8 @@ def test_pattern_search_finds_the_bottom_of_a_valley() -> None:
     def cost(x: np.ndarray) -> float:
         return abs(x[0] - 0.3) + 3 * (x[1] + 1.2 + 0.5 * x[0]) ** 2
 
-    found, least = pattern_search(cost, np.zeros(2))
-    assert found == pytest.approx((0.3, -1.35), abs=0.01) and least < 0.01
+    point, least = pattern_search(cost, np.zeros(2))
+    assert point == pytest.approx((0.3, -1.35), abs=0.01) and least < 0.01
 
 
 def test_presses_fit_the_sensor_and_are_held_out() -> None:

@@ -30,7 +30,7 @@ def by_loop(
     sensor: SensorSpec, grid: PadGrid, surface: GelSurface, contacts: list[tuple[float, float, float, float, float]]
 ) -> np.ndarray:
     """Thesis eq. 4.1 to 4.3, node by node and marker by marker; ``contacts``: G_x, G_y, Δs_x, Δs_y, Δθ, all before the caps."""
-    found = []
+    result = []
     dx, dy = grid.pitch
     ys, xs = np.nonzero(surface.contact[0])
     for mx, my in marker_centres(sensor.markers):
@@ -51,8 +51,8 @@ def by_loop(
             ex, ey = dragged_x - grid.x[i], dragged_y - grid.y[j]
             w = MOTION.dilate_gain * dx * dy * h * math.exp(-MOTION.dilate_lambda * (ex * ex + ey * ey))
             ux, uy = ux + w * ex, uy + w * ey
-        found.append((ux, uy))
-    return np.array(found)
+        result.append((ux, uy))
+    return np.array(result)
 
 
 @pytest.mark.parametrize(("shear", "twist"), [((3e-4, -4e-4), -0.2), ((-6e-4, 7e-4), 0.8)], ids=["within", "beyond the caps"])
@@ -119,9 +119,9 @@ def test_it_dilates_outwards(sensor: SensorSpec, grid: PadGrid) -> None:
 def test_caps(sensor: SensorSpec, grid: PadGrid) -> None:
     """The skin that is dragged to the contact's centre, where there is no dilation, follows to the cap and no further."""
     middle = int(np.linalg.norm(marker_centres(sensor.markers), axis=1).argmin())
-    for way in (2e-4, 5e-4, 9e-4, 1.4e-3):
-        followed = min(way, MOTION.shear_max)
-        start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (followed - way, followed))
+    for shear in (2e-4, 5e-4, 9e-4, 1.4e-3):
+        followed = min(shear, MOTION.shear_max)
+        start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (followed - shear, followed))
         assert run(sensor, grid, start, end)[0, middle] == pytest.approx((followed, 0.0), abs=2e-6)
 
     def twisted(angle: float) -> np.ndarray:

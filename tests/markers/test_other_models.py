@@ -108,7 +108,7 @@ def test_superposition_of_a_symmetric_press_is_symmetric(sensor: SensorSpec, gri
     np.testing.assert_allclose(moved[::-1] * (1, -1), moved, atol=2e-7)
 
 
-def test_superposition_drags_what_is_held(sensor: SensorSpec, grid: PadGrid, superposed: MarkerTracker) -> None:
+def test_superposition_drags_what_sticks(sensor: SensorSpec, grid: PadGrid, superposed: MarkerTracker) -> None:
     superposed.reset()
     start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (0.0, 3e-4))
     before = superposed.update(start).displacement[0]
@@ -133,9 +133,9 @@ def test_superposition_slides_as_coulomb_has_it(sensor: SensorSpec, grid: PadGri
         model = tracker.model
         assert isinstance(model, SuperpositionModel)
         height, _, touched = height_and_slope(start, model.coat.rest[None, :, :2])
-        wanted = np.zeros((len(model.coat.rest), 3))
-        wanted[:, 0], wanted[:, 2] = x, height[0] - model.coat.rest[:, 2]
-        coat = model._superpose(wanted, touched[0] & (wanted[:, 2] < 0))
+        prescribed = np.zeros((len(model.coat.rest), 3))
+        prescribed[:, 0], prescribed[:, 2] = x, height[0] - model.coat.rest[:, 2]
+        coat = model._superpose(prescribed, touched[0] & (prescribed[:, 2] < 0))
         return moved, np.linalg.solve(model._compliance.astype(float) + 1e-9 * np.eye(coat.size), coat.ravel()).reshape(-1, 3)
 
     stuck, slid, further = (sheared(s, x) for s, x in ((sensor, 8e-4), (gel, 8e-4), (gel, 1.6e-3)))

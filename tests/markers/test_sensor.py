@@ -70,8 +70,8 @@ def test_dots_in_the_image_are_where_the_markers_are() -> None:
         near = np.hypot(u - pixel[0], v - pixel[1]) < 9
         weight = darker * near
         assert weight.sum() > 0
-        found = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
-        assert found == pytest.approx(tuple(pixel), abs=0.35)
+        centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
+        assert centre == pytest.approx(tuple(pixel), abs=0.35)
     assert sensor.rest().rgb is not None
 
 

@@ -49,7 +49,7 @@ def test_pure_twist_is_pure_rotation(sensor: SensorSpec, grid: PadGrid) -> None:
 
 
 def test_a_sinking_coat_moves_dots_in_the_image_by_perspective(sensor: SensorSpec, grid: PadGrid) -> None:
-    """Straight down by d: nothing moves on the pad, and pixels spread by d over the distance that is left."""
+    """Straight down by d: nothing moves on the pad, and pixels spread by d over the remaining distance."""
     mesh, deep = coat_mesh(sensor), 1e-3
     sunk = mesh.rest - (0, 0, deep)
     frame = MarkerTracker(sensor, "surface", grid).update(with_coat(pressed(grid, []), mesh, sunk[None]))
