@@ -33,7 +33,7 @@ import ipc
 from raytac.errors import InputError, RaytacError
 from raytac.gel import CoatMesh
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
-from raytac.markers import bind
+from raytac.markers import bind_to_coat
 from raytac.physics import PadLevel, PadMesh, SoftPad, pad_mesh
 from raytac.shapes import object_height
 from raytac.specs import PADS, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
@@ -148,7 +148,7 @@ def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, 
             state = pad.peak(pad.run())
             surface, reading = pad.surface(state), state.reading
             assert reading is not None and surface.coat is not None
-            vertices, weights = bind(mesh.coat, probes)
+            vertices, weights = bind_to_coat(mesh.coat, probes)
             solver, shown = (
                 (weights[..., None] * (at[0] - mesh.coat.rest)[vertices]).sum(axis=1)[:, :2]
                 for at in (reading.vertices, surface.coat.positions)

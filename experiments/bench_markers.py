@@ -22,12 +22,11 @@ import tyro
 from raytac.errors import InputError, RaytacError
 from raytac.gel import DeformedCoat, GelSurface
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
-from raytac.markers import MARKER_MODELS, PUBLISHED, MarkerTracker
+from raytac.markers import MARKERS, MarkerTracker
 from raytac.physics import RigidPad, pad_mesh
 from raytac.report import machine
 from raytac.specs import MarkerMotionSpec, ObjectSpec, PressScene, PunchSpec, SensorSpec, StageSpec, load_sensor
 
-MODELS = (*MARKER_MODELS, PUBLISHED)
 NAMES = {"surface": "surface_markers"}
 """Model to the first word of its keys, where that differs."""
 
@@ -40,7 +39,7 @@ class Args(CommonOptions):
     """Sensor with markers."""
     envs: str = "1,64"
     """Numbers of environments, joined by commas."""
-    models: str = ",".join(MODELS)
+    models: str = ",".join(MARKERS.names)
     """Models, joined by commas."""
     frames: int = 200
     """Frames of one environment that are timed, after a tenth as many to warm up; batches time fewer."""
@@ -83,9 +82,6 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
 def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Args) -> tuple[list[float], str]:
     """Times of frames per environment [ms], after warming up, and the device."""
     envs = surfaces[0].batch
-    if model == PUBLISHED:
-        assert sensor.marker_motion is not None
-        model, sensor = "fots", replace(sensor, marker_motion=replace(sensor.marker_motion, punch=None))
     tracker = MarkerTracker(sensor, model, surfaces[0].grid, num_envs=envs, device=args.device)
     count = max(10, args.frames // envs)
     times = []
@@ -106,8 +102,8 @@ def main(args: Args) -> int:
     if not all(text.strip().isdecimal() and int(text) for text in texts):
         raise InputError("envs", value=args.envs, rule="must be whole numbers >= 1, joined by commas")
     for model in models:
-        if model not in MODELS:
-            raise InputError("models", value=model, rule="must be known marker models, joined by commas", choices=MODELS)
+        if model not in MARKERS.names:
+            raise InputError("models", value=model, rule="must be known marker models, joined by commas", choices=MARKERS.names)
     if args.frames < 1:
         raise InputError("frames", value=args.frames, rule="must be at least 1")
     sensor = load_sensor(args.sensor)

@@ -28,7 +28,7 @@ from raytac.assets import asset_root
 from raytac.errors import RaytacError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.metrics import read_metrics
-from raytac.markers import MarkerPerturbation
+from raytac.markers import ContactSettings, MarkerPerturbation, Superposition
 from raytac.observe import ObservationSettings, Randomization, TactileObserver
 from raytac.optics.image.mlp_weights import load_mlp
 from raytac.optics.taxim.bake.settings import BakeSettings
@@ -312,7 +312,7 @@ CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     TactileSensor: {
         "sensor": MINI, "physics": "rigid", "pad": None, "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
         "integrator": "fast",
-        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None, "marker_perturbation": None,
+        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
         "optics_options": None,
     },
     press: {"offsets": None, "depths": None, "rotations": None, "shears": None, "twists": None, "seeds": None},
@@ -339,6 +339,8 @@ CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     partial(replace, TASK): {name: value for name, value in vars(TASK).items() if name not in ("name", "source")},
     Randomization: {name: getattr(Randomization(), name) for name in vars(Randomization())},
     MarkerPerturbation: dict(vars(MarkerPerturbation())),
+    ContactSettings: dict(vars(ContactSettings())),
+    Superposition: dict(vars(Superposition())),
     ObservationSettings: dict(vars(ObservationSettings())),
     TactileObserver: {"sensor": MINI, "settings": ObservationSettings(("height",)), "num_envs": 2, "randomization": None, "seed": 0},
     BakeSettings: dict(vars(BakeSettings())),

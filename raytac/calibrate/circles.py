@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.calibrate.presses import RealPresses
 from raytac.errors import InputError
+from raytac.gel.interpolate import sampled
 
 __all__ = ["DOUBTFUL", "FoundCircles", "circle_score", "find_circles", "with_found_circles"]
 
@@ -123,12 +124,8 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
     height, width = image.shape[:2]
     x, y = u - 0.5, v - 0.5
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    x, y = np.clip(x, 0, width - 1.001), np.clip(y, 0, height - 1.001)
-    i, j = x.astype(int), y.astype(int)
-    wx, wy = (x - i)[..., None], (y - j)[..., None]
-    top = image[j, i] * (1 - wx) + image[j, i + 1] * wx
-    bottom = image[j + 1, i] * (1 - wx) + image[j + 1, i + 1] * wx
-    return top * (1 - wy) + bottom * wy, inside
+    channels = sampled(np.moveaxis(image, -1, 0), np.arange(width), np.arange(height), x, y)
+    return np.moveaxis(channels, 0, -1), inside
 
 
 def _smoothed(image: np.ndarray) -> np.ndarray:

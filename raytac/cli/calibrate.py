@@ -1,4 +1,4 @@
-"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the simulated pad."""
+"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the soft pad."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from raytac.specs.press import PADS
 __all__ = ["CalibrateArgs"]
 
 _OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
-_OF_MARKERS = ("pad", "quick", "verbose")
+_OF_MARKERS = ("level", "quick", "verbose")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateArgs(SolverOptions):
-    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the simulated pad.
+    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the soft pad.
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
     out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
 
-    With `markers`: press the simulated pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
-    sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model against surface tracking on presses that
-    the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error
-    or Ctrl-C leaves these files as they were; presses that are finished stay in presses/, and the same command goes on from there.
+    With `markers`: press the soft pad, and fit FOTS and the force field to the displacement of its surface. Writes marker_motion.toml
+    (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (marker models against surface tracking on presses
+    that the fit did not use) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An
+    error or Ctrl-C leaves these files as they were; finished presses stay in presses/, and the same command continues from there.
     """
 
     what: Annotated[str, tyro.conf.Positional]
@@ -64,8 +64,8 @@ class CalibrateArgs(SolverOptions):
     cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
-    pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
-    """How finely the simulated pad is cut."""
+    level: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
+    """Resolution of the soft pad's mesh."""
     quick: bool = False
     """Few presses: shows that all runs; a poor fit."""
 
@@ -80,11 +80,11 @@ class CalibrateArgs(SolverOptions):
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
         try:
             written = run_calibrate_markers(
-                sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
+                sensor, out, level=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )
         except KeyboardInterrupt:
             print(
-                f"raytac: interrupted; finished presses are kept in {out}, the same command goes on from there", file=sys.stderr
+                f"raytac: interrupted; finished presses are kept in {out}, the same command continues from there", file=sys.stderr
             )
             return 130
         for path in written:

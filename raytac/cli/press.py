@@ -15,7 +15,7 @@ from raytac.cli.solver_options import SolverOptions
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
-from raytac.markers import MARKER_MODELS
+from raytac.markers import MARKERS
 from raytac.optics import INTEGRATORS
 from raytac.report.press import run_press
 from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
@@ -49,9 +49,9 @@ class PressArgs(ShadowOptions, SolverOptions):
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given. mlp: folder of
     raytac calibrate DATASET --model mlp."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
-    """How the sensor's markers move: fots, surface (needs physics ipc), superposition or force_field; the sensor must have markers, as
-    gelsight_mini_7x9 has. Writes markers.npz, and images show the dots. None if not given."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    """Model that moves the sensor's markers; surface needs physics ipc. The sensor must have markers, as gelsight_mini_7x9 has. Writes
+    markers.npz, and images show the dots. None if not given."""
     integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
     """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
     spp: int | None = None

@@ -12,7 +12,7 @@ from raytac.checks import check_known, check_whole
 from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
-from raytac.markers import MARKER_MODELS
+from raytac.markers import MARKERS
 from raytac.physics.soft.availability import check_solver, hush_solver
 from raytac.sensor import OPTICS, TactileSensor
 from raytac.sensor.options import sensor_spec
@@ -50,8 +50,8 @@ class ViewArgs(ShadowOptions):
     """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
-    """How the sensor's markers move; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
     coupling: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(COUPLINGS) + "}")] = None
     """Whether what simulated pads feel acts back on a task's robot; as the task says if not given."""
     steps: int | None = None

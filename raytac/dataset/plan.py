@@ -16,7 +16,7 @@ import numpy as np
 from raytac.dataset.arrays import ARRAYS, DATASET_OUTPUTS, SHARED, ArrayKind
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.surface import PadGrid, grid_pitch, make_grid
-from raytac.markers import MarkerPerturbation
+from raytac.markers import MARKERS, MarkerPerturbation
 from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
 from raytac.sensor import TactileSensor
@@ -173,8 +173,7 @@ class DatasetPlan:
             "pad": sweep.pad,
             "optics": sweep.optics,
             "outputs": tuple(name for name in sweep.outputs if name != "contact"),
-            "markers": sweep.markers,
-            "marker_perturbation": replace(self.randomization.markers) if sweep.markers is not None else None,
+            "markers": None if sweep.markers is None else MARKERS.config(sweep.markers, perturbation=self.randomization.markers),
             "resolution": sweep.resolution,
             "pitch": sweep.pitch,
             "num_envs": num_envs,

@@ -13,6 +13,9 @@ from raytac.checks import MOST_ENVIRONMENTS, check_kind, check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs, rounded_envs
+from raytac.markers import MarkerPerturbation
+from raytac.markers.base import MarkersConfig
+from raytac.markers.registry import markers_config
 from raytac.observe.cells import CellMeans
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout
@@ -39,11 +42,13 @@ class TactileObserver:
     Attributes:
         sensor: the specification; the drawn one if the randomisation changes sensors.
         settings: what is observed.
+        markers: marker model with its perturbation; None if no markers are observed.
         arrays: shape, type and bounds of every modality, of one environment.
     """
 
     sensor: SensorSpec
     settings: ObservationSettings
+    markers: MarkersConfig | None
     arrays: dict[str, ArraySpec]
 
     def __init__(
@@ -65,7 +70,8 @@ class TactileObserver:
             seed: of every draw.
 
         Raises:
-            InputError: markers of a sensor without, an image too large, or a number out of range.
+            InputError: markers of a sensor without, an image too large, a number out of range, or a perturbation of markers that
+                settings and randomization both give.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         seed = check_whole("seed", seed, 0)
@@ -81,21 +87,30 @@ class TactileObserver:
         self._drift = CameraDrift(self.sensor, self.randomization, num_envs, seed) if drifts else None
         self._rest: np.ndarray | None = None
         self._rest_rgb: np.ndarray | None = None
-        self._moves_dots = (
-            "rgb" in self.settings.modalities and self.settings.needs_markers and self.randomization.markers.moves_pattern
-        )
+        self.markers = self._perturbed_markers() if self.settings.needs_markers else None
+        perturbation = None if self.markers is None else self.markers.perturbation
+        self._moves_dots = "rgb" in self.settings.modalities and perturbation is not None and perturbation.moves_pattern
         self._unrested = np.ones(num_envs, bool)
         self._cells: CellMeans | None = None
         self._last: dict[str, np.ndarray] = {}
         self._fresh = np.ones(num_envs, bool)
 
+    def _perturbed_markers(self) -> MarkersConfig:
+        """Marker model of the settings with the perturbation of the randomisation, or with its own."""
+        config, drawn = markers_config(self.settings.markers), self.randomization.markers
+        if drawn == MarkerPerturbation():
+            return config
+        if config.perturbation is not None:
+            rule = "is given by the settings' markers already; give it to one of the two"
+            raise InputError("randomization.markers", value=drawn, rule=rule)
+        return replace(config, perturbation=drawn)
+
     def sensor_options(self) -> dict[str, Any]:
         """Keyword arguments of a ``TactileSensor`` that gives what is observed, but for the sensor itself and the physics."""
-        settings, disturbed = self.settings, self.randomization.markers
+        settings = self.settings
         return {
             "outputs": settings.outputs,
-            "markers": settings.marker_model if settings.needs_markers else None,
-            "marker_perturbation": replace(disturbed) if settings.needs_markers else None,
+            "markers": self.markers,
             "optics": settings.optics,
             "optics_options": dict(settings.optics_options),
             "resolution": self.layout.rendered,
@@ -106,7 +121,7 @@ class TactileObserver:
     def world_options(self) -> dict[str, Any]:
         """The same as keyword arguments of a ``TactileWorld``; the sensor's specification is the task scene's."""
         options = self.sensor_options()
-        further = {key: options.pop(key) for key in ("marker_perturbation", "optics_options")}
+        further = {key: options.pop(key) for key in ("optics_options",)}
         return {**options, "sensor_options": further}
 
     def make_sensor(self, **options: Any) -> TactileSensor:

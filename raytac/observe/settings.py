@@ -10,7 +10,8 @@ from typing import Any
 from raytac.checks import check_known, check_mapping, check_names, check_truth, check_whole, is_number, is_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
-from raytac.markers import MARKER_MODELS
+from raytac.markers.base import MarkersConfig
+from raytac.markers.registry import markers_config
 from raytac.sensor.options import LARGEST_SIDE, OPTICS, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
@@ -63,8 +64,8 @@ class ObservationSettings:
     """In place of those of ``SCALES``, by modality."""
     optics: str = "taxim"
     """As of ``TactileSensor``."""
-    marker_model: str = "fots"
-    """As ``markers`` of ``TactileSensor``."""
+    markers: str | MarkersConfig = "fots"
+    """As of ``TactileSensor``."""
     optics_options: Mapping[str, Any] = field(default_factory=dict)
     """As of ``TactileSensor``."""
 
@@ -90,7 +91,7 @@ class ObservationSettings:
         for name in ("difference", "normalise"):
             check_truth(name, getattr(self, name))
         check_known("optics", self.optics, OPTICS)
-        check_known("marker_model", self.marker_model, MARKER_MODELS)
+        markers_config(self.markers)
         for name in ("scales", "optics_options"):
             check_mapping(name, getattr(self, name))
         if self.difference and "rgb" not in self.modalities:

@@ -15,6 +15,7 @@ from raytac.io.exr import vector_channels, write_exr
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.png import write_png
+from raytac.markers import MARKERS
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
 
@@ -154,7 +155,7 @@ def press_metrics(sensor: TactileSensor, scene: PressScene, frame: TactileFrame,
         moved = np.linalg.norm(frame.markers.displacement[0], axis=-1)
         moved_px = np.linalg.norm(frame.markers.displacement_px[0], axis=-1)
         metrics |= {
-            "markers.model": sensor.markers or "",
+            "markers.model": "" if sensor.markers is None else MARKERS.name_of(sensor.markers),
             "markers.count": len(moved),
             "markers.mean_mm": 1e3 * float(np.nanmean(moved)),
             "markers.max_mm": 1e3 * float(np.nanmax(moved)),

@@ -11,7 +11,8 @@ from raytac.checks import check_known, check_mapping, check_methods, check_names
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
-from raytac.markers import MARKER_MODELS, MarkerPerturbation
+from raytac.markers.base import MarkersConfig
+from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import INTEGRATORS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
 from raytac.specs.press import PADS, PHYSICS
@@ -23,9 +24,9 @@ if TYPE_CHECKING:
 __all__ = [
     "LARGEST_SIDE",
     "OPTICS",
-    "check_markers",
     "check_optics",
     "check_physics",
+    "checked_markers",
     "checked_outputs",
     "checked_resolution",
     "press_scene",
@@ -89,15 +90,13 @@ def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> 
     return tuple(name for name in OUTPUTS if name in outputs)
 
 
-def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: str | None) -> None:
-    """Raises ``InputError`` for an unknown model, one that the physics cannot feed, or a perturbation of no markers."""
-    if markers is not None:
-        check_known("markers", markers, MARKER_MODELS)
-        if markers == "surface" and physics == "rigid":
-            rule = "tracks the surface of a simulated gel; physics='rigid' has none"
-            raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
-    elif perturbation is not None:
-        raise InputError("marker_perturbation", value=perturbation, rule="needs a marker model: markers=…")
+def checked_markers(markers: str | MarkersConfig | None, physics: str | None) -> MarkersConfig | None:
+    """Configuration of the marker model. Raises ``InputError`` for an unknown one, or one that needs what the physics does not have."""
+    config = None if markers is None else markers_config(markers)
+    if config is not None and config.needs_coat and physics == "rigid":
+        rule = "tracks the surface of a soft pad; physics='rigid' has none"
+        raise InputError("markers", value=MARKERS.name_of(config), rule=rule, choices=models_without_coat())
+    return config
 
 
 def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, int] | None:

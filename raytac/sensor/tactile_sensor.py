@@ -16,16 +16,18 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
-from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
-from raytac.markers.pattern import MarkerPattern
+from raytac.markers.base import MarkersConfig
+from raytac.markers.pattern import MarkerPattern, dot_ink
+from raytac.markers.registry import MARKERS
+from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.optics.registry import Imaging
 from raytac.physics.base import PadReading
 from raytac.physics.soft.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.options import (
-    check_markers,
     check_optics,
     check_physics,
+    checked_markers,
     checked_outputs,
     checked_resolution,
     press_scene,
@@ -67,6 +69,8 @@ class TactileSensor:
     """Nodes of the pad's surface."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
+    markers: MarkersConfig | None
+    """Configuration of the marker model; None without markers."""
     physics: str
     """How the gel deforms: as asked for, else as the scene that was loaded last asks, else ``rigid``."""
 
@@ -85,8 +89,7 @@ class TactileSensor:
         seed: int = 0,
         num_envs: int = 1,
         pitch: float | None = None,
-        markers: str | None = None,
-        marker_perturbation: MarkerPerturbation | None = None,
+        markers: str | MarkersConfig | None = None,
         optics_options: dict[str, Any] | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
@@ -107,9 +110,8 @@ class TactileSensor:
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
-            markers: how the sensor's markers move, one of ``MARKER_MODELS``; frames then hold them, and images show the dots. None leaves
-                them out, and images show a plain coat.
-            marker_perturbation: noise, losses and shifts of the markers; None is none.
+            markers: marker model, a name of ``raytac.markers.MARKERS`` or a configuration such as ``Fots(perturbation=…)``; frames then
+                hold markers, and images show the dots. None leaves them out, and images show a plain coat.
             optics_options: further keyword arguments of the optical mode, such as ``calibration`` of ``taxim``, or ``shadows``, which the
                 sensor else decides; their values are checked when it is built.
 
@@ -125,7 +127,7 @@ class TactileSensor:
         check_optics(optics, integrator, spp, optics_options)
         resolve_device(device)
         self.outputs = checked_outputs(outputs, optics)
-        check_markers(markers, marker_perturbation, physics)
+        self.markers = checked_markers(markers, physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
@@ -142,9 +144,8 @@ class TactileSensor:
         self._known_grid = self.grid
         """Grid of the last surface, which is of this pad."""
         self._level: str | PadMesh = pad or PADS[0]
-        self.markers, self._marker_perturbation = markers, marker_perturbation
-        if markers is not None:
-            MarkerPattern.of(self.spec, self.resolution)  # a pattern that cannot be seen is told now
+        if self.markers is not None:
+            MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
         self._imaging = Imaging(
             self.spec,
@@ -172,7 +173,7 @@ class TactileSensor:
             raise InputError("optics", value=self._settings["optics"], rule=rule)
         if self._tracker is not None:
             rule = "cannot be copied or pickled once they have a history: make another sensor with the same arguments"
-            raise InputError("markers", value=self.markers, rule=rule)
+            raise InputError("markers", value=self._settings["markers"], rule=rule)
         return partial(type(self), **self._settings), ()
 
     @property
@@ -388,7 +389,7 @@ class TactileSensor:
             BackendError: the model's backend does not work here.
         """
         if self.markers is None:
-            raise InputError("markers", value=None, rule="was not asked for", choices=MARKER_MODELS)
+            raise InputError("markers", value=None, rule="was not asked for", choices=MARKERS.names)
         if self._tracker is None:
             self._tracker = MarkerTracker(
                 self.spec,
@@ -398,7 +399,6 @@ class TactileSensor:
                 resolution=self.resolution,
                 device=self.device,
                 seed=self.seed,
-                perturbation=self._marker_perturbation,
             )
         return self._tracker
 
@@ -423,8 +423,6 @@ class TactileSensor:
         """The surface with dots printed where the markers are, if there is an image to show them."""
         if not {"rgb", "layers"} & set(self._optical_outputs):
             return surface
-        from raytac.markers.dots import dot_ink
-
         return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:

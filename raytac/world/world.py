@@ -34,6 +34,7 @@ from raytac.world.state import BatchController, Control, Drive, WorldState
 from raytac.world.variation import EnvironmentModels, Variation
 
 if TYPE_CHECKING:
+    from raytac.markers import MarkersConfig
     from raytac.physics.soft.scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
@@ -73,7 +74,7 @@ class TactileWorld:
         pad: str | None = None,
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
-        markers: str | None = None,
+        markers: str | MarkersConfig | None = None,
         optics: str = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.skipif(bool(cuda_missing()), reason=f"CUDA for Mitsuba: {cuda_missing()}")
 def test_fots_on_cuda_equals_the_cpu(tmp_path: Path) -> None:
-    found = {}
+    result = {}
     for device in ("cpu", "cuda"):
         path = tmp_path / f"{device}.npz"
         command = [sys.executable, "-m", "tests.markers.track_on", device, str(path)]
@@ -28,8 +28,8 @@ def test_fots_on_cuda_equals_the_cpu(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         with np.load(path) as arrays:
             assert arrays["device"] == device
-            found[device] = arrays["displacement"], arrays["displacement_px"]
-    (cpu, cpu_px), (cuda, cuda_px) = found["cpu"], found["cuda"]
+            result[device] = arrays["displacement"], arrays["displacement_px"]
+    (cpu, cpu_px), (cuda, cuda_px) = result["cpu"], result["cuda"]
     assert (np.linalg.norm(cpu[-1], axis=-1).max(axis=-1) > 2e-5).all() and not cpu[:-1, 2].any()
     # float32 sums over some hundred samples, with another exp.
     np.testing.assert_allclose(cuda, cpu, rtol=1e-4, atol=1e-9)

@@ -9,8 +9,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.dots import dot_ink
-from raytac.markers.pattern import MarkerPattern
+from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.optics.image.phong import PhongMode
 from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.markers.base import MarkerModel
+from raytac.markers.config import Fots
 from raytac.markers.contacts import ContactCells, ContactTracker
-from raytac.markers.fots import FotsMarkers
-from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
+from raytac.markers.registry import MARKERS
+from raytac.markers.tracker import MarkerTracker
 from raytac.optics.device_image import DeviceImage, ImageCut
 from raytac.optics.image.base import ImageMode
 from raytac.optics.image.mlp import MlpMode
@@ -273,7 +275,7 @@ def beside(one: GelSurface, other: GelSurface) -> GelSurface:
     )
 
 
-@pytest.mark.parametrize("model", [*MARKER_MODELS, "fots-punch"])
+@pytest.mark.parametrize("model", [*MARKERS.names, "fots-punch"])
 @DEVICES
 def test_markers_of_rest_press_rest_and_another_press(model: str, device: str) -> None:
     if device == "cuda" and not model.startswith("fots"):
@@ -307,9 +309,12 @@ def test_other_numbers_of_markers_are_other_recordings(device: str) -> None:
     contacts = ContactTracker(1).update(surface, samples)
     places = np.random.default_rng(0).uniform(-4e-3, 4e-3, (1, 300, 3))
 
-    def moved(model: FotsMarkers, count: int) -> np.ndarray:
+    def moved(model: MarkerModel, count: int) -> np.ndarray:
         return model.displacement(places[:, :count].copy(), surface, samples, contacts)
 
-    one = FotsMarkers(sensor, grid, device=device)
+    def make() -> MarkerModel:
+        return Fots().build(sensor, grid, num_envs=1, device=device)
+
+    one = make()
     for count in (7, 300, 1, 7):
-        np.testing.assert_array_equal(moved(one, count), moved(FotsMarkers(sensor, grid, device=device), count))
+        np.testing.assert_array_equal(moved(one, count), moved(make(), count))

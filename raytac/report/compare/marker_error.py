@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from raytac.io.metrics import Metric
-from raytac.report.markers import TESTED, error_metrics, press_all
+from raytac.report.markers import error_metrics, press_all
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ PAD = "medium"
 
 @dataclass(frozen=True)
 class MarkerErrors:
-    """Every model of ``raytac.report.markers.TESTED`` against surface tracking."""
+    """Every model that needs no coat against surface tracking."""
 
     pad: str
     """How finely the simulated pad was cut whose surface is the truth."""
@@ -78,7 +78,7 @@ def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, dev
     """
     from raytac.markers.calibration import model_errors, probe_sensor
 
-    errors, times = model_errors(sensor, frames, frames[0].surface.grid, models=TESTED, device=device)
+    errors, times = model_errors(sensor, frames, frames[0].surface.grid, device=device)
     probes = probe_sensor(sensor).markers
     presses = tuple(dict.fromkeys(str(frame.press) for frame in frames))
     return MarkerErrors(pad, probes.rows * probes.columns, presses, tuple(errors), times)

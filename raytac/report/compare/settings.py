@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from raytac.errors import BackendError, InputError
-from raytac.markers.fots import marker_motion_of
+from raytac.markers.base import marker_motion_of
 from raytac.physics.soft.availability import check_solver
 from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
