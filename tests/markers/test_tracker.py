@@ -152,7 +152,7 @@ def test_configurations_refuse_what_cannot_be(make: Callable[[], object], match:
 
 
 def test_contact_settings_reach_sampling_and_tracking(sensor: SensorSpec, grid: PadGrid) -> None:
-    """A contact 3.1 mm off where the object carried it, about its radius and 1 mm, is the same with the default reach and new with a short one."""
+    """A contact 3.1 mm from where the object carries it is the same one with the default reach, and a new one with a short reach."""
     first = pressed(grid, [(0, 0, DEEP)], poses=[pose()])
     jumped = pressed(grid, [(3.2e-3, 0, DEEP)], poses=[pose(1e-4)])
     moved = []
