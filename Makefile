@@ -1,21 +1,53 @@
-# Two commands do everything: `make demo` and `make test`. They need Python >= 3.11, make and a C compiler.
+# Three commands do everything: `make demo`, `make check` (a minute) and `make test`. They need Python >= 3.11, make and a C compiler.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: demo test lint clean
+.PHONY: demo check test test-random suite quick lint rules types clean
+
+TEST := $(BIN)/python -m pytest
+# The installation goes before what then runs beside each other.
+BESIDE = $(MAKE) --no-print-directory --jobs 2
+# Two processes; each begins with one half of the tests in their order, so that what a file or a session shares is made about once.
+TWO := -n 2 --dist worksteal
+SOURCES = $(shell find raytac ipc examples experiments tests -name '*.py' 2>/dev/null)
 
 demo: $(VENV)/.installed
 	$(BIN)/python experiments/press_sheet.py --out $(OUT)
 
-test: $(VENV)/.installed-test lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile  # a file stays in one process, so that its fixtures are made once
+check: $(VENV)/.installed-test
+	+@$(BESIDE) $(VENV)/.types rules quick
 
-lint: $(VENV)/.installed-test
+test: $(VENV)/.installed-test
+	+@$(BESIDE) types rules suite
+
+suite: $(VENV)/.installed-test
+	$(TEST) $(TWO) --durations=25
+
+# Tests that need neither renderer nor solver and run no script (tests/marks.py), with those packages blocked.
+quick: $(VENV)/.installed-test
+	$(TEST) $(TWO) -q -m "not (slow or gpu or renderer or solver or script)"
+
+# Every test in an order of its own, which the first lines name: repeat it by `make test-random SEED=...`.
+SEED ?= $(shell $(BIN)/python -c 'import random; print(random.randrange(2**32))')
+test-random: $(VENV)/.installed-test
+	$(TEST) $(TWO) -p randomly --randomly-seed=$(SEED)
+
+lint: rules types
+
+rules: $(VENV)/.installed-test
 	$(BIN)/ruff check .
-	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
+
+types: $(VENV)/.installed-test
+	$(BIN)/pyright
+	@touch $(VENV)/.types
+
+# Types of the files that changed since all of them were right; those that import them are seen by `make types`, a part of `make test`.
+$(VENV)/.types: $(SOURCES) pyproject.toml
+	$(BIN)/pyright $(filter %.py,$?)
+	@touch $@
 
 clean:
 	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,9 +23,26 @@ from raytac.specs.sensor import (
     ResponseSpec,
     SensorSpec,
 )
+from tests import marks
 
 BALL_RADIUS = 4e-3
 BALL_DEPTH = 1e-3
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    marks.block(config.getoption("markexpr"))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files all of whose tests are deselected: importing them would import what they need."""
+    expression = config.getoption("markexpr")
+    return True if any(marks.is_deselected(mark, expression) for mark in marks.marks_of(collection_path)) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        for mark in marks.marks_of(item.path):
+            item.add_marker(mark)
 
 
 def make_sensor_spec() -> SensorSpec:

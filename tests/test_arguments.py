@@ -249,6 +249,7 @@ def test_a_copy_of_a_sensor_is_another_of_the_same_settings(twin: Any) -> None:
     np.testing.assert_array_equal(other.press(BALL).height, frame.height)
 
 
+@pytest.mark.renderer
 def test_what_a_copy_would_lose_is_said() -> None:
     class Mode:
         label, device = "mine", "cpu"

@@ -119,6 +119,7 @@ class Untraceable:
         return [self._variant != "cuda_ad_rgb"]
 
 
+@pytest.mark.renderer
 def test_a_cuda_that_can_be_set_and_does_not_trace_is_never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     from raytac.optics import runtime as variant
 
@@ -149,6 +150,7 @@ def test_an_optix_that_the_user_named_is_the_only_one_tried(monkeypatch: pytest.
         device.optix_library.cache_clear()
 
 
+@pytest.mark.renderer
 def test_auto_stays_with_the_device_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     from raytac.optics.runtime import load_mitsuba
 

@@ -38,11 +38,11 @@ def planned(checkout: Path, target: str) -> str:
 
 
 @needs_make
-@pytest.mark.parametrize("target", ["demo", "test", "lint"])
+@pytest.mark.parametrize("target", ["demo", "test", "check", "test-random", "lint"])
 def test_a_second_make_installs_nothing(checkout: Path, target: str) -> None:
     commands = planned(checkout, target)
     assert "pip" not in commands and "venv " not in commands, commands
-    assert {"demo": "press_sheet.py", "test": "pytest", "lint": "ruff"}[target] in commands
+    assert {"demo": "press_sheet.py", "lint": "ruff"}.get(target, "pytest") in commands
 
 
 @needs_make
@@ -54,6 +54,21 @@ def test_a_changed_project_file_or_a_lost_stamp_installs_again(checkout: Path, t
     assert "pip install" not in planned(checkout, target)
     (checkout / ".venv" / ".installed").unlink()
     assert "pip install" in planned(checkout, target)
+
+
+@needs_make
+def test_a_check_asks_for_the_types_of_what_changed_only(checkout: Path) -> None:
+    (checkout / "raytac").mkdir()
+    kept, changed = checkout / "raytac" / "kept.py", checkout / "raytac" / "changed.py"
+    for age, path in ((200, kept), (200, changed), (50, checkout / ".venv" / ".types")):
+        path.touch()
+        os.utime(path, (time.time() - age, time.time() - age))
+    assert "pyright" not in planned(checkout, "check")
+    changed.touch()
+    (line,) = [line for line in planned(checkout, "check").splitlines() if "pyright" in line]
+    assert line.split()[1:] == ["raytac/changed.py"]
+    (line,) = [line for line in planned(checkout, "test").splitlines() if "pyright" in line]
+    assert line.split()[1:] == []
 
 
 @needs_make

@@ -24,6 +24,8 @@ DEEP = re.compile(r"^\s*(?:from|import) (raytac\.\w+\.[\w.]+)", re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", PACKAGES)
+@pytest.mark.renderer
+@pytest.mark.solver
 def test_every_public_name_can_be_imported(name: str) -> None:
     package = importlib.import_module(name)
     assert package.__all__

@@ -187,6 +187,7 @@ def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> N
 
 
 @pytest.mark.parametrize(("optics", "known"), [("raytrace", "denoise"), ("taxim", "calibration"), ("phong", "lights")])
+@pytest.mark.renderer
 def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(sensor_spec: SensorSpec, optics: str, known: str) -> None:
     for name in ("calibratoin", "resolution"):
         with pytest.raises(InputError, match=f"optics_options.*{name}.*choose from: .*{known}"):

@@ -39,6 +39,7 @@ def equal(a: dict, b: dict) -> bool:
 
 
 @pytest.mark.parametrize("kind", ENVS)
+@pytest.mark.renderer
 def test_gymnasium_and_stable_baselines3_accept_it(kind: type) -> None:
     with warnings.catch_warnings():
         # Both warn of bounds at infinity and of arrays that are neither images nor vectors, which is as it should be.
@@ -57,6 +58,7 @@ def test_every_name_is_registered_alone_and_as_a_vector() -> None:
     assert isinstance(many.unwrapped, RollBallVectorEnv) and many.num_envs == 3
 
 
+@pytest.mark.renderer
 def test_the_docstring_says_the_shapes_that_there_are() -> None:
     for kind in ENVS:
         text = " ".join((kind.__doc__ or "").split())
@@ -76,6 +78,7 @@ def test_the_docstring_says_the_shapes_that_there_are() -> None:
         assert all(f"`{term}`" in text for term in info["reward_terms"])
 
 
+@pytest.mark.renderer
 def test_seeds_repeat_and_differ_with_noise_too() -> None:
     noisy = Randomization(markers=MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=2e-4))
     env = RollBallEnv(randomization=noisy)
@@ -91,6 +94,7 @@ def test_seeds_repeat_and_differ_with_noise_too() -> None:
     assert not equal(one[0], other[0]) and np.isfinite(one[3]["sensor_markers"]).all()
 
 
+@pytest.mark.renderer
 def test_a_vector_does_what_single_environments_of_its_seeds_do() -> None:
     many = PushCubeVectorEnv(2)
     first, _ = many.reset(seed=5)
@@ -110,6 +114,7 @@ def test_a_vector_does_what_single_environments_of_its_seeds_do() -> None:
     assert steps[-1][0]["sensor_markers"].any(), "nothing was touched"
 
 
+@pytest.mark.renderer
 def test_no_two_sensors_of_a_vector_have_the_same_noise() -> None:
     tactile = ObservationSettings(("rgb", "markers"), resolution=(16, 12), optics="phong")
     disturbed = Randomization(noise=4.0, markers=MarkerPerturbation(noise_px=0.3))
@@ -120,6 +125,7 @@ def test_no_two_sensors_of_a_vector_have_the_same_noise() -> None:
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+@pytest.mark.renderer
 def test_with_noise_in_every_frame_too_when_they_begin_anew_at_different_times(mode: AutoresetMode) -> None:
     disturbed = MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=5e-5)
     direct = {"optics": "raytrace", "optics_options": {"bounce": False}}  # quickest to build
@@ -246,6 +252,7 @@ def test_joint_targets_are_actions_too() -> None:
     np.testing.assert_allclose(after[0, :6], before[0, :6], atol=0.01)
 
 
+@pytest.mark.renderer
 def test_images_in_a_vector() -> None:
     settings = ObservationSettings(("rgb", "markers"), resolution=(32, 32), optics="phong")
     many = RollBallVectorEnv(2, tactile=settings, randomization=Randomization(exposure=0.2))
@@ -303,6 +310,7 @@ def test_a_simulated_pad_is_a_setting_that_changes_no_shape() -> None:
     assert soft.observation_space.contains(seen) and seen["sensor_wrench"][0, 2] < 0.0 == seen["sensor_wrench"][1, 2]
 
 
+@pytest.mark.renderer
 def test_the_wrench_alone_is_the_wrench_that_is_seen_beside_markers() -> None:
     both, alone = (RollBallVectorEnv(2, tactile=t, max_episode_steps=5) for t in (("markers", "wrench"), ("wrench",)))
     seen = [env.reset(seed=0)[0]["sensor_wrench"] for env in (both, alone)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from experiments import bench_markers as bench
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
+from tests.clock import steady_clock
 
 
 @pytest.mark.parametrize("options", [{"envs": "0"}, {"envs": "1,two"}, {"frames": 0}, {"models": "fots,fotz"}, {"models": ""}])
@@ -20,17 +22,23 @@ def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path, opti
     assert not (tmp_path / "out").exists()
 
 
-def test_a_small_run_times_every_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_small_run_times_every_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steady_clock(monkeypatch, bench)
     pytest.importorskip("warp")  # the surface model is timed on the coat of a simulated pad
     assert bench.main(bench.Args(out=tmp_path, device="cpu", envs="1,3", frames=6)) == 0
     metrics = read_metrics(tmp_path / "metrics.json")
     assert metrics["markers"] == 99
     for key in ("fots", "surface_markers", "superposition", "force_field", "fots_published"):
-        for suffix in ("", ".x3"):
-            least, median = (float(metrics[f"{key}{suffix}.ms_per_frame{which}"]) for which in ("_least", ""))
-            assert 0 < least <= median
+        for envs, suffix in ((1, ""), (3, ".x3")):
+            for which in ("_least", ""):
+                assert metrics[f"{key}{suffix}.ms_per_frame{which}"] == pytest.approx(1.0 / envs)
             assert metrics[f"{key}{suffix}.device"] == "cpu"
-    assert capsys.readouterr().out.count("ms a frame") == 10
+    printed = capsys.readouterr().out
+    for model in bench.MODELS:
+        for envs, ms in ((1, "1.000"), (3, "0.333")):
+            assert re.search(rf"^{model} +{envs} environments +{ms} ms a frame  \(least {ms}\)  on cpu$", printed, re.MULTILINE)
 
 
 def test_what_is_timed_is_in_contact_and_moves() -> None:

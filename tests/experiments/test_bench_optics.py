@@ -10,6 +10,8 @@ from experiments import bench_optics as bench
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.io.png import read_png
+from raytac.report import timing
+from tests.clock import steady_clock
 
 
 @pytest.mark.parametrize("options", [{"parts": "speed,colour"}, {"parts": ""}, {"scenes": " , "}, {"spp": 1}])
@@ -23,10 +25,12 @@ def test_quick_run_measures_everything_and_keeps_its_reference(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # for the process that the benchmark starts
+    steady_clock(monkeypatch, timing, 1.0)
     bench.main(bench.Args(out=tmp_path, device="cpu", quick=True))
     metrics = read_metrics(tmp_path / "metrics.json")
     numbers = {key: float(value) for key, value in metrics.items() if not isinstance(value, str)}
-    assert numbers["fast.cpu.80x60.fps"] > 1 and numbers["fast.cpu.80x60.batch2.device_fps"] > 1
+    assert numbers["fast.cpu.80x60.fps"] == 1.0 == numbers["fast.cpu.80x60.batch2.fps"] / 2
+    assert numbers["fast.cpu.80x60.batch2.device_fps"] == 2.0 and numbers["fast.cpu.80x60.batch2.device_call_ms"] == 1000.0
     assert numbers["fast.cpu.80x60.psnr_db"] == numbers["fast.cpu.80x60.psnr_db.sphere"] > 30
     # Both tracers are unbiased: four times the samples halve the error, less the reference's own noise and clipping.
     for kind in ("path", "reference"):

@@ -10,16 +10,21 @@ import pytest
 
 from experiments import bench_rl as bench
 from experiments import soak
+from raytac.envs import batch as env_batch
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
+from tests.clock import steady_clock
 
 
-def test_environment_steps_are_timed_and_split(tmp_path: Path) -> None:
+def test_environment_steps_are_timed_and_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Policy and step take one reading of the clock each; physics and observation are as the environment counts them."""
+    steady_clock(monkeypatch, bench)
+    steady_clock(monkeypatch, env_batch)
     bench.main(bench.Args(out=tmp_path, device="cpu", envs=2, modes="none", steps=3))
     found = read_metrics(tmp_path / "metrics.json")
-    parts = [float(found[f"push.none.{part}_ms"]) for part in ("physics", "observation", "policy")]
-    assert min(parts) > 0.0
-    assert float(found["push.none.env_steps_per_s"]) <= float(found["push.none.env_steps_per_s_best"])
+    assert [found[f"push.none.{part}_ms"] for part in ("physics", "observation", "policy")] == pytest.approx([1.0, 1.0, 1.0])
+    for key in ("env_steps_per_s", "env_steps_per_s_best"):
+        assert found[f"push.none.{key}"] == pytest.approx(2 / 2e-3)
 
 
 def test_frames_are_timed_without_physics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

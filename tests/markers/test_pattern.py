@@ -42,6 +42,7 @@ def test_order_is_row_by_row(sensor: SensorSpec) -> None:
 
 @pytest.mark.parametrize("slab", [False, True], ids=["straight", "slab"])
 @pytest.mark.parametrize("resolution", [None, (160, 120)])
+@pytest.mark.renderer
 def test_projection_round_trip(resolution: tuple[int, int] | None, slab: bool) -> None:
     """The ray through a marker's pixel meets the marker again."""
     sensor = load_sensor("gelsight_mini_7x9")

@@ -32,6 +32,7 @@ def still(sensor: SensorSpec, grid: PadGrid, batch: int = 1) -> GelSurface:
 
 
 @pytest.mark.parametrize("model", MARKERS.names)
+@pytest.mark.renderer
 def test_every_model_is_at_rest_on_a_pad_at_rest(model: str, sensor: SensorSpec, grid: PadGrid) -> None:
     frame = MarkerTracker(sensor, model, grid, num_envs=2, device="cpu").update(still(sensor, grid, 2))
     assert frame.displacement.shape == frame.displacement_px.shape == (2, 99, 2)
@@ -42,6 +43,7 @@ def test_every_model_is_at_rest_on_a_pad_at_rest(model: str, sensor: SensorSpec,
 
 
 @pytest.mark.parametrize("model", ["fots", "superposition", "force_field"])
+@pytest.mark.renderer
 def test_reset_clears_history(model: str, sensor: SensorSpec, grid: PadGrid) -> None:
     tracker = MarkerTracker(sensor, model, grid, device="cpu")
     first, last = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (0.0, 4e-4))
@@ -70,6 +72,7 @@ def test_another_number_of_environments_or_grid(sensor: SensorSpec, grid: PadGri
         tracker.update(pressed(make_grid(sensor.gelpad, 0.2e-3), [], []))
 
 
+@pytest.mark.renderer
 def test_a_broken_environment_is_nan_and_harms_no_other(sensor: SensorSpec, grid: PadGrid) -> None:
     surface = pressed(grid, [(0, 0, DEEP)], [(0, 0, DEEP)])
     surface.height[0] = np.nan

@@ -154,6 +154,7 @@ def test_crop_and_downscale_are_of_the_rendered_image() -> None:
         seen.observe(frame(size=(10, 8)))
 
 
+@pytest.mark.renderer
 def test_difference_to_rest_with_a_real_sensor() -> None:
     settings = ObservationSettings(("rgb",), resolution=(16, 12), difference=True, optics="phong")
     seen = TactileObserver("gelsight_mini", settings)

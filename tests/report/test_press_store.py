@@ -69,12 +69,13 @@ def test_the_code_is_that_of_solver_physics_and_presses(monkeypatch: pytest.Monk
     seen = set()
 
     def edited(path: Path) -> bytes:
-        seen.add(path.name)
+        seen.add(f"{path.parent.name}/{path.name}")
         return read(path) + (b"\n" if path.name == "newton.py" else b"")
 
     monkeypatch.setattr(Path, "read_bytes", edited)
     assert press_code() != before  # a line more in the solver
-    assert {"friction.py", "soft.py", "rigid.py", "calibration_presses.py", "standoff.py"} <= seen
+    assert {"soft/pad.py", "rigid/pad.py", "correction/standoff.py"} <= seen
+    assert {"friction.py", "calibration_presses.py"} <= {name.partition("/")[2] for name in seen}
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "empty"])

@@ -157,6 +157,7 @@ def test_every_kind_of_object_is_drawn(kind):
     assert np.isfinite(press.snapshot().pads[SENSOR.name].vertices).all()
 
 
+@pytest.mark.renderer
 def test_markers_follow_the_object_and_start_anew_on_reset():
     press = session(markers="fots", outputs=("wrench",))
     driven(press, depth=0.6)
@@ -169,6 +170,7 @@ def test_markers_follow_the_object_and_start_anew_on_reset():
     assert again is not None and np.nanmax(np.abs(again[1])) < 1e-6
 
 
+@pytest.mark.solver
 def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
     press = session(physics="ipc", pad="coarse")
     rest = press.snapshot().reshaped["coat_mesh"]
@@ -186,6 +188,7 @@ def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
 
 
 @pytest.mark.parametrize("kind", ["torus", "pins"])
+@pytest.mark.solver
 def test_the_mesh_of_a_simulated_pad_lies_on_the_coat_that_is_drawn(kind):
     """Above it everywhere, so that no line is broken, by no more than is needed for that."""
     from matplotlib.tri import LinearTriInterpolator, Triangulation
@@ -215,6 +218,7 @@ def test_no_slider_shows_less_than_there_is():
     assert limits(press, "force") == (0.0, 20.0)
 
 
+@pytest.mark.solver
 def test_an_object_that_lies_free_is_played_and_not_driven():
     free = replace(SCENE, object=replace(BALL, dynamics="affine"), trajectory=(StageSpec("indent", force=0.5),))
     press = session(free, physics="ipc", pad="coarse")
@@ -223,6 +227,7 @@ def test_an_object_that_lies_free_is_played_and_not_driven():
         press.drive({"depth": 0.1})
 
 
+@pytest.mark.solver
 def test_a_soft_object_is_drawn_as_it_deforms():
     soft = replace(SCENE, object=replace(BALL, dynamics="soft", youngs_modulus=2e5))
     press = session(soft, physics="ipc", pad="coarse")

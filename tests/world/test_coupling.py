@@ -130,6 +130,7 @@ def test_an_open_contact_takes_its_friction_and_torque_with_it():
     np.testing.assert_allclose(left, staying, atol=1e-4)
 
 
+@pytest.mark.solver
 def test_a_light_finger_presses_a_flat_face_with_its_force():
     """40 g on 5e4 N/m and more, exchanged every 10 ms: with the law it settles at its force, without it is thrown about."""
     forces = {}
@@ -148,6 +149,7 @@ def test_a_light_finger_presses_a_flat_face_with_its_force():
     assert np.ptp(forces[False][2:]) > 2.0
 
 
+@pytest.mark.solver
 def test_a_pad_dropped_on_a_face_loses_energy():
     rig = Coupled(SLIDER.format(h=1e-3, g=-G, z=0.6e-3, m=0.1, drive=""), ["finger"], BLOCK, TOP)
     rig.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
@@ -178,6 +180,7 @@ def squeezed(owner):
     return rig
 
 
+@pytest.mark.solver
 def test_the_same_press_whoever_owns_the_object():
     by_ipc, by_mujoco = squeezed("ipc"), squeezed("mujoco")
     for rig in (by_ipc, by_mujoco):
@@ -189,6 +192,7 @@ def test_the_same_press_whoever_owns_the_object():
     assert np.linalg.norm(by_ipc.scene.pose("cube")[0, :3, 3]) < 1e-4
 
 
+@pytest.mark.solver
 def test_a_stiff_arm_hardly_feels_its_pad():
     """Two-way and one-way agree as the drive's stiffness grows: both press as deep, and as hard."""
     found = {}

@@ -39,6 +39,7 @@ def test_named_environments_start_where_they_are_told_and_others_go_on() -> None
     np.testing.assert_allclose(world.reset().world_from_body["ball"][:, 0, 3], 0.45, atol=1e-12)
 
 
+@pytest.mark.solver
 def test_the_solver_s_bodies_start_elsewhere_too() -> None:
     world = TactileWorld("roll_ball", physics="ipc", outputs=("wrench",), num_envs=2)
     state = world.reset([1], bodies={"ball": shifted(world, "ball", 1, 0.02)})
@@ -75,6 +76,7 @@ def test_a_robot_can_carry_a_sensor_that_is_no_file() -> None:
 
 
 @pytest.mark.parametrize("physics", ["rigid", "ipc"])
+@pytest.mark.solver
 def test_a_start_that_cannot_be_changes_nothing(physics: str) -> None:
     world = TactileWorld("roll_ball", physics=physics, outputs=("wrench",), num_envs=2)
     before = world.step()

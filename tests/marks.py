@@ -1,0 +1,107 @@
+"""Marks by place: which tests need a renderer or a solver, and which run scripts. ``make check`` runs the others.
+
+A name is a folder of ``tests`` or a file in it; single tests carry the mark themselves. With ``-m "not renderer"`` the packages of the
+renderer cannot be imported, with ``-m "not solver"`` those of the solver: a test that needs them and does not say so fails, and names them.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.machinery
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+PLACES: dict[str, tuple[str, ...]] = {
+    "renderer": (
+        "calibrate",
+        "dataset/test_renderer.py",
+        "io/test_code_digest.py",
+        "markers/test_calibration.py",
+        "markers/test_dots.py",
+        "markers/test_fots.py",
+        "markers/test_fots_punch.py",
+        "markers/test_sensor.py",
+        "observe/test_device_images.py",
+        "observe/test_wrapper.py",
+        "optics",
+        "regression",
+        "report/test_compare.py",
+        "report/test_marker_error.py",
+        "report/test_press_sheet.py",
+        "report/test_real.py",
+        "report/test_tracers.py",
+        "test_bake_end_to_end.py",
+        "test_cli.py",
+        "test_doctor.py",
+        "test_press_end_to_end.py",
+        "view/test_view_command.py",
+    ),
+    "solver": (
+        "ipc",
+        "markers/test_other_models.py",
+        "physics/test_soft.py",
+        "physics/test_soft_batch.py",
+        "physics/test_soft_forces.py",
+        "physics/test_soft_objects.py",
+        "physics/test_soft_scene.py",
+        "regression",
+        "test_sensor_soft.py",
+        "world/test_held.py",
+        "world/test_soft_world.py",
+    ),
+    "script": ("dataset/test_ray_engine.py", "envs/test_sb3.py", "experiments", "test_packaging.py"),
+}
+PACKAGES = {"renderer": ("mitsuba", "drjit"), "solver": ("warp",)}
+
+
+def marks_of(path: Path) -> list[str]:
+    """Marks of all tests of a file."""
+    try:
+        place = path.relative_to(Path(__file__).parent).as_posix()
+    except ValueError:
+        return []
+    return [mark for mark, places in PLACES.items() if any(place == name or place.startswith(f"{name}/") for name in places)]
+
+
+def is_deselected(mark: str, expression: str) -> bool:
+    """Whether ``-m expression`` leaves out what has this mark alone."""
+    if mark not in expression:
+        return False
+    return not eval(expression, {"__builtins__": {}}, defaultdict(bool, {mark: True}))
+
+
+class Blocked(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Import hook in whose presence some packages cannot be imported; they can still be found, as if installed."""
+
+    def __init__(self, packages: dict[str, str]) -> None:
+        """``packages``: mark that a test which imports a package must have."""
+        self.packages = packages
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        return importlib.machinery.ModuleSpec(fullname, self) if fullname in self.packages else None
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType | None:
+        mark = self.packages[spec.name]
+        pytest.fail(
+            f"imports {spec.name} without the mark '{mark}': give it to the test, or to its file or folder in tests/marks.py"
+        )
+
+    def exec_module(self, module: ModuleType) -> None:
+        raise NotImplementedError
+
+
+def block(expression: str) -> Blocked | None:
+    """Block what the tests selected by ``-m expression`` must not import."""
+    packages = {package: mark for mark, names in PACKAGES.items() if is_deselected(mark, expression) for package in names}
+    if not packages:
+        return None
+    blocked = Blocked(packages)
+    sys.meta_path.insert(0, blocked)
+    return blocked
