@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, turned
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances
+from raytac.se3 import pose, rotations
 
 __all__ = ["BalancePole", "BalancePoleEnv", "BalancePoleVectorEnv"]
 
@@ -24,27 +25,25 @@ class BalancePole(Task):
     stands_on: ClassVar = "sensor"
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        # It leans about an edge of its foot, which stays a hair above the pad.
+        # The pole leans about an edge of its foot, which stays 0.1 mm above the pad.
         angle, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, np.radians(2.0))
         foot = tool[:3, 3] + [*rng.uniform(-1e-3, 1e-3, 2), 1e-4 + 0.003 * np.sin(tilt)]
-        begin = np.eye(4)
-        begin[:3, :3] = turned(np.array([np.cos(angle), np.sin(angle), 0.0]), tilt)
-        begin[:3, 3] = foot + 0.15 * begin[:3, 2]
-        return Start(tool[:3, 3].copy(), {"pole": begin})
+        rotation = rotations(tilt * np.array([np.cos(angle), np.sin(angle), 0.0]))
+        return Start(tool[:3, 3].copy(), {"pole": pose(rotation, foot + 0.15 * rotation[:, 2])})
 
-    def judge(self, now: Situation) -> Verdict:
-        axis = now.body[:, :3, 2]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        axis = state.body[:, :3, 2]
         tilt = np.arccos(np.clip(axis[:, 2], -1.0, 1.0))
-        foot = now.body[:, :3, 3] - 0.15 * axis
-        terminated = (far(foot, now.tool[:, :3, 3]) > 0.05) | (now.body[:, 2, 3] < 0.4) | (tilt > np.pi / 2)
+        foot = state.body[:, :3, 3] - 0.15 * axis
+        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > np.pi / 2)
         terms = {
             "alive": 1.0 * ~terminated,
             "terminated": -2.0 * terminated,
             "tilt": -np.square(tilt),
-            "tool_speed": -0.01 * np.abs(now.speed).sum(axis=1),
-            "pole_speed": -0.005 * np.abs(now.body_speed[:, 3:]).sum(axis=1),
+            "tool_speed": -0.01 * np.abs(state.speed).sum(axis=1),
+            "pole_speed": -0.005 * np.abs(state.body_speed[:, 3:]).sum(axis=1),
         }
-        return Verdict({**terms, **self.effort(now)}, terminated, ~terminated & (tilt < np.radians(12.0)))
+        return TaskResult({**terms, **self.effort(state)}, terminated, ~terminated & (tilt < np.radians(12.0)))
 
 
 class BalancePoleEnv(TactileEnv):

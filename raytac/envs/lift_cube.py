@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.se3 import pose
 
 __all__ = ["LiftCube", "LiftCubeEnv", "LiftCubeVectorEnv"]
 
@@ -29,21 +30,21 @@ class LiftCube(Task):
     body_seen: ClassVar = True
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        at = body[:3, 3] + [*rng.uniform(-0.03, 0.03, 2), 0.0]
+        position = body[:3, 3] + [*rng.uniform(-0.03, 0.03, 2), 0.0]
         goal = np.array([*(body[:2, 3] + rng.uniform(-0.05, 0.05, 2)), rng.uniform(0.08, 0.20)])
-        return Start(goal, {"object": placed(body, at)})
+        return Start(goal, {"object": pose(body[:3, :3], position)})
 
-    def judge(self, now: Situation) -> Verdict:
-        cube = now.body[:, :3, 3]
-        lifted, rest = cube[:, 2] > 0.04, far(cube, now.goal)
+    def evaluate(self, state: TaskState) -> TaskResult:
+        cube = state.body[:, :3, 3]
+        lifted, distance = cube[:, 2] > 0.04, distances(cube, state.goal)
         terms = {
-            "reaching": near(far(now.tool[:, :3, 3], cube), 0.1),
+            "reaching": near(distances(state.tool[:, :3, 3], cube), 0.1),
             "lifted": 15.0 * lifted,
-            "goal": 16.0 * lifted * near(rest, 0.3),
-            "goal_fine": 5.0 * lifted * near(rest, 0.05),
+            "goal": 16.0 * lifted * near(distance, 0.3),
+            "goal_fine": 5.0 * lifted * near(distance, 0.05),
         }
-        terminated = far(now.tool[:, :3, 3], cube) > 1.0
-        return Verdict({**terms, **self.effort(now)}, terminated, lifted & (rest < 0.02))
+        terminated = distances(state.tool[:, :3, 3], cube) > 1.0
+        return TaskResult({**terms, **self.effort(state)}, terminated, lifted & (distance < 0.02))
 
 
 class LiftCubeEnv(TactileEnv):

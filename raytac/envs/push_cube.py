@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed, turned
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.se3 import pose, rotations
 
 __all__ = ["PushCube", "PushCubeEnv", "PushCubeVectorEnv"]
 
@@ -22,26 +23,25 @@ class PushCube(Task):
     body_seen: ClassVar = True
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        at = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
-        begin = placed(body, at)
-        begin[:3, :3] = turned(np.array([0.0, 0.0, 1.0]), rng.uniform(-0.3, 0.3)) @ body[:3, :3]
+        position = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
+        rotation = rotations(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])) @ body[:3, :3]
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.10)
-        goal = at + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
-        return Start(goal, {"cube": begin})
+        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Start(goal, {"cube": pose(rotation, position)})
 
-    def judge(self, now: Situation) -> Verdict:
-        cube = now.body[:, :3, 3]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        cube = state.body[:, :3, 3]
         top = cube + np.array([0.0, 0.0, 0.02])
-        reach, rest = far(now.tool[:, :3, 3], top), far(cube[:, :2], now.goal[:, :2])
-        force = -now.wrench["sensor"][:, 2]
+        reach, distance = distances(state.tool[:, :3, 3], top), distances(cube[:, :2], state.goal[:, :2])
+        force = -state.wrench["sensor"][:, 2]
         terms = {
             "reaching": near(reach, 0.1),
             "touching": 1.0 * ((force > 0.5) & (force < 10.0)),
-            "target": 4.0 * near(rest, 0.1),
-            "target_fine": 4.0 * near(rest, 0.02),
+            "target": 4.0 * near(distance, 0.1),
+            "target_fine": 4.0 * near(distance, 0.02),
         }
-        terminated = far(now.tool[:, :3, 3], cube) > 1.0
-        return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.01)
+        terminated = distances(state.tool[:, :3, 3], cube) > 1.0
+        return TaskResult({**terms, **self.effort(state)}, terminated, distance < 0.01)
 
 
 class PushCubeEnv(TactileEnv):

@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.se3 import pose
 
 __all__ = ["RollBall", "RollBallEnv", "RollBallVectorEnv"]
 
@@ -22,27 +23,28 @@ class RollBall(Task):
     body_seen: ClassVar = False
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        at = body[:3, 3] + [*rng.uniform(-2e-3, 2e-3, 2), 0.0]
+        position = body[:3, 3] + [*rng.uniform(-2e-3, 2e-3, 2), 0.0]
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(5e-3, 10e-3)
-        return Start(at + distance * np.array([np.cos(angle), np.sin(angle), 0.0]), {"ball": placed(body, at)})
+        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Start(goal, {"ball": pose(body[:3, :3], position)})
 
-    def judge(self, now: Situation) -> Verdict:
-        ball, pad = now.body[:, :3, 3], now.tool[:, :3, 3]
-        aside, rest = far(ball[:, :2], pad[:, :2]), far(ball[:, :2], now.goal[:, :2])
-        force = -now.wrench["sensor"][:, 2]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        ball, pad = state.body[:, :3, 3], state.tool[:, :3, 3]
+        aside, distance = distances(ball[:, :2], pad[:, :2]), distances(ball[:, :2], state.goal[:, :2])
+        force = -state.wrench["sensor"][:, 2]
         touching = (force > 0.05) & (force < 5.0)
         terms = {
             "touching": 0.25 * touching,
             "aside": -0.05 * np.square(100.0 * aside),
             "lost_height": -15.0 * (ball[:, 2] > 0.025),
-            "goal_wide": 0.75 * near(rest, 0.6),
-            "goal": 1.25 * near(rest, 0.2),
-            "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(rest / 0.08))),
-            "reached": 5.0 * ((rest < 0.002) & touching),
+            "goal_wide": 0.75 * near(distance, 0.6),
+            "goal": 1.25 * near(distance, 0.2),
+            "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(distance / 0.08))),
+            "reached": 5.0 * ((distance < 0.002) & touching),
         }
-        off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (rest > 0.75)
+        off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
         terminated = off | (aside > 0.015) | (pad[:, 2] < 0.002)
-        return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.002)
+        return TaskResult({**terms, **self.effort(state)}, terminated, distance < 0.002)
 
 
 class RollBallEnv(TactileEnv):

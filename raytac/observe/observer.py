@@ -13,7 +13,6 @@ from raytac.checks import MOST_ENVIRONMENTS, check_kind, check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs, rounded_envs
-from raytac.observe.cells import CellMeans
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.observe.spaces import ArraySpec, array_specs
@@ -21,7 +20,7 @@ from raytac.sensor import TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["TactileObserver"]
+__all__ = ["CellMeans", "TactileObserver"]
 
 
 class TactileObserver:
@@ -151,11 +150,8 @@ class TactileObserver:
         if batch != len(rows):
             raise InputError("frame", value=batch, rule=f"must have {len(rows)} environments, as this observer")
         failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
-        found = {
-            name: self._rgb(frame, sensor, rows) if name == "rgb" else getattr(self, f"_{name}")(frame)
-            for name in self.settings.modalities
-        }
-        return self._finished(found, failed, rows)
+        values = {name: self._values(name, frame, sensor, rows) for name in self.settings.modalities}
+        return self._finished(values, failed, rows)
 
     def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
         """As ``observe``, where nothing but the ``wrench`` is observed, from the world's own: no sensor need look at the pad.
@@ -191,6 +187,25 @@ class TactileObserver:
         return {name: self._kept(name).copy() for name in self.settings.modalities}
 
     # --- modalities ------------------------------------------------------------------------------------------------------------
+
+    def _values(self, name: str, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
+        match name:
+            case "rgb":
+                return self._rgb(frame, sensor, rows)
+            case "markers":
+                markers = _given(frame.markers, name)
+                return self._scaled(name, np.where(markers.visible[..., None], markers.displacement, 0.0))
+            case "marker_visible":
+                return _given(frame.markers, name).visible.astype(np.int8)
+            case "contact":
+                return self._map(frame, frame.surface.contact).astype(np.float32)
+            case "height":
+                return self._scaled(name, self._map(frame, frame.surface.height))
+            case "indentation":
+                return self._scaled(name, self._map(frame, frame.surface.indentation))
+            case "wrench":
+                return self._scaled(name, _given(frame.wrench, name))
+        raise AssertionError(name)  # the settings know the names
 
     def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
         images = self._cut(_given(frame.rgb, "rgb"))
@@ -236,26 +251,6 @@ class TactileObserver:
             images = (blocks.sum(axis=(2, 4), dtype=np.uint32) + k * k // 2) // (k * k)
         return images.astype(np.uint8, copy=False)
 
-    def _markers(self, frame: TactileFrame) -> np.ndarray:
-        markers = _given(frame.markers, "markers")
-        moved = np.where(markers.visible[..., None], markers.displacement, 0.0)
-        return self._scaled("markers", moved)
-
-    def _marker_visible(self, frame: TactileFrame) -> np.ndarray:
-        return _given(frame.markers, "marker_visible").visible.astype(np.int8)
-
-    def _height(self, frame: TactileFrame) -> np.ndarray:
-        return self._scaled("height", self._map(frame, frame.surface.height))
-
-    def _indentation(self, frame: TactileFrame) -> np.ndarray:
-        return self._scaled("indentation", self._map(frame, frame.surface.indentation))
-
-    def _contact(self, frame: TactileFrame) -> np.ndarray:
-        return self._map(frame, frame.surface.contact).astype(np.float32)
-
-    def _wrench(self, frame: TactileFrame) -> np.ndarray:
-        return self._scaled("wrench", _given(frame.wrench, "wrench"))
-
     def _map(self, frame: TactileFrame, values: np.ndarray) -> np.ndarray:
         if self._cells is None or self._cells.nodes != frame.surface.grid.shape:
             self._cells = CellMeans(frame.surface.grid.shape, self.settings.map_shape)
@@ -300,3 +295,22 @@ def _given(value: Any, name: str) -> Any:
     if value is None:
         raise InputError("frame", value=name, rule="does not hold this modality: make its sensor with sensor_options")
     return value
+
+
+class CellMeans:
+    """From values at nodes (B, Ny, Nx) to their means over (rows, columns) cells; a node belongs to the cell that it lies in."""
+
+    def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
+        """Raises ``InputError`` if there are more cells than nodes."""
+        for name, n, m in zip(("rows", "columns"), nodes, cells, strict=True):
+            if m > n:
+                raise InputError("map_shape", value=tuple(cells), rule=f"must not have more {name} than the pad's grid, {n}")
+        self.nodes, self.cells = tuple(nodes), tuple(cells)
+        self._starts = [np.arange(m) * n // m for n, m in zip(nodes, cells, strict=True)]
+        self._counts = [np.diff(np.append(s, n)) for s, n in zip(self._starts, nodes, strict=True)]
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Means (B, rows, columns), float64."""
+        summed = np.add.reduceat(values, self._starts[0], axis=1, dtype=float)
+        summed = np.add.reduceat(summed, self._starts[1], axis=2)
+        return summed / (self._counts[0][:, None] * self._counts[1])

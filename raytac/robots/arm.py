@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.robots.pose import world_from_site
+from raytac.robots.frames import world_from_site
 
 __all__ = ["Arm"]
 

@@ -1,14 +1,24 @@
-"""Cartesian control by differential inverse kinematics: joint velocities that move a site towards a pose, within all limits.
+"""Inverse kinematics of one arm in two ways: by a quadratic program that keeps every limit, and by damped least squares for a batch.
 
-Each call solves one quadratic program with mink (K. Zakka, Apache-2.0) on DAQP:
+``DifferentialIk`` is for one arm that must not break a limit: a viewer, a demonstration, a search for joint positions. Each call solves a
+quadratic program in about a millisecond with mink (K. Zakka, Apache-2.0) on DAQP:
 
     min over Δq of  ‖J Δq − e‖² + w² ‖q₀ − q − Δq‖² + μ ‖e‖² ‖Δq‖²
     subject to      q_min ≤ q + Δq ≤ q_max,  |Δq| ≤ q̇_max Δt,
 
-e the twist from the site to its target, J the site's Jacobian, q₀ the posture that a redundant arm leans to. The term in μ is
-Levenberg and Marquardt's damping, which keeps Δq bounded where J loses rank: S. R. Buss, "Introduction to inverse kinematics with
+with e the twist from the site to its target, J the site's Jacobian, and q₀ the posture that a redundant arm tends to. The term in μ is the
+damping of Levenberg and Marquardt, which keeps Δq bounded where J loses rank: S. R. Buss, "Introduction to inverse kinematics with
 Jacobian transpose, pseudoinverse and damped least squares methods", 2004, section 5 and 7; proportional to ‖e‖² after T. Sugihara,
 "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE T-RO 27(5), 2011.
+
+``PoseServo`` is for a learner that steps dozens of environments: one small solve for all of them, without mink. A step that is too fast is
+shortened as a whole, and each joint stops at its limit on its own:
+
+    Δq = Jᵀ (J Jᵀ + λ² 1)⁻¹ e + g (1 − J⁺ J) (q₀ − q)
+
+C. W. Wampler, "Manipulator inverse kinematic solutions based on vector formulations and damped least-squares methods", IEEE Trans. Syst.
+Man Cybern. 16(1), 1986; the second term moves a redundant arm towards q₀ without moving the site (A. Liégeois, IEEE Trans. SMC 7(12),
+1977).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,6 +27,7 @@ Jacobian transpose, pseudoinverse and damped least squares methods", 2004, secti
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,10 +36,10 @@ import numpy as np
 
 from raytac.errors import BackendError, InputError
 from raytac.robots.arm import Arm
-from raytac.robots.pose import check_pose, pose_error
-from raytac.se3 import quaternion
+from raytac.robots.frames import site_poses
+from raytac.se3 import check_pose, pose_error, quaternion
 
-__all__ = ["DifferentialIk", "Reached"]
+__all__ = ["DifferentialIk", "IkResult", "PoseServo"]
 
 _STRIDE = 0.1
 """Duration [s] that ``reach`` gives each of its steps: at 2 rad/s, a fifth of a radian."""
@@ -40,7 +51,7 @@ _FLOOR = 1e-9
 
 
 @dataclass(frozen=True)
-class Reached:
+class IkResult:
     """What a search for joint positions came to."""
 
     joints: np.ndarray
@@ -127,7 +138,7 @@ class DifferentialIk:
         steps: int = 100,
         restarts: int = 10,
         seed: int = 0,
-    ) -> Reached:
+    ) -> IkResult:
         """Search joint positions that put the site at ``world_from_target`` (4, 4): such steps over and over, from ``qpos`` (nq,).
 
         A search that does not arrive within ``steps``, or stalls, is started again from random positions within the limits, up to
@@ -153,7 +164,7 @@ class DifferentialIk:
                 inside = bool(((joints >= self.arm.range[:, 0]) & (joints <= self.arm.range[:, 1])).all())
                 arrived = inside and distance <= position_tolerance and angle <= rotation_tolerance
                 if inside and (best is None or arrived or distance + angle < best.position_error + best.rotation_error):
-                    best = Reached(joints, distance, angle, spent, arrived)
+                    best = IkResult(joints, distance, angle, spent, arrived)
                 stalled = stalled + 1 if distance + angle > _PROGRESS * last else 0
                 last = distance + angle
                 if arrived or stalled > _PATIENCE:
@@ -164,7 +175,7 @@ class DifferentialIk:
             if best is not None and best.reached:
                 break
         assert best is not None  # the random starts are inside, and every step keeps them there
-        return Reached(best.joints, best.position_error, best.rotation_error, spent, best.reached)
+        return IkResult(best.joints, best.position_error, best.rotation_error, spent, best.reached)
 
     def _aim(self, qpos: np.ndarray, world_from_target: np.ndarray) -> None:
         mink, model = _mink(), self.arm.model
@@ -187,6 +198,71 @@ class DifferentialIk:
         if not solution.found or solution.x is None:
             raise BackendError("the quadratic program of the inverse kinematics has no solution here")
         return solution.x[self.arm.dof]
+
+
+class PoseServo:
+    """Steps of one arm in any number of environments. Keeps no state."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        max_velocity: np.ndarray | float,
+        posture: np.ndarray | None = None,
+        posture_gain: float = 0.1,
+        damping: float = 0.02,
+    ) -> None:
+        """Set the law.
+
+        Args:
+            arm: joints and site.
+            max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
+            posture: q₀ (n,); None does not lean.
+            posture_gain: g, share of the way to q₀ that a step makes.
+            damping: λ, of metres and radians alike.
+
+        Raises:
+            InputError: a shape, sign or range is wrong.
+        """
+        n = len(arm)
+        speed = np.asarray(max_velocity, float)
+        if speed.shape not in ((), (n,)) or not (speed > 0.0).all():
+            raise InputError("max_velocity", value=speed.tolist(), rule=f"must be positive, one or {n}")
+        if posture is not None and (np.shape(posture) != (n,) or not np.isfinite(posture).all()):
+            raise InputError("posture", value=np.asarray(posture).tolist(), rule=f"must be {n} finite numbers")
+        for name, value in (("posture_gain", posture_gain), ("damping", damping)):
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(name, value=value, rule="must be 0 or more, and finite")
+        self.arm, self._speed = arm, np.broadcast_to(speed, (n,)).copy()
+        self._posture, self._gain, self._damping = posture, posture_gain, damping
+
+    def targets(
+        self, datas: Sequence[mujoco.MjData], world_from_target: np.ndarray, twist: np.ndarray, duration: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Joint positions and velocities, each (B, n), by which the sites follow targets that move.
+
+        Args:
+            datas: states, kinematics up to date (``mj_kinematics`` and ``mj_comPos``, or any step).
+            world_from_target: where the targets are now (B, 4, 4).
+            twist: how they move, velocity above angular velocity (B, 6) [m/s, rad/s], world axes.
+            duration: how long the motion is followed [s]: what is still missing is made up for in that time.
+
+        Positions are those of now, ranges are kept; add velocities times the time since.
+        """
+        arm = self.arm
+        q = np.stack([data.qpos[arm.qpos] for data in datas])
+        jacobian = np.stack([arm.jacobian(data) for data in datas])
+        error = pose_error(world_from_target, site_poses(datas, arm.site))
+        transposed = np.swapaxes(jacobian, -1, -2)
+        gram = jacobian @ transposed + self._damping**2 * np.eye(6)
+        lean = np.zeros_like(q) if self._posture is None else self._gain * (self._posture - q)
+        # Leaning is a step of its own whose motion of the site is taken back.
+        error = error - (jacobian @ lean[..., None])[..., 0]
+        solved = transposed @ np.linalg.solve(gram, np.stack([error, twist], axis=-1))
+        step, velocity = solved[..., 0] + lean, solved[..., 1]
+        excess = np.maximum((np.abs(step) / (self._speed * duration)).max(axis=-1, keepdims=True), 1.0)
+        faster = np.maximum((np.abs(velocity) / self._speed).max(axis=-1, keepdims=True), 1.0)
+        return np.clip(q + step / excess, arm.range[:, 0], arm.range[:, 1]), velocity / faster
 
 
 def _mink() -> Any:

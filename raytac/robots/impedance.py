@@ -17,7 +17,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.robots.arm import Arm
-from raytac.robots.pose import check_pose, pose_error
+from raytac.se3 import check_pose, pose_error
 
 __all__ = ["CartesianImpedance", "JointImpedance", "JointTorque"]
 

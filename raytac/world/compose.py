@@ -16,16 +16,15 @@ from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.objects import object_parts
 from raytac.robots.arm import Arm
 from raytac.robots.gripper import floating_gripper
-from raytac.robots.mount import MountedSensor, mount_sensor
+from raytac.robots.mount import MountedSensor, RobotModel, mount_sensor
 from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
-from raytac.robots.pose import pose
-from raytac.se3 import quaternion, rotation_of
+from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import load_sensor
 from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, RobotSpec, TaskScene
 
-__all__ = ["ComposedBody", "ComposedScene", "compose", "pose_of"]
+__all__ = ["ComposedBody", "ComposedScene", "compose"]
 
 _GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -139,40 +138,26 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
     return ComposedScene(scene, model, robot.sensors, specs, arm, opening, fingers, bodies, start, ctrl)
 
 
-def pose_of(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
-    """Pose (4, 4) from a position [m] and a quaternion wxyz."""
-    return pose(rotation_of(quaternion), np.asarray(position, float))
-
-
-@dataclass(frozen=True)
-class _Robot:
-    spec: mujoco.MjSpec
-    sensors: tuple[MountedSensor, ...]
-    site: str
-    opening: str | None
-    joints: tuple[str, ...]
-
-
-def _robot(scene: TaskScene) -> tuple[_Robot, tuple[SensorSpec, ...]]:
+def _robot(scene: TaskScene) -> tuple[RobotModel, tuple[SensorSpec, ...]]:
     """The robot of a scene, not compiled, and the sensors on it."""
     robot = scene.robot
     sensor = robot.sensor if isinstance(robot.sensor, SensorSpec) else load_sensor(robot.sensor)
     if robot.model == "panda_one_sensor":
-        made = one_sensor_panda(sensor)
+        robot_model = one_sensor_panda(sensor)
     elif robot.model == "panda_two_fingers":
-        made = two_finger_panda(sensor)
+        robot_model = two_finger_panda(sensor)
     elif robot.model == "floating_gripper":
-        made = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
+        robot_model = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
     elif robot.model == "fixed_sensor":
         spec = mujoco.MjSpec()
         mounted = mount_sensor(spec, sensor, "world", pose_of(robot.position, robot.quaternion))
-        made = _Robot(spec, (mounted,), mounted.site, None, ())
+        robot_model = RobotModel(spec, (mounted,), mounted.site, None, ())
     else:
-        made = _own_robot(scene, robot, sensor)
-    return _Robot(made.spec, made.sensors, made.site, made.opening, tuple(made.joints)), (sensor,) * len(made.sensors)
+        robot_model = _own_robot(scene, robot, sensor)
+    return robot_model, (sensor,) * len(robot_model.sensors)
 
 
-def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot:
+def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> RobotModel:
     try:
         check_mjcf_size(robot.model)
         spec = mujoco.MjSpec.from_file(robot.model)
@@ -190,7 +175,7 @@ def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot
         except InputError as error:
             key = f"robot.mount[{i}].{error.name if error.name in ('at', 'name', 'kind') else 'position_mm'}"
             raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
-    return _Robot(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
+    return RobotModel(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
 
 
 def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:

@@ -36,7 +36,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.se3 import rotation_vector, rotations
+from raytac.se3 import rotation_vector, rotations, shifted_wrench
 
 __all__ = ["Coupling", "FreePartner", "Touching"]
 
@@ -213,7 +213,7 @@ class Coupling:
         for k, contact in enumerate(interval.contacts):
             for side, sign in ((contact.body, 1.0), (contact.other, -1.0)):
                 if isinstance(side, int):
-                    extra[held.index(side)] += sign * _moved_to(c[6 * k : 6 * k + 6], points[k], data.xpos[side])
+                    extra[held.index(side)] += sign * shifted_wrench(c[6 * k : 6 * k + 6], points[k] - data.xpos[side])
         data.xfrc_applied[held] = self._at_centre(data, interval.wrench + extra)
         for at, (name, mass) in enumerate(zip(names, inertia, strict=True)):
             interval.speed[name] = free_speed[at] + h * np.linalg.solve(mass, stand_in[:, 6 * at : 6 * at + 6].T @ c)
@@ -222,7 +222,7 @@ class Coupling:
     def _at_centre(self, data: mujoco.MjData, wrench: np.ndarray) -> np.ndarray:
         """Wrenches (n, 6) about the bodies' origins, as MuJoCo takes them: about their centres of mass."""
         arm = data.xpos[list(self.bodies)] - data.xipos[list(self.bodies)]
-        return np.concatenate([wrench[:, :3], wrench[:, 3:] + np.cross(arm, wrench[:, :3])], axis=1)
+        return shifted_wrench(wrench, arm)
 
     @staticmethod
     def _frame(data: mujoco.MjData, interval: _Interval, side: int | str | None) -> tuple[np.ndarray, np.ndarray]:
@@ -288,8 +288,3 @@ def _lever(arm: np.ndarray) -> np.ndarray:
     found = np.eye(6)
     found[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
     return found
-
-
-def _moved_to(wrench: np.ndarray, point: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """A wrench (6,) about ``point``, about ``origin``."""
-    return np.concatenate([wrench[:3], wrench[3:] + np.cross(point - origin, wrench[:3])])

@@ -36,15 +36,15 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.load_law import LoadLaw
+from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
-from raytac.robots.pose import body_poses, site_poses
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
 from raytac.world.bonded_face import BondedFace
 from raytac.world.compose import ComposedScene
+from raytac.world.environment_models import EnvironmentModels
 from raytac.world.pad_overlap import PadOverlap, Touches
-from raytac.world.state import Drive, lost
-from raytac.world.variation import EnvironmentModels
+from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
 

@@ -25,18 +25,18 @@ from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import SceneBody, scene_body
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import ScenePad, SceneReport, SoftScene
-from raytac.robots.pose import body_poses, site_poses
-from raytac.se3 import quaternion
+from raytac.robots.frames import body_poses, site_poses
+from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.task import PAIR_FRICTION, TaskScene
-from raytac.world.compose import ComposedScene, pose_of
+from raytac.world.compose import ComposedScene
 from raytac.world.coupling import Coupling
+from raytac.world.environment_models import EnvironmentModels
 from raytac.world.robot_overlap import Inside, RobotOverlap
 from raytac.world.soft_answers import soft_answers
-from raytac.world.state import Drive, lost
-from raytac.world.variation import EnvironmentModels
+from raytac.world.world_state import Drive, lost
 
 __all__ = ["SoftPads"]
 

@@ -20,8 +20,8 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
+from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import body_poses, site_poses
 from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
 from raytac.sensor.options import check_physics
@@ -29,9 +29,9 @@ from raytac.specs.press import PADS, chosen_physics
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
+from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.rigid_pads import RigidPads
-from raytac.world.state import BatchController, Control, Drive, WorldState
-from raytac.world.variation import EnvironmentModels, Variation
+from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
