@@ -28,7 +28,7 @@ _FREQUENCY = 60.0
 
 
 class Steering:
-    """A controller of one environment (see ``raytac.world``): ``aim`` sets ends, ``go`` moves on by one control step.
+    """A controller of one environment (see ``raytac.world.state.Controller``): ``aim`` sets ends, ``go`` moves on by one control step.
 
     Arms with torque motors follow by differential inverse kinematics and joint impedance, a driven frame by its servos. Other robots
     are held at their start.

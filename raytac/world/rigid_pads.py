@@ -40,9 +40,9 @@ from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
-from raytac.world.bonded_face import BondedFace
 from raytac.world.compose import ComposedScene
 from raytac.world.environment_models import EnvironmentModels
+from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.pad_overlap import PadOverlap, Touches
 from raytac.world.world_state import Drive, lost
 

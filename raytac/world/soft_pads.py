@@ -32,10 +32,9 @@ from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene
-from raytac.world.coupling import Coupling
+from raytac.world.coupling import Coupling, coupling_inputs
 from raytac.world.environment_models import EnvironmentModels
-from raytac.world.robot_overlap import Inside, RobotOverlap
-from raytac.world.soft_answers import soft_answers
+from raytac.world.forbidden_overlap import Inside, RobotOverlap
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["SoftPads"]
@@ -228,7 +227,7 @@ class SoftPads:
         return []
 
     def _prepare_held(self) -> None:
-        """Invert the stiffness of soft bodies that are held now, not in the step that first touches them (see ``soft_answers``)."""
+        """Invert the stiffness of soft bodies that are held now, not in the step that first touches them (see ``coupling_inputs``)."""
         scene = self.composed.scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
@@ -274,11 +273,11 @@ class SoftPads:
         alive = np.flatnonzero(~failed).tolist()
         self._mirror(datas, alive)
         if self._coupling is not None:
-            answers = soft_answers(self.soft, self._felt)
+            inputs = coupling_inputs(self.soft, self._felt)
             for b in alive:
-                failed[b] = not np.isfinite(answers[b][0]).all()
+                failed[b] = not np.isfinite(inputs[b][0]).all()
                 if not failed[b]:
-                    self._coupling.update(datas[b], b, *answers[b])
+                    self._coupling.update(datas[b], b, *inputs[b])
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
