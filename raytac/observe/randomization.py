@@ -25,7 +25,7 @@ class Randomization:
 
     *Each environment, at every reset*: the camera (``CameraDrift``) by ``exposure``, ``white_balance``, ``gamma``; the pattern of
     ``markers``; the mounting of the pad by ``pad_shift``, ``pad_turn``; and in environments with rigid pads (``TaskBatch``) bodies by
-    ``body_mass``, ``body_friction``, gels by ``youngs_modulus``, ``friction``. *Each frame*: ``noise``, and noise and losses of ``markers``.
+    ``body_mass``, ``body_friction``, gels by ``youngs_modulus``, ``friction``. *Each frame*: ``noise``, and noise and loss of ``markers``.
     *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``;
     with soft pads, or a sensor that is in no environment, gels too, and bodies (``randomised_bodies``). A table of ``taxim`` is baked for
     every such sensor, which the ray tracer does not need: vary seeds over processes.

@@ -22,7 +22,7 @@ def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path, opti
 
 def test_a_small_run_times_every_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("warp")  # the surface model is timed on the coat of a simulated pad
-    assert bench.main(bench.Args(out=tmp_path, device="cpu", envs="1,3", frames=6)) == 0
+    bench.main(bench.Args(out=tmp_path, device="cpu", envs="1,3", frames=6))
     metrics = read_metrics(tmp_path / "metrics.json")
     assert metrics["markers"] == 99
     for key in ("fots", "surface_markers", "superposition", "force_field", "fots_published"):
