@@ -26,10 +26,7 @@ __all__ = ["ACTIONS", "ActionControl"]
 
 ACTIONS = ("pose", "joints")
 """``pose``: an action moves the target of the tool's pose, in the axes of the task. ``joints``: it moves the targets of the arm's seven
-joints, by up to 0.05 rad a step, and the opening if there is one."""
-_JOINT_STEP, _JOINT_LEASH = 0.05, 0.1
-_FREQUENCY = 30.0
-"""Natural frequency of the joints' springs [rad/s]."""
+joints, by up to ``Motion.joint_step`` a step, and the opening if there is one."""
 
 
 class ActionControl:
@@ -46,7 +43,7 @@ class ActionControl:
             raise InputError("scene", value=world.scene.name, rule="needs an arm with torque motors")
         self.world, self.arm, self.motion, self.action = world, world.arm, motion, action
         self._posture = world.composed.start[self.arm.qpos].copy()
-        self._law = JointImpedance(self.arm, frequency=_FREQUENCY)
+        self._law = JointImpedance(self.arm, frequency=motion.frequency)
         self._servo = PoseServo(self.arm, max_velocity=np.array(MAX_VELOCITY), posture=self._posture)
         self._has_grip = "grip" in motion.axes
         self.size = len(motion.axes) if action == "pose" else len(self.arm) + self._has_grip
@@ -97,8 +94,8 @@ class ActionControl:
             joints, speed = self._servo.targets(self.world.data, before, pose_error(self._target, before) / dt, dt)
         else:
             present = np.array([data.qpos for data in self.world.data])[:, self.arm.qpos]
-            target = self._joints + _JOINT_STEP * actions[:, : len(self.arm)]
-            target = np.clip(target, present - _JOINT_LEASH, present + _JOINT_LEASH)
+            target = self._joints + self.motion.joint_step * actions[:, : len(self.arm)]
+            target = np.clip(target, present - self.motion.joint_leash, present + self.motion.joint_leash)
             target = np.clip(target, self.arm.range[:, 0], self.arm.range[:, 1])
             joints, speed = self._joints, (target - self._joints) / dt
             self._joints = target

@@ -31,6 +31,12 @@ class Motion:
     """Greatest rotation of the target from the start [rad]."""
     opening: tuple[float, float] = (0.0, 0.08)
     """Least and greatest opening that an action can command [m]."""
+    joint_step: float = 0.05
+    """Change of a joint's target in a control step for an action of 1, with ``action="joints"`` [rad]."""
+    joint_leash: float = 0.1
+    """Greatest lead of a joint's target over the joint [rad]."""
+    frequency: float = 30.0
+    """Natural frequency of the joints' springs [rad/s]."""
 
 
 @dataclass(frozen=True)

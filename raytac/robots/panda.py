@@ -17,7 +17,7 @@ import numpy as np
 
 from raytac.assets import asset_root
 from raytac.errors import InputError
-from raytac.robots.gripper import FACING, add_opening_servo
+from raytac.robots.gripper import FACING, GripperSettings, add_opening_servo
 from raytac.robots.mount import RobotModel, case_depth, mount_sensor, standing_on
 from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
@@ -142,7 +142,7 @@ def _replace_servo(spec: mujoco.MjSpec) -> None:
     for actuator in list(spec.actuators):
         if actuator.target not in JOINTS:
             spec.delete(actuator)
-    add_opening_servo(spec, ("finger_joint1", "finger_joint2"))
+    add_opening_servo(spec, ("finger_joint1", "finger_joint2"), GripperSettings())
 
 
 def _read(path: Path) -> mujoco.MjSpec:

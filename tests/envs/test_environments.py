@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -212,6 +213,24 @@ def test_a_policy_reads_the_state_of_the_batch_and_cannot_change_it() -> None:
     for name in ("tool", "body", "body_speed", "goal", "action", "target"):
         getattr(batch, name)[:] = np.nan
         assert np.isfinite(getattr(batch, name)).all(), name
+
+
+def test_steps_of_joint_actions_are_the_motions() -> None:
+    class Slow(RollBall):
+        motion = replace(RollBall.motion, joint_step=0.01)
+
+    moved = []
+    for task in (RollBall(), Slow()):
+        batch = TaskBatch(task, tactile=None, action="joints")
+        batch.reset([0], [np.random.default_rng(0)])
+        start = batch.world.state().joints
+        assert start is not None
+        for _ in range(5):
+            batch.step(np.eye(7)[:1])
+        joints = batch.world.state().joints
+        assert joints is not None
+        moved.append(float(np.abs(joints - start)[0, 0]))
+    assert 0.01 < moved[1] < 0.4 * moved[0], moved
 
 
 def test_the_shipped_policies_read_public_names_only() -> None:
