@@ -32,7 +32,7 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
     """Arrays of an observation with ``settings``, by modality.
 
     Raises:
-        InputError: markers are asked for and the sensor has none, or an image is too large.
+        InputError: markers are observed and the sensor has none, or an image is too large.
     """
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
