@@ -20,19 +20,17 @@ there was to see; ``force_n`` of each, and ``truth_force_n``.
 
 from __future__ import annotations
 
-import sys
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 import ipc
-from raytac.errors import InputError, RaytacError
+from experiments.running import recorded, run
+from raytac.errors import InputError
 from raytac.gel import CoatMesh
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, parse_names
 from raytac.markers import bind_to_coat
 from raytac.physics import PadLevel, PadMesh, SoftPad, pad_mesh
 from raytac.shapes import object_height
@@ -67,15 +65,14 @@ class Args(CommonOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
-    def run(self) -> int:
-        start = time.perf_counter()
+    def run(self) -> None:
         levels, shapes = parse_names(self.levels, "levels"), parse_names(self.shapes, "shapes")
         for value, name, choices in [(v, "levels", PADS) for v in levels] + [(v, "shapes", (*SHAPES, BALL)) for v in shapes]:
             if value not in choices:
                 raise InputError(name, value=value, rule="must be known", choices=tuple(choices))
         spec = load_sensor(self.sensor)
-        metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um, "seed": self.seed, "device": "cpu"}
-        with result_folder(self.out or Path("runs") / "bench_coat", ("metrics.json",)) as folder:
+        with recorded(self, "bench_coat", device="cpu", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+            metrics["cell_um"] = self.cell_um
             if BALL in shapes:
                 metrics |= marked(spec, levels, 4e-6 * self.cell_um)
             for shape in (shape for shape in shapes if shape != BALL):
@@ -89,12 +86,9 @@ class Args(CommonOptions):
                             at = SHAPES[shape] + np.linspace(low, high, 200)
                             off = np.interp(at, *section) - np.interp(at, *truth)
                             metrics[f"{shape}.{level}.{kind}{name}_um"] = 1e6 * float(np.sqrt((off**2).mean()))
-            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
-            write_metrics(folder / "metrics.json", metrics)
         for key, value in metrics.items():
             if not key.startswith("versions"):
                 print(f"{key} = {value:.5g}" if isinstance(value, float) else f"{key} = {value}")
-        return 0
 
 
 Section = tuple[np.ndarray, np.ndarray]
@@ -215,13 +209,5 @@ def steps(first: float, length: float, growth: float) -> np.ndarray:
     return np.asarray(at) * (length / at[-1])
 
 
-def main() -> int:
-    try:
-        return tyro.cli(Args).run()
-    except (InputError, RaytacError) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(Args.run, Args)

@@ -11,17 +11,15 @@ are the coat's vertices of a medium pad: what physics costs comes on top. Median
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import tyro
 
-from raytac.errors import InputError, RaytacError
+from experiments.running import recorded, run
+from raytac.errors import InputError
 from raytac.gel import DeformedCoat, GelSurface
-from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
+from raytac.io import CommonOptions
 from raytac.markers import MARKERS, MarkerTracker
 from raytac.physics import RigidPad, pad_mesh
 from raytac.report import machine
@@ -96,8 +94,7 @@ def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Ar
     return times[-count:], tracker.model.device
 
 
-def main(args: Args) -> int:
-    begin = time.perf_counter()
+def main(args: Args) -> None:
     texts, models = args.envs.split(","), args.models.split(",")
     if not all(text.strip().isdecimal() and int(text) for text in texts):
         raise InputError("envs", value=args.envs, rule="must be whole numbers >= 1, joined by commas")
@@ -110,37 +107,23 @@ def main(args: Args) -> int:
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
         motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
         sensor = replace(sensor, marker_motion=motion)
-    metrics: dict[str, Metric] = {}
-    for envs in map(int, texts):
-        surfaces = pressed(sensor, envs)
-        for model in models:
-            times, device = measure(model, sensor, surfaces, args)
-            key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
-            metrics |= {
-                f"{key}.ms_per_frame": float(np.median(times)),
-                f"{key}.ms_per_frame_least": float(np.min(times)),
-                f"{key}.device": device,
-            }
-            print(
-                f"{model:14} {envs:5d} environments  {np.median(times):8.3f} ms a frame  (least {np.min(times):.3f})  on {device}"
-            )
-    common = {
-        "experiment": "bench_markers",
-        "sensor": sensor.name,
-        "markers": sensor.markers.rows * sensor.markers.columns,
-        "device": args.device,
-        "seed": args.seed,
-        "cores": os.cpu_count() or 1,
-        **versions((*VERSIONED, "warp-lang")),
-        **machine(),
-    }
-    with result_folder(args.out or Path("runs/bench_markers"), ("metrics.json",)) as folder:
-        write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})
-    return 0
+    with recorded(args, "bench_markers", device=args.device, owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+        count = sensor.markers.rows * sensor.markers.columns
+        metrics |= {"sensor": sensor.name, "markers": count, "cores": os.cpu_count() or 1, **machine()}
+        for envs in map(int, texts):
+            surfaces = pressed(sensor, envs)
+            for model in models:
+                times, device = measure(model, sensor, surfaces, args)
+                key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
+                metrics |= {
+                    f"{key}.ms_per_frame": float(np.median(times)),
+                    f"{key}.ms_per_frame_least": float(np.min(times)),
+                    f"{key}.device": device,
+                }
+                print(
+                    f"{model:14} {envs:5d} environments  {np.median(times):8.3f} ms a frame  (least {np.min(times):.3f})  on {device}"
+                )
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args)))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

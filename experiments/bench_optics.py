@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from experiments.running import recorded, run
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, parse_names
 from raytac.report import (
     References,
     Tracers,
@@ -460,7 +460,6 @@ def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     parts = parse_names(args.parts, "parts", PARTS)
     scenes = parse_names(args.scenes, "scenes")
     if args.spp < 2 or args.frames < 1:
@@ -475,8 +474,6 @@ def main(args: Args) -> None:
     tracers = Tracers(spec, device, args.seed)
     bench = Bench(args, device, spec, size, surfaces, frames, spp, peer_spp, out, tracers)
     references = References(out / "references", tracers, size, spp)
-    metrics: dict[str, Metric] = {"experiment": "bench_optics", "device": device, "seed": args.seed, **versions(), **machine()}
-    metrics |= {"frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
     jobs: dict[str, Callable[[], dict[str, Metric]]] = {
         "speed": lambda: speed(bench),
         "error": lambda: error(bench, references),
@@ -485,7 +482,8 @@ def main(args: Args) -> None:
         "memory": lambda: memory(bench),
         "first_image": lambda: first_image(bench),
     }
-    with result_folder(out) as folder:
+    with recorded(args, "bench_optics", device=device) as (folder, metrics):
+        metrics |= {**machine(), "frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
         for part in parts:
             began = time.perf_counter()
             metrics |= jobs[part]()
@@ -493,14 +491,9 @@ def main(args: Args) -> None:
             print(f"{part}: {metrics[f'wall_s.{part}']:.1f} s")
         if "peer" in parts:
             draw(metrics, bench, folder / "pareto.png")
-        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
-        write_metrics(folder / "metrics.json", metrics)
+        metrics["machine.load_at_end"] = os.getloadavg()[0]
     print(as_text(metrics, bench))
-    print(f"{out / 'metrics.json'}" + (f", {out / 'pareto.png'}" if "peer" in parts else ""))
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as problem:
-        sys.exit(f"error: {problem}")
+    run(main, Args)

@@ -12,7 +12,6 @@ installed (``pip install taxim[jax-cpu]``); it is timed with its own sensor, and
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from experiments.running import recorded, run
 from raytac.device import resolve_device
-from raytac.errors import BackendError, RaytacError
+from raytac.errors import BackendError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, parse_names
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -140,15 +139,13 @@ def error(
 def main(args: Args) -> None:
     from raytac.optics import BakeSettings, baked_table
 
-    start = time.perf_counter()
     device = resolve_device(args.device)
-    out = args.out if args.out is not None else Path("runs") / "bench_taxim"
     scenes = parse_names(args.scenes, "scenes")[: 1 if args.quick else None]
     sizes = {"80x60": (80, 60)} if args.quick else SIZES
     first = next(iter(sizes.values()))
     spec, surfaces = press_peaks(args.sensor, scenes, first, args.seed)
-    metrics: dict[str, Metric] = {"experiment": "bench_taxim", "device": device, "seed": args.seed, **versions(), **machine()}
-    with result_folder(out, ("metrics.json",)) as folder:
+    with recorded(args, "bench_taxim", device=device, owned=("metrics.json",)) as (_, metrics):
+        metrics |= machine()
         began = time.perf_counter()
         settings, baked_at = (BakeSettings.quick(), first) if args.quick else (BakeSettings(), None)
         table = baked_table(spec, device=device, seed=args.seed, settings=settings, resolution=baked_at)
@@ -164,16 +161,11 @@ def main(args: Args) -> None:
             for family, other in (("taxim", "peer"), ("taxim_shadow", "peer_shadow")):
                 mine = 1e3 / float(metrics[f"{family}.{device}.{name}.fps"])
                 metrics[f"{family}.vs_peer_speedup"] = float(metrics[f"{other}.{device}.{name}.ms_per_frame"]) / mine
-        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
-        write_metrics(folder / "metrics.json", metrics)
+        metrics["machine.load_at_end"] = os.getloadavg()[0]
     for key, value in metrics.items():
         if not key.startswith(("versions.", "machine.")):
             print(f"{key} = {value:.4g}" if isinstance(value, float) else f"{key} = {value}")
-    print(out / "metrics.json")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as problem:
-        sys.exit(f"error: {problem}")
+    run(main, Args)

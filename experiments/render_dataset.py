@@ -9,7 +9,6 @@ Killed at any time, the same command goes on where it stopped. docs/datasets.md 
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,8 +16,9 @@ from typing import Annotated
 
 import tyro
 
+from experiments.running import run
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
-from raytac.errors import InputError, RaytacError
+from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
 from raytac.physics import hush_solver
 from raytac.report import machine
@@ -132,7 +132,4 @@ def _asked(args: Args) -> SweepSpec:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

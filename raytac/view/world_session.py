@@ -23,8 +23,8 @@ from raytac.view.sensor_view import (
 )
 from raytac.view.session import CameraPlace, Colour, Control, Lines, Pad, Snapshot, Solid, check_targets
 from raytac.view.steering import Steering
-from raytac.world.state import WorldState
 from raytac.world.world import TactileWorld
+from raytac.world.world_state import WorldState
 
 __all__ = ["WorldSession"]
 

@@ -1,4 +1,4 @@
+from .environment_models import Variation as Variation
 from .scene_camera import SceneCamera as SceneCamera
-from .state import WorldState as WorldState
-from .variation import Variation as Variation
 from .world import TactileWorld as TactileWorld
+from .world_state import WorldState as WorldState

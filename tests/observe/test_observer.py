@@ -12,7 +12,7 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.markers import Fots, MarkerFrame, MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization, TactileObserver, gymnasium_space, randomised_sensor
-from raytac.observe.cells import CellMeans
+from raytac.observe.observer import CellMeans
 from raytac.observe.randomization import CameraDrift
 from raytac.specs import load_sensor
 

@@ -19,7 +19,7 @@ from raytac.se3 import rotations
 from raytac.shapes.part import mesh_part, primitive
 from raytac.shapes.underside import object_radius
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
-from raytac.world.bonded_face import BondedFace
+from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.world import TactileWorld
 
 MINI = load_sensor("gelsight_mini")

@@ -17,8 +17,8 @@ import pytest
 from raytac.errors import InputError, SpecError
 from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor, load_task
-from raytac.world.state import BatchController
 from raytac.world.world import TactileWorld
+from raytac.world.world_state import BatchController
 
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05)
 UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,))

@@ -1,4 +1,4 @@
-"""Worlds with simulated pads: who owns what, forces, reset, and what is refused."""
+"""Worlds with soft pads: owners of bodies, forces, resets and errors."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module names its types at run time.)

@@ -1,4 +1,4 @@
-"""What a world is like after a step, and how it is steered."""
+"""State of a world after a step, and the controllers that drive it."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's compiled module names its types at run time.)
@@ -25,15 +25,15 @@ Drive = Callable[[Sequence[int] | np.ndarray], None]
 
 
 class BatchController(ABC):
-    """A controller of all environments in one call."""
+    """Controller of all environments in one call."""
 
     @abstractmethod
     def drive(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
-        """Write ``ctrl`` of ``datas[b]`` for every b of ``envs``; called as a ``Controller`` is. Those not named have failed."""
+        """Write ``ctrl`` of ``datas[b]`` for every b of ``envs``, when a ``Controller`` would be called; the others have failed."""
 
 
 Control = Controller | BatchController | Sequence[Controller] | np.ndarray
-"""One controller for all environments or for each at a time, one for each, or constant controls (nu,) or (B, nu)."""
+"""Controllers of a world: one for all environments, one for each, or constant controls (nu,) or (B, nu)."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class WorldState:
     """B environments at one instant, world frame unless said otherwise. An environment that failed holds NaN."""
 
     time: np.ndarray
-    """Since the reset [s], shape (B,)."""
+    """Time since the reset [s], shape (B,)."""
     joints: np.ndarray | None
     """Positions of the arm's joints [rad or m], shape (B, n); None without an arm."""
     world_from_pad: dict[str, np.ndarray]
@@ -49,15 +49,15 @@ class WorldState:
     world_from_body: dict[str, np.ndarray]
     """Pose (B, 4, 4) of every rigid body."""
     wrench: dict[str, np.ndarray]
-    """Force of what touches on each pad [N] and its torque about the pad frame's origin [N m], **pad frame**, shape (B, 6)."""
+    """Contact force on each pad [N] and its torque about the pad frame's origin [N m], **pad frame**, shape (B, 6)."""
     failed: np.ndarray
     """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
     report: dict[str, np.ndarray] = field(default_factory=dict)
-    """What the pads' solver says of this step, each (B,); empty with the rigid pad."""
+    """Report of the pads' solver on this step, each (B,); empty with the rigid pad."""
 
 
 def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
-    """Which of one or more states of MuJoCo are beyond use, (n,): a number is not finite, or a joint runs away."""
-    speed, place = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
+    """True (n,) for states of MuJoCo that are invalid: a number is not finite, or a joint is far too fast."""
+    speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
     # One number that is not finite makes the sum such.
-    return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < _LARGEST_SPEED) & np.isfinite(place.sum(axis=1)))
+    return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < _LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))

@@ -1,7 +1,7 @@
-"""Environments of one world that differ: masses, friction, gels, and pads that do not sit where the drawing has them.
+"""Environments of one world that differ: masses, friction, gels, and mounting errors of pads.
 
-MuJoCo keeps such numbers in its model, of which a world has one for all environments. An environment that differs gets a model of its own,
-the scene's with these numbers changed; what MuJoCo derives from them (inverse weights) is computed anew.
+MuJoCo keeps such numbers in its model, of which a world has one for all environments. An environment that differs gets its own copy of the
+scene's model with these numbers changed; quantities that MuJoCo derives from them (inverse weights) are computed again.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -25,22 +25,22 @@ __all__ = ["EnvironmentModels", "Variation"]
 
 @dataclass(frozen=True)
 class Variation:
-    """What n environments have otherwise than the scene; all that is not named is as in the scene."""
+    """Differences of n environments from the scene; what is not named is as in the scene."""
 
     mass: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Free body to factors (n,) of its mass and inertia."""
     friction: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Body to factors (n,) of the coefficients that the scene gives it, against gel and against all else; none that it leaves out."""
+    """Body to factors (n,) of its friction coefficients in the scene, against gel and against all else."""
     gel_stiffness: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Sensor to factors (n,) of its gel's Young's modulus."""
     gel_friction: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Sensor to factors (n,) of its gel's own coefficient of friction, which holds for bodies that the scene gives none."""
+    """Sensor to factors (n,) of its gel's own friction coefficient, which applies to bodies without one in the scene."""
     mounting: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Sensor to ``nominal_from_pad`` (n, 4, 4): where its pad is in the frame in which the scene has the pad."""
+    """Sensor to ``nominal_from_pad`` (n, 4, 4): pose of its pad relative to the pad as designed."""
 
 
 class EnvironmentModels:
-    """MuJoCo's models of B environments: the scene's own, but for those that differ.
+    """MuJoCo's models of B environments: the scene's, or a copy for each environment that differs.
 
     Attributes:
         inverse_weight: ``body_invweight0`` of translations [1/kg], (B, bodies of the model).
@@ -71,15 +71,15 @@ class EnvironmentModels:
         return self._models[env]
 
     def differ(self, envs: Sequence[int] | range) -> bool:
-        """Whether any of these environments has a model of its own."""
+        """True if any of these environments has its own model."""
         return any(self._models[b] is not self._composed.model for b in envs)
 
     def snapshot(self) -> tuple[list[mujoco.MjModel], list[np.ndarray]]:
-        """What ``restore`` takes."""
+        """Present models and numbers, for ``restore``."""
         return list(self._models), [values.copy() for values in self._numbers()]
 
     def restore(self, before: tuple[list[mujoco.MjModel], list[np.ndarray]]) -> None:
-        """As at a ``snapshot``."""
+        """Return to a ``snapshot``."""
         self._models[:] = before[0]
         for values, old in zip(self._numbers(), before[1], strict=True):
             values[:] = old
@@ -88,15 +88,15 @@ class EnvironmentModels:
         return self.inverse_weight, self.friction_on_gel, self.gel_stiffness, self.gel_friction
 
     def check(self, variation: Variation, count: int, *, rigid: bool) -> None:
-        """Refuse what cannot be.
+        """Raise for a variation that is not possible.
 
         Args:
             variation: of ``count`` environments.
-            rigid: whether pads are rigid: the solver of simulated ones has the same bodies and gels in all environments.
+            rigid: pads are rigid; the solver of soft pads has the same bodies and gels in all environments.
 
         Raises:
             InputError: a name that is not there, factors that are not positive and finite, poses that are not rigid, arrays of another
-                length, or bodies or gels that differ with simulated pads.
+                length, or bodies or gels that differ with soft pads.
         """
         free = [body.spec.name for body in self._bodies if body.spec.dynamics == "free"]
         sensors = [mounted.name for mounted in self._composed.sensors]
@@ -105,7 +105,7 @@ class EnvironmentModels:
         for what, known in names.items():
             given: Mapping[str, np.ndarray] = getattr(variation, what)
             if given and what != "mounting" and not rigid:
-                rule = "needs the rigid pad: the solver of simulated pads has the same bodies and gels in all environments"
+                rule = "needs the rigid pad: the solver of soft pads has the same bodies and gels in all environments"
                 raise InputError(f"variation.{what}", value=sorted(given), rule=rule)
             for name, values in given.items():
                 label = f"variation.{what}[{name!r}]"
@@ -123,35 +123,35 @@ class EnvironmentModels:
                     raise InputError(label, value=float(factors[row]), rule=f"must be positive and finite; row {row} is not")
 
     def vary(self, envs: Sequence[int], variation: Variation) -> None:
-        """Give environments models with what is checked and theirs; what they had of their own before is gone."""
+        """Give environments models with a checked variation, in place of the one they had."""
         for row, b in enumerate(envs):
-            own = self._models[b] = copy(self._composed.model)
+            model = self._models[b] = copy(self._composed.model)
             self.friction_on_gel[b] = self._scene_friction
             self.gel_stiffness[b], self.gel_friction[b] = 1.0, self._scene_gel_friction
             for i, body in enumerate(self._bodies):
                 name, index = body.spec.name, body.index
                 if name in variation.mass:
                     factor = float(variation.mass[name][row])
-                    own.body_mass[index] *= factor
-                    own.body_inertia[index] *= factor
+                    model.body_mass[index] *= factor
+                    model.body_inertia[index] *= factor
                 if name in variation.friction:
                     factor = float(variation.friction[name][row])
                     self.friction_on_gel[b, i] *= factor
                     if body.spec.friction is not None:
-                        first = int(own.body_geomadr[index])
-                        own.geom_friction[first : first + int(own.body_geomnum[index]), 0] *= factor
+                        first = int(model.body_geomadr[index])
+                        model.geom_friction[first : first + int(model.body_geomnum[index]), 0] *= factor
             for i, mounted in enumerate(self._composed.sensors):
                 if mounted.name in variation.gel_stiffness:
                     self.gel_stiffness[b, i] = variation.gel_stiffness[mounted.name][row]
                 if mounted.name in variation.gel_friction:
                     self.gel_friction[b, i] *= variation.gel_friction[mounted.name][row]
                 if mounted.name in variation.mounting:
-                    at = np.broadcast_to(variation.mounting[mounted.name], (len(envs), 4, 4))[row]
-                    index = int(own.body(mounted.body).id)
-                    turn = rotation_of(own.body_quat[index])
-                    own.body_pos[index] += turn @ at[:3, 3]
-                    own.body_quat[index] = quaternion(turn @ at[:3, :3])
+                    shift = np.broadcast_to(variation.mounting[mounted.name], (len(envs), 4, 4))[row]
+                    index = int(model.body(mounted.body).id)
+                    turn = rotation_of(model.body_quat[index])
+                    model.body_pos[index] += turn @ shift[:3, 3]
+                    model.body_quat[index] = quaternion(turn @ shift[:3, :3])
             if self._scratch is None:
                 self._scratch = mujoco.MjData(self._composed.model)
-            mujoco.mj_setConst(own, self._scratch)
-            self.inverse_weight[b] = own.body_invweight0[:, 0]
+            mujoco.mj_setConst(model, self._scratch)
+            self.inverse_weight[b] = model.body_invweight0[:, 0]
