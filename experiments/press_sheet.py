@@ -14,8 +14,8 @@ import tyro
 
 from raytac.errors import RaytacError
 from raytac.frame import OUTPUTS
-from raytac.io import CommonOptions, read_metrics, result_folder, versions, write_metrics
-from raytac.report import run_press, write_sheet
+from raytac.io import CommonOptions, read_metrics, result_folder, versions, write_metrics, write_sheet
+from raytac.report import run_press
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 

@@ -54,7 +54,7 @@ print("MuJoCo", mujoco.__version__, "dropped a ball and it came to rest")
 _EXR = """
 import pathlib, tempfile
 import numpy as np
-from raytac.io.exr import read_exr, write_exr
+from raytac.io.images import read_exr, write_exr
 with tempfile.TemporaryDirectory() as folder:
     path = pathlib.Path(folder) / "probe.exr"
     image = np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4)

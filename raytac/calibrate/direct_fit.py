@@ -19,9 +19,17 @@ import numpy as np
 from raytac.calibrate.direct_light import LedLight, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import CEILING, DARKEST, HEIGHT, HEIGHTS, REFERENCE_DISTANCE, LightParameters, darkest
+from raytac.calibrate.light_parameters import (
+    CEILING,
+    DARKEST,
+    HEIGHT,
+    HEIGHTS,
+    REFERENCE_DISTANCE,
+    LightParameters,
+    darkest,
+    side_ties,
+)
 from raytac.calibrate.photographs import Photographs, decode, encode
-from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
 __all__ = ["DirectFit", "FitSettings", "FitState"]

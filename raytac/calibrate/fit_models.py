@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 
 from raytac.calibrate.direct_fit import SIGMA, FitSettings
+from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_cast_shadows, with_shading
 from raytac.calibrate.imprint import press_surface
-from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
-from raytac.calibrate.shading_fit import with_shading
-from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shadow_options import ShadowOptions
+from raytac.cli.shared import ShadowOptions
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.bake import run_bake
 from raytac.specs import load_sensor

@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import FROM_SCRATCH, INNER, SolverOptions, prior_of, read_data
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import SolverOptions
 from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare.page import write_comparison
 from raytac.report.compare.run import run_comparison

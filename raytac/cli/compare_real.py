@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
+from raytac.cli.shared import FROM_SCRATCH, INNER, prior_of, read_data
 from raytac.io.options import CommonOptions
 
 __all__ = ["CompareRealArgs"]

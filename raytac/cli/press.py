@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from raytac.checks import check_known
-from raytac.cli.shadow_options import ShadowOptions
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import ShadowOptions, SolverOptions
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution

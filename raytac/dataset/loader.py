@@ -13,8 +13,7 @@ import numpy as np
 from raytac.dataset.arrays import COLUMNS, ArrayKind
 from raytac.dataset.describe import read_description
 from raytac.dataset.manifest import read_manifest
-from raytac.dataset.shard import FOLDER, is_shard_file
-from raytac.dataset.shard_reader import open_shard
+from raytac.dataset.shard import FOLDER, is_shard_file, open_shard
 from raytac.errors import InputError
 
 __all__ = ["PressDataset", "open_shard"]

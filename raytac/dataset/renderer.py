@@ -13,7 +13,7 @@ from raytac.dataset.arrays import ARRAYS
 from raytac.dataset.plan import DatasetPlan, Presses, press_scene_of
 from raytac.errors import AssetError, BackendError, RaytacError
 from raytac.frame import TactileFrame
-from raytac.io.git_state import git_state
+from raytac.io.code_digest import git_state
 from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
 from raytac.physics import NarrowContactWarning

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,16 +16,15 @@ from tqdm import tqdm
 
 from raytac.checks import check_known, check_whole
 from raytac.dataset.describe import FILE, describe, read_description, write_description
-from raytac.dataset.engines import ENGINES, render_here
 from raytac.dataset.manifest import check_pyarrow, write_manifest
 from raytac.dataset.plan import DatasetPlan
-from raytac.dataset.ray_engine import render_on_ray
-from raytac.dataset.renderer import RenderJob
+from raytac.dataset.ray_cluster import render_on_ray
+from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
 from raytac.errors import InputError
-from raytac.io.lock import FolderLock
+from raytac.io.folder import FolderLock
 
-__all__ = ["Check", "RunReport", "render_dataset", "verify_dataset"]
+__all__ = ["ENGINES", "Check", "RunReport", "render_dataset", "render_here", "verify_dataset"]
 
 _SPARE = 1.05
 """The estimated size must fit this many times on the disk."""
@@ -211,3 +210,14 @@ def _write_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         rule = f"cannot be written ({error.strerror}): shards that are done stay, and the same command goes on with the others"
         raise InputError("out", value=folder, rule=rule) from error
+
+
+ENGINES = ("local", "ray")
+"""Names that ``engine=`` accepts."""
+
+
+def render_here(job: RenderJob, shards: Sequence[int]) -> Iterator[ShardResult]:
+    """Render shards one after the other in this process."""
+    renderer = ShardRenderer(job)
+    for shard in shards:
+        yield renderer.render(shard)

@@ -15,7 +15,7 @@ from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
 from raytac.markers.calibration import PUBLISHED
-from raytac.report.machine import machine
+from raytac.report.measure import machine
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec

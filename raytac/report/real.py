@@ -16,9 +16,8 @@ from tqdm import tqdm
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
 from raytac.calibrate.photographs import FAR, Photographs
-from raytac.calibrate.presses import RealPresses
+from raytac.calibrate.presses import RealPresses, Split, by_half, by_press, shallow_to_deep
 from raytac.calibrate.ray_fit import FEWEST
-from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
 from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder

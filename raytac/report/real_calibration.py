@@ -27,8 +27,7 @@ from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.report.real import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
-from raytac.specs.sensor_file import lights_text
-from raytac.specs.sensor_text import sensor_files
+from raytac.specs.sensor_file import lights_text, sensor_files
 
 __all__ = ["OUTLIER", "run_calibrate_optics"]
 

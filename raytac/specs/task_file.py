@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from raytac.specs.files import find_file, is_file, name_of
+from raytac.errors import SpecError
+from raytac.specs.files import available, find_file, is_file, name_of
+from raytac.specs.press import PressScene
+from raytac.specs.press_file import load_press
 from raytac.specs.shape_file import check_shape, resolved, unit_quaternion
 from raytac.specs.task import (
     BODY_SCHEMA,
@@ -21,7 +24,7 @@ from raytac.specs.task import (
 )
 from raytac.specs.toml import Schema, Table, Text, read_toml, split_unit
 
-__all__ = ["load_task"]
+__all__ = ["load_scene", "load_task"]
 
 _OWN: Final = {
     "panda_one_sensor": ("joints_deg",),
@@ -141,3 +144,21 @@ def _check_names(tables: tuple[Table, ...], bodies: tuple[BodySpec, ...]) -> Non
             raise table.error("another body has this name already", "name", body.name)
         if body.held_by is not None and body.held_by not in fixed:
             raise table.error("must be the name of a fixed body of the scene", "held_by", body.held_by, fixed)
+
+
+def load_scene(name_or_path: str | Path) -> PressScene | TaskScene:
+    """Read and check a press scene or a task scene: by its shipped name, or by the path of a file, where ``[robot]`` makes a task.
+
+    Raises:
+        SpecError: a name that neither has (the message lists all); as ``load_press`` and ``load_task``.
+        MeshError: an object's mesh cannot be used.
+    """
+    presses, tasks = available("press scene"), available("task scene")
+    text = str(name_or_path)
+    if isinstance(name_or_path, str) and not text.endswith(".toml") and not set(text) & {"/", "\\"}:
+        if text not in (*presses, *tasks):
+            rule = "no shipped press or task of this name, and not a path to a .toml file"
+            raise SpecError(rule, key="scene", value=text, choices=(*presses, *tasks))
+        return load_task(text) if text in tasks else load_press(text)
+    path = find_file("press scene", name_or_path)
+    return load_task(path) if "robot" in read_toml(path).data else load_press(path)

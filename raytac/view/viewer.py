@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from raytac.errors import BackendError, InputError
-from raytac.view.addresses import PageAddresses
 from raytac.view.page import Page
 from raytac.view.player import Player
+from raytac.view.server import PageAddresses
 from raytac.view.session import Session
 
 __all__ = ["Viewer", "check_address", "check_viewer"]

@@ -8,8 +8,8 @@ import pytest
 
 from experiments import bench_optics as bench
 from raytac.errors import InputError
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 
 
 @pytest.mark.parametrize("options", [{"parts": "speed,colour"}, {"parts": ""}, {"scenes": " , "}, {"spp": 1}])

@@ -17,8 +17,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from raytac.report.compare.metrics import known, resolutions, select, summaries
 from raytac.report.compare.modes import FAMILIES
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import Comparison
+from raytac.report.compare.store import Row
 
 __all__ = ["error_range", "signed_error", "write_pareto", "write_sheet_of_scene"]
 

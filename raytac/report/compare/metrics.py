@@ -11,8 +11,8 @@ import numpy as np
 from raytac.io.metrics import Metric
 from raytac.report.compare.marker_error import marker_error_metrics
 from raytac.report.compare.physics_error import physics_metrics
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import REGIONS, Comparison
+from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
 
 __all__ = [

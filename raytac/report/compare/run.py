@@ -27,14 +27,12 @@ from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, held_out_frames, marker_errors
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
-from raytac.report.compare.references import References
-from raytac.report.compare.row_store import Row, RowStore, Value, row_key
 from raytac.report.compare.settings import CompareSettings
+from raytac.report.compare.store import References, Row, RowStore, Value, row_key
 from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
-from raytac.report.machine import machine
-from raytac.report.surfaces import press_peaks
-from raytac.report.timing import moving, timed_within
+from raytac.report.measure import machine, moving, timed_within
+from raytac.report.press import press_peaks
 from raytac.report.tracers import Tracers
 from raytac.specs import load_sensor
 
@@ -49,7 +47,7 @@ BATCH = {"cpu": 8, "cuda": 64}
 """Environments of the batched timing where none are asked for."""
 TURNS = 6
 """Surfaces that take turns in a timing."""
-CODE = ("raytac.report.image_error", "raytac.report.timing")
+CODE = ("raytac.report.image_error", "raytac.report.measure")
 """Modules on which every row depends, besides those of its mode."""
 DISTRIBUTIONS = ("numpy", "mitsuba", "drjit", "mitsuba-oidn", "scikit-image", "flip-evaluator", "taxim", "jax")
 """Packages whose version is part of a row's key."""

@@ -1,16 +1,26 @@
-"""Time of a frame: warm calls over surfaces that change, as in a control loop."""
+"""Measurement of what reports state: times of warm calls, the machine, and the confidence of a proportion.
+
+Times are taken over surfaces that change, as in a control loop.
+"""
 
 from __future__ import annotations
 
+import math
+import os
+import platform
+import subprocess
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.io.metrics import Metric
 
-__all__ = ["moving", "once", "timed", "timed_within"]
+__all__ = ["machine", "moving", "once", "timed", "timed_within", "wilson_interval"]
 
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
@@ -54,3 +64,39 @@ def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: i
         return timed(call, inputs, frames)
     count = min(frames, max(3, int(1e3 * budget_s / first)))
     return np.array([first, *(once(call, inputs[k % len(inputs)]) for k in range(2, count + 1))])
+
+
+def machine() -> dict[str, Metric]:
+    """CPU, cores, load and GPU as far as the system tells: keys ``machine.cpu``, ``.cores``, ``.load_at_start``, ``.gpu``."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        cpu = next(
+            (line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), cpu
+        )
+    facts: dict[str, Metric] = {
+        "machine.cpu": cpu,
+        "machine.cores": os.cpu_count() or 0,
+        "machine.load_at_start": os.getloadavg()[0],
+    }
+    try:
+        ask = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        gpu = subprocess.run(ask, capture_output=True, text=True, check=False, timeout=20).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        gpu = ""
+    return facts | ({"machine.gpu": gpu.splitlines()[0]} if gpu else {})
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's score interval of a proportion (J. Am. Stat. Assoc. 22, 1927): the p with (p̂ − p)² = z² p (1 − p) / n; z = 1.96 is 95 %.
+
+    Unlike p̂ ± z √(p̂ (1 − p̂) / n) it stays within 0 and 1 and has a width at p̂ = 0 and 1. Raises ``InputError`` without trials.
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise InputError(
+            "successes", value=(successes, trials), rule="must be from 0 to the number of trials, which must be at least 1"
+        )
+    share, square = successes / trials, z * z / trials
+    middle = share + 0.5 * square
+    half = math.sqrt(share * (1.0 - share) * square + 0.25 * square * square)
+    return max(0.0, (middle - half) / (1.0 + square)), min(1.0, (middle + half) / (1.0 + square))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.report.timing import moving, timed
+from raytac.report.measure import moving, timed
 from tests.conftest import make_surface
 
 
