@@ -18,7 +18,7 @@ from raytac.markers import MARKER_MODELS
 from raytac.optics import INTEGRATORS
 from raytac.report.press import run_press
 from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
-from raytac.specs import PADS, PHYSICS, load_press
+from raytac.specs import PADS, PHYSICS, press_of
 from raytac.specs.press import chosen_physics
 
 __all__ = ["PressArgs"]
@@ -34,7 +34,11 @@ class PressArgs(ShadowOptions, SolverOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press scene, such as coin, or path of a scene file."""
+    """Name of a shipped press scene, such as coin; path of a scene file; or an STL, OBJ or PLY file, with --depth."""
+    depth: float | None = None
+    """How deep a mesh file is pressed in [mm]; scenes have their own."""
+    scale: float | None = None
+    """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
@@ -68,7 +72,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
-        scene = load_press(self.scene)
+        scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
         physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":
             self.prepare_solver("physics='ipc'")

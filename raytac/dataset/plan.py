@@ -310,6 +310,8 @@ def _object_of(scene: PressScene) -> dict[str, Any]:
         file = Path(str(params["path"]))
         params = {**params, "path": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
     spec = scene.object
+    if spec.heights:
+        params = {**params, "sha256": hashlib.sha256(repr(spec.heights).encode()).hexdigest()}
     return {
         "kind": spec.kind,
         "params": params,

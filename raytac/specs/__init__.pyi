@@ -9,6 +9,7 @@ from .press import ObjectSpec as ObjectSpec
 from .press import PressScene as PressScene
 from .press import StageSpec as StageSpec
 from .press_file import load_press as load_press
+from .press_file import press_of as press_of
 from .press_file import validate_press as validate_press
 from .sensor import CameraSpec as CameraSpec
 from .sensor import CaseSpec as CaseSpec

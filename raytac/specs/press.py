@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -51,6 +51,9 @@ POSE_SCHEMA: Final[Schema] = {
 }
 """Keys of ``[object]`` that every kind but ``none`` has."""
 
+OBJECT_KINDS: Final[dict[str, Schema]] = {**OBJECT_SCHEMA, "heights": {"pitch_mm": Number("(0, 10]")}}
+"""Kind of object to the keys of its parameters: those of scene files, and ``heights``, which is made in code."""
+
 _DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
 STAGE_SCHEMA: Final[dict[str, Schema]] = {
     "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
@@ -71,11 +74,12 @@ class ObjectSpec:
     """The indenter, a union of convex or concave parts rigidly joined.
 
     Most kinds are exact shapes: sphere, cylinder, edge, cone, torus and pins are computed from a few lengths, so that no facet
-    shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body.
+    shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body;
+    ``heights`` is an elevation map of the user's.
     """
 
     kind: str
-    """``none sphere cylinder edge cone torus pins coin mesh mjcf``."""
+    """One of ``OBJECT_KINDS``."""
     params: dict[str, float | int | str]
     """Lengths [m] and counts of the kind, by the key of its TOML file without the unit; for ``mesh`` the absolute ``path`` and
     ``scale`` [m per file unit], for ``mjcf`` the absolute ``path`` and the name of the ``body``. Object frame of each kind:
@@ -92,13 +96,19 @@ class ObjectSpec:
     """Of a soft object [Pa]."""
     poisson_ratio: float = 0.4
     """Of a soft object."""
+    heights: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
+    """Of the kind ``heights``: elevation [m] of the face that looks at the gel, rows along y, columns along x; 0 where there is none."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.kind, str) or self.kind not in OBJECT_SCHEMA:
-            raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_SCHEMA))
+        if not isinstance(self.kind, str) or self.kind not in OBJECT_KINDS:
+            raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_KINDS))
+        if bool(self.heights) != (self.kind == "heights"):
+            raise SpecError(
+                'must be given for the kind "heights", and for no other', key="object.heights", value=len(self.heights)
+            )
         if self.kind == "none":
             return
-        check_params(self.kind, self.params, OBJECT_SCHEMA[self.kind], "object")
+        check_params(self.kind, self.params, OBJECT_KINDS[self.kind], "object")
         if not isinstance(self.position, (tuple, list)) or len(self.position) != 3:
             raise SpecError("must be three numbers, of which the last is not used", key="object.position_mm", value=self.position)
         place = self.position[:2]  # as a file gives it
