@@ -21,12 +21,11 @@ from typing import Any
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from raytac.device import resolve_device
 from raytac.errors import BackendError, RaytacError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, Progress, parse_names, result_folder, versions, write_metrics
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -70,7 +69,7 @@ def speed(
         (family, batch) for family in ("taxim", "taxim_shadow", "phong") for batch in ((1, 2) if args.quick else BATCHES[device])
     ]
     modes: dict[str, Any] = {}
-    for family, batch in tqdm(jobs, desc=f"speed {name}", leave=False, disable=None):
+    for family, batch in Progress(jobs, desc=f"speed {name}", leave=False):
         mode = modes.setdefault(family, mode_of(spec, family, size, device, table))
         inputs = moving(surfaces, batch, 6 if batch < 64 else 3)
         host = timed(mode.render, inputs, frames)

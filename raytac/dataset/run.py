@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from raytac.checks import check_known, check_whole
 from raytac.dataset.describe import FILE, describe, read_description, write_description
 from raytac.dataset.manifest import check_pyarrow, write_manifest
@@ -23,6 +21,7 @@ from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
 from raytac.errors import InputError
 from raytac.io.folder import FolderLock
+from raytac.io.progress import Progress
 
 __all__ = ["ENGINES", "Check", "RunReport", "render_dataset", "render_here", "verify_dataset"]
 
@@ -111,7 +110,7 @@ def render_dataset(
                 render_here(job, missing) if engine == "local" else render_on_ray(job, missing, workers=workers, address=address)
             )
             total = sum(len(record.rows) for record in records.values())
-            with tqdm(total=plan.sweep.count, initial=total, unit="press", disable=None if progress else True) as bar:
+            with Progress(desc="render", total=plan.sweep.count, initial=total, unit="press", show=progress) as bar:
                 for result in results:
                     with _write_errors(folder):
                         if first is None:
@@ -145,7 +144,7 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
         raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to mend it")
     store = ShardStore(folder, found["plan_sha256"])
     wrong = {}
-    for shard in tqdm(range(found["shards"]), unit="shard", disable=None if progress else True, leave=False):
+    for shard in Progress(range(found["shards"]), desc="verify", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, str):
             wrong[shard] = record
@@ -155,7 +154,7 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
 def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
     """Records of the shards that are there and whole."""
     records, there = {}, store.present()
-    for shard in tqdm(there, "checking", unit="shard", disable=None if progress else True, leave=False):
+    for shard in Progress(there, desc="check", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, ShardRecord):
             records[shard] = record

@@ -12,6 +12,7 @@ from .metrics import write_metrics as write_metrics
 from .options import CommonOptions as CommonOptions
 from .options import parse_names as parse_names
 from .options import parse_resolution as parse_resolution
+from .progress import Progress as Progress
 from .seal import SealError as SealError
 from .seal import read_sealed as read_sealed
 from .seal import write_sealed as write_sealed

@@ -14,6 +14,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.progress import Progress
 from raytac.markers.calibration import PUBLISHED
 from raytac.report.measure import machine
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
@@ -92,8 +93,6 @@ def run_calibrate_markers(
     if pad not in PADS:
         raise InputError("pad", value=pad, rule="must be a known level", choices=PADS)
     solver = resolve_device(device, ray_tracing=False)
-    from tqdm import tqdm
-
     from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
     from raytac.report.markers import write_arrows, write_errors
     from raytac.report.press_store import PressStore, press_code
@@ -101,7 +100,7 @@ def run_calibrate_markers(
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
-        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=tqdm.write)
+        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=Progress.write)
         pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress, store=store)
         press_s = time.perf_counter() - began
         names = {press.name for press in fit}
@@ -137,8 +136,6 @@ def press_all(
         RaytacError: a press did not settle.
         BackendError: the solver cannot run on ``device``.
     """
-    from tqdm import tqdm
-
     from raytac.markers.calibration_presses import press_frames, simulate_press
     from raytac.specs import validate_press
 
@@ -146,7 +143,7 @@ def press_all(
         validate_press(sensor, press.scene())
     solver = resolve_device(device, ray_tracing=False)
     frames: list[PressFrame] = []
-    for press in tqdm(presses, desc=f"press {sensor.name}", unit="press", disable=None if progress else True):
+    for press in Progress(presses, desc=f"press {sensor.name}", unit="press", show=progress):
         states = None if store is None else store.read(press)
         if states is None:
             states = simulate_press(sensor, press, pad=pad, device=solver)

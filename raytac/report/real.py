@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
@@ -22,6 +20,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.progress import Progress
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
@@ -150,7 +149,7 @@ def compare_real(
     starts: dict[str, list[tuple[float, ...]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
     with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
-        with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
+        with Progress(total=len(splits) + len(ablations), desc="fits") as bar:
             for number, (kind, (train, test)) in enumerate(splits):
                 models = _fitted(sensor, shots.take(train), settings, bar)
                 priors.setdefault(kind, []).append(models.prior)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
@@ -19,6 +17,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.progress import Progress
 from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.mlp_weights import save_mlp
 from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
@@ -78,7 +77,7 @@ def run_calibrate_optics(
     held = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
     train, test = shots.take(index[~held]), shots.take(index[held])
     with result_folder(out, FILES) as folder:  # now, so that a folder that cannot be written is told before the fit
-        with tqdm(desc=f"calibrate {model}", unit="step", disable=None, file=sys.stderr) as bar:
+        with Progress(desc=f"calibrate {model}", unit="step") as bar:
 
             def tick(stage: str, cost: float) -> None:
                 bar.update()

@@ -60,7 +60,7 @@ def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = 
     """
     from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
 
-    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=False)
+    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=True)
 
 
 def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, device: str) -> MarkerErrors:

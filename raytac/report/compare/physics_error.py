@@ -67,7 +67,7 @@ def physics_errors(
         for physics in ("rigid", "ipc"):
             start = time.perf_counter()
             sensor = TactileSensor(tracers.spec, physics=physics, pad=pad if physics == "ipc" else None, **settings)
-            frame = sensor.press(press)
+            frame = sensor.press(press, progress=True)
             seconds.append(time.perf_counter() - start)
         if frame.failed is not None and frame.failed[0]:
             raise RaytacError(f"the press {press.name!r} did not settle on the {pad} pad")

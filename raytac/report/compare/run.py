@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.errors import InputError, RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
+from raytac.io.progress import Progress
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, held_out_frames, marker_errors
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
@@ -103,9 +103,9 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
     device = load_mitsuba(settings.device)[1]
     modes = comparison_modes(settings.spp, quick=settings.quick) if modes is None else modes
     facts = machine()
-    run = _Run(settings, device, RowStore(out / "rows", tqdm.write), out / "references", facts)
+    run = _Run(settings, device, RowStore(out / "rows", Progress.write), out / "references", facts)
     total = len(settings.resolutions) * len(settings.scenes) * len(modes)
-    with tqdm(total=total, desc="compare", unit="row", disable=None) as bar:
+    with Progress(total=total, desc="compare", unit="row") as bar:
         for size in settings.resolutions:
             run.measure_all(size, modes, bar)
         markers = None
@@ -149,11 +149,11 @@ class _Run:
         self.measured = 0
         self._digests: dict[tuple[str, ...], str] = {}
 
-    def measure_all(self, size: tuple[int, int], modes: Sequence[Mode], bar: tqdm) -> None:
+    def measure_all(self, size: tuple[int, int], modes: Sequence[Mode], bar: Progress) -> None:
         settings, name = self.settings, f"{size[0]}x{size[1]}"
         spec, surfaces = press_peaks(settings.sensor, settings.scenes, size, settings.seed)
         tracers = Tracers(spec, self.device, settings.seed)
-        references = References(self.folder, tracers, size, settings.reference_spp, tqdm.write)
+        references = References(self.folder, tracers, size, settings.reference_spp, Progress.write)
         scenes = []
         for scene, surface in surfaces.items():
             bar.set_postfix_str(f"{name} {scene}: reference")
@@ -172,7 +172,7 @@ class _Run:
                 bar.update(len(scenes) - (len(self.rows) - done))
             seen.add(mode.family)
 
-    def _measure_mode(self, mode: Mode, setting: Setting, scenes: list[_Scene], first: bool, bar: tqdm) -> None:
+    def _measure_mode(self, mode: Mode, setting: Setting, scenes: list[_Scene], first: bool, bar: Progress) -> None:
         """Rows of one mode; ``first`` says that no mode before has built and compiled the same."""
         name = f"{setting.size[0]}x{setting.size[1]}"
         built: OpticalMode | None = None
