@@ -29,7 +29,7 @@ _STEPS = (0.2, 0.1, 0.05, 0.02, 0.01)
 
 @dataclass(frozen=True)
 class FoundCircles:
-    """What ``find_circles`` found."""
+    """Result of ``find_circles``."""
 
     circles: np.ndarray
     """x, y, radius [px], (N, 3)."""
@@ -38,7 +38,7 @@ class FoundCircles:
 
     @property
     def doubtful(self) -> np.ndarray:
-        """Whether a circle's step is below ``DOUBTFUL``, (N,) bool."""
+        """True where a circle's step is below ``DOUBTFUL``, (N,) bool."""
         return self.score < DOUBTFUL
 
 
@@ -57,13 +57,13 @@ def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
         rule = f"must be smaller than the view: {1e3 * smallest * pixel_pitch:.4g} mm across, {smallest} px of {pixel_pitch * 1e3:.4g} mm"
         raise InputError("ball_diameter_mm", value=large, rule=rule)
     background = presses.background.astype(np.float32)
-    found, scores = [], []
+    circles, scores = [], []
     for image, limit in zip(presses.images, widest, strict=True):
         change = _smoothed(image.astype(np.float32) - background)
         circle, score = _climb(change, _first_guess(change, limit), limit)
-        found.append(circle)
+        circles.append(circle)
         scores.append(score)
-    return FoundCircles(np.array(found).reshape(-1, 3), np.array(scores))
+    return FoundCircles(np.array(circles).reshape(-1, 3), np.array(scores))
 
 
 def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPresses, np.ndarray]:
@@ -72,9 +72,9 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
     doubtful = np.zeros(len(presses), bool)
     if not unknown.any():
         return presses, doubtful
-    found = find_circles(presses.take(unknown), pixel_pitch)
+    result = find_circles(presses.take(unknown), pixel_pitch)
     circles = presses.circles.copy()
-    circles[unknown], doubtful[unknown] = found.circles, found.doubtful
+    circles[unknown], doubtful[unknown] = result.circles, result.doubtful
     return presses.with_circles(circles), doubtful
 
 

@@ -34,14 +34,14 @@ ALONE = "raytrace_alone"
 MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
 SHADOW_TABLES = ("none", "raytrace")
-"""Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
+"""Sources of a table's shadows: none, or the fitted ray tracer."""
 GRID_PITCH = 0.06e-3
 """Spacing of the pad's nodes [m], about a pixel's."""
 
 
 @dataclass(frozen=True)
 class Models:
-    """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
+    """Fits to one set of presses: the lights with imprint and circles, and a mode of each kind."""
 
     fitted: Fitted
     rest: np.ndarray
@@ -139,7 +139,7 @@ def fit_models(
     )
     state, background, built = fitted.state, shots.background, {}
 
-    def told(images: int) -> None:
+    def count_rendered(images: int) -> None:
         if tick is not None:
             tick(f"{images} images of shadows", fitted.costs[-1])
 
@@ -154,7 +154,7 @@ def fit_models(
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
-                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
+                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
             built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
         elif name == "mlp":
             built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)

@@ -32,7 +32,7 @@ _TABLE = np.linspace(0, KNOTS[-1], 751)
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """What pixels see of the coat: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
+    """Coat that pixels see: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
 
     p: np.ndarray
     n: np.ndarray
@@ -79,7 +79,7 @@ def pixel_geometry(
     ball_radius: np.ndarray,
     slopes: np.ndarray,
 ) -> PixelGeometry:
-    """What the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses with index ``press`` (M,) see.
+    """Coat seen by the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses ``press`` (M,).
 
     ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
     The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.

@@ -1,4 +1,10 @@
-"""What a fit of lights varies: every LED's place, aim, lobe, height and power, the case's even glow, and the camera's response."""
+"""Parameters of a fit of lights, and ties between LEDs of one side.
+
+Every LED has a place, aim, lobe, height and power. The case has an even glow, and the camera a response.
+
+A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
+nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +53,7 @@ REFERENCE_DISTANCE = 10e-3
 
 @dataclass(frozen=True)
 class LightParameters:
-    """What a fit varies of lights and camera, as arrays."""
+    """Parameters of lights and camera, as arrays."""
 
     template: LightsSpec
     """The light file that names, layers and widths come from."""
@@ -195,11 +201,11 @@ def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
 
 
 PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
-"""How far LEDs are believed to be from mirrored places [mm] and aims [rad], and from the lobe, height [mm] and power [full scales] next to
-them."""
+"""Standard deviations of LEDs about mirrored places [mm] and aims [rad], and about the lobe, height [mm] and power [full scales] of the
+LED beside them."""
 
 LEAST = 1.0
-"""How far [mm] the middle of a layer's LEDs must be from the pad's for them to be on one side of it."""
+"""Least distance [mm] of the middle of a layer's LEDs from the pad's, for them to be on one side of it."""
 
 
 @dataclass(frozen=True)

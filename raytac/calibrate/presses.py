@@ -43,7 +43,7 @@ class RealPresses:
     circles: np.ndarray
     """Contact circle of each press: x and y of its centre, radius [px], (N, 3); NaN where the data set has none."""
     names: tuple[str, ...]
-    """What messages and figures call each press."""
+    """Name of each press, for messages and figures."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -55,7 +55,7 @@ class RealPresses:
 
     @property
     def fully_visible(self) -> np.ndarray:
-        """Whether all of the circle lies in the image, (N,) bool; False where the circle is unknown."""
+        """True where all of the circle lies in the image, (N,) bool; False where the circle is unknown."""
         width, height = self.resolution
         x, y, r = self.circles.T
         return (x - r >= 0) & (y - r >= 0) & (x + r <= width) & (y + r <= height)
@@ -93,10 +93,10 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
     if ball_diameter is not None and not (math.isfinite(ball_diameter) and ball_diameter > 0):
         raise InputError("ball_diameter", value=ball_diameter, rule="must be a length > 0 [m]")
     if data.is_dir():
-        found = [name for name in LAYOUTS if (data / name).exists()]
-        if not found:
+        matching = [name for name in LAYOUTS if (data / name).exists()]
+        if not matching:
             raise InputError("data", value=str(data), rule="must hold one of the files that tell a layout", choices=LAYOUTS)
-        data = data / found[0]
+        data = data / matching[0]
     if data.name.endswith(".npz"):
         if ball_diameter is None:
             raise InputError("ball_diameter", value=None, rule=f"must be given: {data.name} does not say how large the ball is")
@@ -240,10 +240,10 @@ def by_half(presses: RealPresses) -> list[Split]:
     Raises:
         InputError: a half without a press.
     """
-    left = _known(presses)[:, 0] < presses.resolution[0] / 2
-    if left.all() or not left.any():
+    in_left_half = _known(presses)[:, 0] < presses.resolution[0] / 2
+    if in_left_half.all() or not in_left_half.any():
         raise InputError("presses", value=f"{len(presses)} presses", rule="must lie on both halves of the image")
-    a, b = np.flatnonzero(left), np.flatnonzero(~left)
+    a, b = np.flatnonzero(in_left_half), np.flatnonzero(~in_left_half)
     return [(a, b), (b, a)]
 
 

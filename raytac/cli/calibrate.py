@@ -1,4 +1,4 @@
-"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the simulated pad."""
+"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the soft pad."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _OF_MARKERS = ("pad", "quick", "verbose")
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateArgs(SolverOptions):
-    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the simulated pad.
+    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the soft pad.
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
     out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
 
-    With `markers`: press the simulated pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
+    With `markers`: press the soft pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
     sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model against surface tracking on presses that
     the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error
     or Ctrl-C leaves these files as they were; presses that are finished stay in presses/, and the same command goes on from there.
@@ -39,7 +39,7 @@ class CalibrateArgs(SolverOptions):
     what: Annotated[str, tyro.conf.Positional]
     """`markers`, or a folder of photographs or a dataPack.npz."""
     model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
-    """What a data set is fitted by; table and network take imprint and circles from a fit of the lights too."""
+    """Model that is fitted to a data set; table and network take imprint and circles from a fit of the lights too."""
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
     sides: str = FROM_SCRATCH
@@ -51,7 +51,7 @@ class CalibrateArgs(SolverOptions):
     holdout: int = 5
     """Every so manieth press is held out and scored; 0 holds out none."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat while it is fitted; sensor.toml says so, and is rendered so."""
+    """Let the ray tracer cast shadows on the coat while it is fitted; sensor.toml then asks for the same."""
     shadow_table: Literal["none", "raytrace"] = "none"
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     starts: int = 3
@@ -59,12 +59,12 @@ class CalibrateArgs(SolverOptions):
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
     prior: str = INNER
-    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
+    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
     cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
-    """How finely the simulated pad is cut."""
+    """Mesh level of the soft pad."""
     quick: bool = False
     """Few presses: shows that all runs; a poor fit."""
 

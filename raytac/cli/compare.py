@@ -41,9 +41,9 @@ class CompareArgs(SolverOptions):
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """Also press into the simulated pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
+    """Also press into the soft pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
     markers: bool = False
-    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the simulated pad of the level
+    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the soft pad of the level
     that --pad names, else medium; needs raytac[ipc] and a sensor with marker motion."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
@@ -66,7 +66,7 @@ class CompareArgs(SolverOptions):
         return 0
 
     def settings(self) -> CompareSettings:
-        """What the options mean. Raises InputError for names or numbers that cannot be read."""
+        """Settings that the options mean. Raises InputError for names or numbers that cannot be read."""
         scenes = parse_names(self.scenes, "scenes")
         sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
         chosen = CompareSettings(

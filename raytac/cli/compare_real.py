@@ -30,7 +30,7 @@ class CompareRealArgs(CommonOptions):
     folds: int = 5
     """Every so manieth press is held out in turn."""
     tested: int | None = None
-    """How many of the folds are fitted and tested, for a run that is about regions or ablations; all if not given."""
+    """Number of folds that are fitted and tested, for a run that is about regions or ablations; all if not given."""
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
     sides: str = FROM_SCRATCH
@@ -44,13 +44,13 @@ class CompareRealArgs(CommonOptions):
     ablations: bool = True
     """Also fit the ray tracer with one thing after another left out."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat: photographs of a GelSight Mini show next to none (docs/accuracy.md)."""
+    """Let the ray tracer cast shadows on the coat: photographs of a GelSight Mini show next to none (docs/accuracy.md)."""
     starts: int = 3
     """Places that a fit of direct light starts from; the best goes on."""
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
     prior: str = INNER
-    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
+    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
     cross-validation between halves of the pad within the presses that are fitted to."""
 
     def run(self) -> int:

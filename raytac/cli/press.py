@@ -36,7 +36,7 @@ class PressArgs(ShadowOptions, SolverOptions):
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Name of a shipped press scene, such as coin; path of a scene file; or an STL, OBJ or PLY file, with --depth."""
     depth: float | None = None
-    """How deep a mesh file is pressed in [mm]; scenes have their own."""
+    """Depth that a mesh file is pressed in to [mm]; scenes have their own."""
     scale: float | None = None
     """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"

@@ -1,4 +1,4 @@
-"""What a data set keeps of a press: names, types, shapes, units and frames."""
+"""Arrays and columns of a press in a data set: names, types, shapes, units and frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ArrayKind:
     """Output that it comes with, ``markers``, or nothing: always there."""
 
     def is_kept(self, outputs: Collection[str], markers: bool) -> bool:
-        """Whether a sweep with these outputs keeps it."""
+        """True if a sweep with these outputs keeps it."""
         return self.needs == "" or self.needs in outputs or (self.needs == "markers" and markers)
 
 
@@ -117,7 +117,7 @@ COLUMNS: dict[str, Column] = {
     "contact_cells": Column(
         "float64",
         "",
-        "width of the contact in cells of a simulated pad; below 6 its force at a depth is too large; null if rigid",
+        "width of the contact in cells of a soft pad; below 6 its force at a depth is too large; null if rigid",
     ),
     "indentation_max": Column("float64", "m", "how far the coat lies below its place at rest, at most"),
     "shard_sha256": Column("string", "", "of the file"),

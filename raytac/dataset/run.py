@@ -31,7 +31,7 @@ _SPARE = 1.05
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a run did."""
+    """Result of a run."""
 
     folder: Path
     rendered: int
@@ -49,7 +49,7 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Check:
-    """What ``verify_dataset`` found."""
+    """Result of ``verify_dataset``."""
 
     shards: int
     wrong: dict[int, str]
@@ -138,17 +138,17 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     from raytac.dataset.manifest import FILE as MANIFEST
     from raytac.dataset.shard import sha256_of
 
-    found = read_description(folder)
+    description = read_description(folder)
     manifest = Path(folder) / MANIFEST
-    if found["complete"] and (not manifest.is_file() or sha256_of(manifest) != found["manifest_sha256"]):
+    if description["complete"] and (not manifest.is_file() or sha256_of(manifest) != description["manifest_sha256"]):
         raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to mend it")
-    store = ShardStore(folder, found["plan_sha256"])
+    store = ShardStore(folder, description["plan_sha256"])
     wrong = {}
-    for shard in Progress(range(found["shards"]), desc="verify", unit="shard", show=progress, leave=False):
+    for shard in Progress(range(description["shards"]), desc="verify", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, str):
             wrong[shard] = record
-    return Check(found["shards"], wrong)
+    return Check(description["shards"], wrong)
 
 
 def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
@@ -176,9 +176,9 @@ def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
         return
     if not (folder / FILE).is_file():
         raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
-    found = read_description(folder)
-    if found["plan_sha256"] != plan.digest:
-        changed = _differences(found["plan"], plan.description)
+    description = read_description(folder)
+    if description["plan_sha256"] != plan.digest:
+        changed = _differences(description["plan"], plan.description)
         rule = (
             f"holds another data set, which differs in {', '.join(changed) or 'its version'}: choose another folder, or remove it"
         )

@@ -29,7 +29,7 @@ _FILE = re.compile(rf"{FOLDER}/[0-9]{{6,12}}\.npz")
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """What is known of a shard that is done."""
+    """Record of a finished shard."""
 
     shard: int
     file: str
@@ -124,7 +124,7 @@ def _rows_digest(rows: list[Row]) -> str:
 
 
 def is_shard_file(name: str) -> bool:
-    """Whether a path is one that a data set gives its shards: in the folder of the shards and nowhere else."""
+    """True for a path that a data set gives its shards: in the folder of the shards and nowhere else."""
     return _FILE.fullmatch(name) is not None
 
 
@@ -137,7 +137,7 @@ def _check_record(record: ShardRecord, file: str) -> None:
 
 
 KINDS: dict[str, ArrayKind] = {**{name: replace(kind, shape=("N", *kind.shape)) for name, kind in ARRAYS.items()}, **SHARED}
-"""What a shard may hold, with N presses."""
+"""Arrays that a shard may hold, with N presses."""
 _HEADER = 30
 """Bytes of a zip member's local header before its name and extra field."""
 
@@ -175,27 +175,27 @@ def open_shard(
                     raise InputError("shard", value=path, rule=rule)
                 stored = all(member.compress_type == zipfile.ZIP_STORED for member in members.values())
                 known = dict(sizes or {})
-                found = {}
+                arrays = {}
                 for name, member in members.items():
                     if stored:
                         start = _start(stream, member)
                         shape, dtype, order, length = _header(stream, expected[name], known, member.file_size)
                         # NumPy refuses an array that goes beyond the end of `data`.
-                        found[name] = np.ndarray(shape, dtype, data, start + length, order=order)
+                        arrays[name] = np.ndarray(shape, dtype, data, start + length, order=order)
                     else:
                         with archive.open(member) as inflated:
                             shape, dtype, order, length = _header(inflated, expected[name], known, member.file_size)
                             values = np.frombuffer(inflated.read(), dtype)
-                        found[name] = values.reshape(shape, order=order)
+                        arrays[name] = values.reshape(shape, order=order)
     except InputError:
         raise
     except Exception as error:  # a damaged archive ends in errors of many types
         raise InputError("shard", value=path, rule=f"cannot be used ({error})") from error
-    return found, stored
+    return arrays, stored
 
 
 def _start(stream: IO[bytes], member: zipfile.ZipInfo) -> int:
-    """Where a member that is not compressed begins in the file; the stream is left there."""
+    """Offset of a member that is not compressed; the stream stays there."""
     stream.seek(member.header_offset)
     header = stream.read(_HEADER)
     names = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")

@@ -31,7 +31,7 @@ def cache_folder(kind: str) -> Path | None:
 
 
 def read_cached(path: Path | None) -> bytes | None:
-    """What ``keep_cached`` kept; None if there is none, or, with a warning, if it is damaged."""
+    """Contents that ``keep_cached`` kept; None if there are none or, with a warning, if they are damaged."""
     if path is None:
         return None
     try:

@@ -65,7 +65,7 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
 
 
 def _is_of_folder(error: OSError, folders: Iterable[Path]) -> bool:
-    """Whether the file that the error names lies in one of the folders; if it names none, whether it is one of a disk."""
+    """True if the error names a file in one of the folders, or names none and is an error of the disk."""
     if not isinstance(error.filename, str | bytes | os.PathLike):  # none, or the number of an open file
         return error.errno in DISK_ERRORS
     place = Path(os.path.abspath(os.fsdecode(error.filename)))

@@ -136,20 +136,20 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
     counts, degree = fit.counts[:-1, :-1].astype(float), fit.degree[:-1, :-1]
     extent = (-180.0, 180.0, 0.0, 90.0)
     with plt.rc_context(_STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
-        for axes in (left, right):
+        figure, (first, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
+        for axes in (first, right):
             axes.set_facecolor(_FILLED)
             axes.set_xlabel("direction of the slope [°]")
             axes.set_xticks((-180, -90, 0, 90, 180))
             axes.set_yticks((0, 15, 30, 45, 60, 75, 90))
-        left.set_ylabel("magnitude of the slope [°]")
+        first.set_ylabel("magnitude of the slope [°]")
         shown = np.ma.masked_equal(counts, 0)
         norm = LogNorm(1, max(10.0, float(counts.max())))
-        image = left.imshow(
+        image = first.imshow(
             shown, origin="lower", extent=extent, aspect="auto", cmap="viridis", norm=norm, interpolation="nearest"
         )
-        left.set_title(f"a  touched samples a bin, {sensor}")
-        figure.colorbar(image, ax=left, pad=0.02)
+        first.set_title(f"a  touched samples a bin, {sensor}")
+        figure.colorbar(image, ax=first, pad=0.02)
         shown = np.ma.masked_less(degree, 0)
         colours = ListedColormap(_DEGREES)
         right.imshow(

@@ -90,7 +90,7 @@ def ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def has_flip() -> bool:
-    """Whether the package ``flip-evaluator`` is installed."""
+    """True if the package ``flip-evaluator`` is installed."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 

@@ -94,7 +94,7 @@ def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) ->
 
 
 def exr_header(sensor: TactileSensor, scene: PressScene, frame: TactileFrame) -> dict[str, str]:
-    """What is needed to know where an image came from; all text."""
+    """Origin of an image: sensor, scene, mode, seed, units and versions; all text."""
     size = _image_size(frame)
     header = {key: str(value) for key, value in sensor.sampling.items()}
     if size is not None:

@@ -54,7 +54,7 @@ class Ablation:
     prior: str | None = None
     """Name of another strength of priors than that of the comparison."""
     settle: bool = True
-    """Whether the image at rest is averaged (``Photographs.settled``)."""
+    """True averages the image at rest (``Photographs.settled``)."""
     other_shadows: bool = False
     """Cast shadows where the comparison has none, and none where it has."""
 
@@ -97,7 +97,7 @@ ABLATIONS: dict[str, Ablation] = {
 
 @dataclass(frozen=True)
 class RealSettings:
-    """What is compared."""
+    """Settings of a comparison with photographs."""
 
     folds: int = 5
     tested: int | None = None
@@ -110,7 +110,7 @@ class RealSettings:
     starts: int = 3
     rounds: int = 3
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat."""
+    """True lets the ray tracer cast shadows on the coat."""
     device: str = "auto"
     seed: int = 0
 
@@ -155,8 +155,8 @@ def compare_real(
                 priors.setdefault(kind, []).append(models.prior)
                 starts.setdefault(kind, []).append(models.fitted.start_errors)
                 seen, labelled = _tested(models, sensor, shots.take(test))
-                for where, found in (("", seen), ("labelled_", labelled)):
-                    for mode, stack in found.items():
+                for where, scores_of in (("", seen), ("labelled_", labelled)):
+                    for mode, stack in scores_of.items():
                         of = scores.setdefault(where + kind, {}).setdefault(mode, [])
                         of += press_scores(sensor, stack, shots.take(test))
                 if kind == "press":
@@ -251,11 +251,11 @@ def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dic
     """Images of every mode and of the background alone at refined circles, and at the labelled ones."""
     refined, slopes = models.circles(shots), models.fitted.state.slopes
     nothing = np.broadcast_to(shots.background, shots.presses.shape)
-    found = []
+    scores = []
     for circles in (refined, shots.circles):
         own = {name: images_of(mode, sensor, shots, circles, slopes) for name, mode in models.modes.items()}
-        found.append(own | {"background": nothing})
-    return found[0], found[1]
+        scores.append(own | {"background": nothing})
+    return scores[0], scores[1]
 
 
 def check_folds(presses: RealPresses, folds: int) -> None:
@@ -356,9 +356,9 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
         images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
     ):
         off = np.abs(image - real)
-        left, right = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
+        x_low, x_high = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
         top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
-        box = np.s_[top:bottom, left:right]
+        box = np.s_[top:bottom, x_low:x_high]
         score = {
             "contact_mae": float(off[rho < 1].mean()),
             "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),

@@ -67,7 +67,7 @@ def name_of(path: Path) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; False for a path that no file can have, such as a name too long."""
+    """True if there is such a file; False for a path that no file can have, such as a name too long."""
     try:
         return path.is_file()
     except (OSError, ValueError):

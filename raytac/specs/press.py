@@ -1,4 +1,4 @@
-"""What a press scene is: an object, and the motion that presses it into the pad. SI units, pad frame."""
+"""Press scenes: an object, and the motion that presses it into the pad. SI units, pad frame."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ __all__ = [
 ]
 
 MOVES = ("object", "case")
-"""What a press can move; the other side stands still."""
+"""Sides that a press can move; the other one stands still."""
 PHYSICS = ("rigid", "ipc")
-"""How a gel can deform: by geometry and Gaussians, or simulated."""
+"""Physics of the gel: the rigid pad with its Gaussians, or the soft pad of the contact solver."""
 PADS = ("coarse", "medium", "fine")
-"""How finely a simulated pad can be cut."""
+"""Mesh levels of the soft pad."""
 DYNAMICS = ("kinematic", "affine", "soft")
-"""What an object can be to a simulated pad: driven and rigid, free and near-rigid, or driven and soft."""
+"""Dynamics of an object on the soft pad: prescribed and rigid, free and near-rigid, or prescribed and soft."""
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
@@ -150,7 +150,7 @@ class PressScene:
     trajectory: tuple[StageSpec, ...]
     """Empty for an untouched pad."""
     moves: str = "object"
-    """Which side the trajectory moves, one of ``MOVES``. Targets are the object's against the pad either way."""
+    """Side that the trajectory moves, one of ``MOVES``. Targets are those of the object relative to the pad in both cases."""
     source: Path | None = None
     physics: str | None = None
     """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""

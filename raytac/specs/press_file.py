@@ -43,7 +43,7 @@ def load_press(name_or_path: str | Path) -> PressScene:
     if target.kind == "none" and "moves" in top.data:
         raise top.error("must be absent where there is no object", "moves", scene["moves"])
     if scene["pad"] is not None and scene["physics"] != "ipc":
-        raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", scene["pad"])
+        raise top.error('is how finely a soft pad is cut, so physics must be "ipc"', "pad", scene["pad"])
     if target.kind == "none" and stages:
         raise top.error("must be absent where there is no object", "trajectory")
     if target.kind != "none" and not stages:

@@ -55,12 +55,12 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
     base = None
     if "base" in top.data:
         named = top.read_one("base", SENSOR_SCHEMA[""]["base"])
-        found, above = find_file("sensor", named, base=path.parent), (*above, path.resolve())
-        if found.resolve() in above:
+        file, above = find_file("sensor", named, base=path.parent), (*above, path.resolve())
+        if file.resolve() in above:
             raise top.error("must be a sensor that is not built on this one", "base", top.data["base"])
         if len(above) > _LONGEST_CHAIN:
             raise top.error(f"a sensor must be built on at most {_LONGEST_CHAIN} others, one after the other", "base", named)
-        base = _read_sensor(found, above)
+        base = _read_sensor(file, above)
     schema = dict(SENSOR_SCHEMA[""])
     if base is not None:
         schema["lights"] = Text(default="")
@@ -154,12 +154,12 @@ def response_text(response: ResponseSpec) -> str:
         f"black_level = {row(response.black_level)}",
         f"vignetting = {row(response.vignetting)}",
     ]
-    for channel, found in zip(("red", "green", "blue"), response.shading, strict=True):
-        if not found:
+    for channel, coefficients in zip(("red", "green", "blue"), response.shading, strict=True):
+        if not coefficients:
             continue
         lines.append(f"shading_{channel} = [")
-        rest = iter(found)
-        for order in range(shading_degree(len(found)), -1, -1):
+        rest = iter(coefficients)
+        for order in range(shading_degree(len(coefficients)), -1, -1):
             lines.append("    " + ", ".join(f"{value:.4f}" for value in islice(rest, order + 1)) + ",")
         lines.append("]")
     return "\n".join(lines) + "\n"

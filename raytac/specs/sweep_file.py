@@ -59,4 +59,4 @@ def _read_randomization(top: Table) -> tuple[dict[str, float], dict[str, float]]
     markers = table.section("markers").read(MARKER_NOISE_SCHEMA) if "markers" in table.data else {}
     if "noise" in markers:
         markers["noise_px"] = markers.pop("noise")
-    return ({k: v for k, v in found.items() if v is not None} for found in (values, markers))  # type: ignore[return-value]
+    return ({k: v for k, v in given.items() if v is not None} for given in (values, markers))  # type: ignore[return-value]

@@ -65,7 +65,7 @@ def load_task(name_or_path: str | Path) -> TaskScene:
     top = read_toml(path)
     values = top.read(TASK_SCHEMA, sections=("robot", "body"))
     if values["pad"] is not None and values["physics"] != "ipc":
-        raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", values["pad"])
+        raise top.error('is how finely a soft pad is cut, so physics must be "ipc"', "pad", values["pad"])
     robot = _read_robot(top.section("robot"))
     tables = top.sections("body")
     bodies = tuple(_read_body(table) for table in tables)
@@ -80,10 +80,10 @@ def _read_robot(table: Table) -> RobotSpec:
     if not own:
         if not model.endswith(".xml"):
             raise table.error("must be a robot that raytac builds, or the path of an .xml file", "model", model, ROBOTS)
-        found = resolved(table, model)
-        if not is_file(found):
-            raise table.error(f"the model file does not exist ({found})", "model", model)
-        values["model"] = str(found)
+        file = resolved(table, model)
+        if not is_file(file):
+            raise table.error(f"the model file does not exist ({file})", "model", model)
+        values["model"] = str(file)
     takes = _OWN[model if own else ""]
     for key in table.data:
         if key not in ("model", "sensor", *takes):

@@ -44,7 +44,7 @@ class Page:
         self._drawing = threading.Lock()
         """One thread draws at a time: the player's, or that of a user who changed what is shown."""
         self._last: Snapshot | None = None
-        self._held: set[str] = set()
+        self._moved: set[str] = set()
         """Controls that users moved since the last play, step or reset: they stay where the users put them."""
         names = [name for name in QUANTITIES if any(name in pad.quantities for pad in session.pads)]
         self._scales = {name: ColourScale(QUANTITIES[name]) for name in names}
@@ -60,7 +60,7 @@ class Page:
 
         def command(event: GuiEvent[Any]) -> None:
             if event.target.value != "Pause":
-                self._held.clear()
+                self._moved.clear()
             if event.target.value == "Reset":
                 for scale in self._scales.values():
                     scale.reset()
@@ -77,7 +77,7 @@ class Page:
                 self._last = snapshot
                 self._draw(snapshot)
             if status.error:
-                self._held.clear()
+                self._moved.clear()
             rate = f", {status.states_per_s:.1f} states/s" if status.states_per_s else ""
             self._status.content = f"**{_MODES[status.mode]}**{rate}"
             self._error.visible = bool(status.error)
@@ -141,8 +141,8 @@ class Page:
         def moved(event: GuiEvent[Any]) -> None:
             if event.client is None:  # set by the page itself
                 return
-            self._held.discard(control.instead_of)
-            self._held.add(control.name)
+            self._moved.discard(control.instead_of)
+            self._moved.add(control.name)
             player.drive(control.name, slider.value)  # the value now: of many events the last one counts
 
         slider.on_update(moved)
@@ -184,7 +184,7 @@ class Page:
             slider, value = self._sliders[control.name], snapshot.controls.get(control.name)
             if (slider.min, slider.max) != (control.low, control.high):
                 slider.min, slider.max = control.low, control.high
-            if value is None or not np.isfinite(value) or control.name in self._held:
+            if value is None or not np.isfinite(value) or control.name in self._moved:
                 continue
             steps = round((min(max(value, control.low), control.high) - control.low) / control.step)
             slider.value = min(control.low + steps * control.step, control.high)

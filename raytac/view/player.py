@@ -21,7 +21,7 @@ _SMOOTH = 0.8
 
 @dataclass(frozen=True)
 class Status:
-    """What the player is doing."""
+    """State of the player."""
 
     mode: str = "starting"
     """``starting``, ``paused``, ``playing``, ``driving`` (on the way to where the controls ask) or ``stopped``."""

@@ -22,7 +22,7 @@ _FIELD_OF_VIEW = np.radians(38.0)
 _AMBIENT = 0.5
 """Light from everywhere beside viser's own from above, so that the colours of a coat that looks down are seen."""
 _NEAR_A_PAD = (0.035, 0.06, 0.06)
-"""Where an eye looks at a pad from, pad frame [m]: obliquely, from beyond the fingertips of a gripper."""
+"""Place of an eye that looks at a pad, pad frame [m]: oblique, beyond the fingertips of a gripper."""
 _THIN = 0.35
 """Opacity of what pads are seen through."""
 
@@ -82,7 +82,7 @@ class SceneView:
 
     @property
     def has_hiding(self) -> bool:
-        """Whether there is anything that ``see_through`` changes."""
+        """True if there is anything that ``see_through`` changes."""
         return bool(self._hiding)
 
     def see_through(self, wanted: bool) -> None:
@@ -224,9 +224,9 @@ def split_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     order = np.argsort(start * count + end)
     keys = (start * count + end)[order]
-    found = np.minimum(np.searchsorted(keys, end * count + start), len(keys) - 1)
-    edge = np.flatnonzero(keys[found] == end * count + start)
-    partner = order[found[edge]]
+    index = np.minimum(np.searchsorted(keys, end * count + start), len(keys) - 1)
+    edge = np.flatnonzero(keys[index] == end * count + start)
+    partner = order[index[edge]]
     face, other = edge // 3, partner // 3
     smooth = np.einsum("ij,ij->i", normal[face], normal[other]) >= np.cos(np.radians(_SHARP))
     edge, partner = edge[smooth], partner[smooth]
@@ -281,9 +281,9 @@ class ColourScale:
     def colours(self, values: np.ndarray) -> np.ndarray:
         """8-bit sRGB (V, 3) of SI values (V,): below 0 as 0; grey where not finite."""
         share = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0) * (self.quantity.factor / self.full)
-        found = self._table[np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(int)]
-        found[~np.isfinite(values)] = 128
-        return found
+        rgb = self._table[np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(int)]
+        rgb[~np.isfinite(values)] = 128
+        return rgb
 
 
 def legend_html(scale: ColourScale) -> str:

@@ -90,7 +90,7 @@ def _copied(function: Any, **names: Any) -> Any:
 
 
 def _overlaid(module: ModuleType, **names: Any) -> SimpleNamespace:
-    """What a module holds, with some names changed."""
+    """Contents of a module with some names replaced."""
     return SimpleNamespace(**{**vars(module), **names})
 
 
@@ -303,9 +303,9 @@ class PageAddresses:
 def _split(text: str) -> tuple[str, int | None]:
     """Name and port of ``NAME`` or ``NAME:PORT``, as browsers write them."""
     whole = _bracketed(text.strip().lower())  # the end of a bare IPv6 address is no port
-    found = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^\[\]:]+)(?::([0-9]{1,5}))?", whole)
-    name = _bracketed(found[1].strip("[]")) if found else ""
-    port = int(found[2]) if found and found[2] else None
+    match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^\[\]:]+)(?::([0-9]{1,5}))?", whole)
+    name = _bracketed(match[1].strip("[]")) if match else ""
+    port = int(match[2]) if match and match[2] else None
     if not (name.startswith("[") or _NAME.fullmatch(name)) or port == 0 or (port or 0) > 65535:
         rule = "must be a host name or address, as in gpu3.example.org or gpu3.example.org:9000, without http:// and path"
         raise InputError("allow_host", value=text, rule=rule)

@@ -16,7 +16,7 @@ from raytac.view.session import Session
 __all__ = ["Viewer", "check_address", "check_viewer"]
 
 _PATIENCE = 10.0
-"""How long the end waits for the state that is being computed [s]; the thread is a daemon and ends with the program at the latest."""
+"""Longest wait at the end for the state that is being computed [s]; the thread is a daemon and ends with the program."""
 
 
 def check_viewer() -> None:

@@ -36,7 +36,7 @@ _SHOWN_GROUPS = 3
 _PLANE = 1.5
 """A half-space is drawn as a square of this size [m]."""
 _ROUND = 1.5e-3
-"""How far facets lie inside a curved geom, over its size."""
+"""Depth of facets inside a curved geom, over its size."""
 _SOFT_COLOUR = (200, 190, 120)
 _NEAREST, _FARTHEST = 0.12, 0.6
 """Least and greatest distance of the eye from the sensors [m], over 2.5."""
@@ -198,7 +198,7 @@ class WorldSession:
 
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _REACH_MM, _TILT, _YAW = 100.0, 45.0, 180.0
-"""How far from its start the sliders take the site: [mm], [degrees] about x and y, and about z."""
+"""Range of the sliders about the site's start: [mm], [degrees] about x and y, and about z."""
 _SPEED = {**dict.fromkeys(("x", "y", "z"), 50.0), **dict.fromkeys(("roll", "pitch", "yaw"), 45.0), "opening": 40.0}
 """Fastest change of what is asked of the robot, in each control's unit per second."""
 _JOINT_SPEED = 1.5
@@ -249,7 +249,7 @@ class Steering:
 
     @property
     def asked(self) -> dict[str, float]:
-        """Where each control is to take the robot."""
+        """Target of each control."""
         return dict(self._asked)
 
     def aim(self, targets: Mapping[str, float]) -> None:

@@ -102,14 +102,16 @@ def _scales(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _panel(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    found = summaries(rows)
-    for family in dict.fromkeys(summary.family for summary in found):
+    all_summaries = summaries(rows)
+    for family in dict.fromkeys(summary.family for summary in all_summaries):
         colour, marker, line = LOOK[family]
         if family.startswith("peer"):
-            for s in (s for s in found if s.family == family):
+            for s in (s for s in all_summaries if s.family == family):
                 axes.axvline(s.ms, color=colour, linestyle=line, linewidth=0.8, zorder=1)
             continue
-        points = sorted((s for s in found if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0)
+        points = sorted(
+            (s for s in all_summaries if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0
+        )
         for s in points:
             values = known(select(rows, mode=s.mode), column)
             axes.plot([s.ms, s.ms], [min(values), max(values)], color=colour, linewidth=0.6, alpha=0.5, zorder=2)
@@ -163,8 +165,8 @@ def write_sheet_of_scene(comparison: Comparison, scene: str, resolution: str, pa
         figure = Figure(figsize=(WIDTH_IN, total))
 
         def cell(k: int, lower: bool) -> Axes:
-            left, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
-            axes = figure.add_axes((left / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
+            x, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
+            axes = figure.add_axes((x / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
             axes.set_axis_off()
             return axes
 

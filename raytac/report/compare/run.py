@@ -110,7 +110,7 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
             run.measure_all(size, modes, bar)
         markers = None
         if settings.markers:
-            bar.set_postfix_str("markers on the simulated pad")
+            bar.set_postfix_str("markers on the soft pad")
             markers = _marker_errors(settings, device)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
@@ -160,7 +160,7 @@ class _Run:
             scenes.append(_Scene(scene, surface, references, tracers, size))
             self.images[scene, name] = scenes[-1].truth
         if settings.pad is not None:
-            bar.set_postfix_str(f"{name}: simulated pad")
+            bar.set_postfix_str(f"{name}: soft pad")
             self.physics += physics_errors(tracers, settings.scenes, size, settings.pad, surfaces)
         seen: set[str] = set()
         for mode in modes:
@@ -302,12 +302,12 @@ class _Scene:
     def noise(self) -> dict[str, dict[str, float]]:
         """Noise of the reference by region: the halves are independent, so half their difference has the variance of their mean."""
         one, two = self._halves
-        found = {}
+        figures = {}
         for region, mask in self.masks.items():
             off = rmse(one[mask], two[mask]) / 2 if mask.any() else math.nan
             absolute = mean_absolute(one[mask], two[mask]) / 2 if mask.any() else math.nan
-            found[region] = {"mae": absolute, "rmse": off, "psnr": psnr(off)}
-        return found
+            figures[region] = {"mae": absolute, "rmse": off, "psnr": psnr(off)}
+        return figures
 
 
 def _rgb(mode: OpticalMode, surface: GelSurface) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What ``raytac compare`` compares, and what it refuses before anything is computed."""
+"""Settings of ``raytac compare``, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SPP = (1, 4, 16, 64)
 
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings:
-    """What to compare."""
+    """Settings of a comparison."""
 
     sensor: str = "gelsight_mini"
     scenes: tuple[str, ...] = ("sphere", "coin", "pins")
@@ -42,9 +42,9 @@ class CompareSettings:
     quick: bool = False
     """Fewer modes."""
     pad: str | None = None
-    """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
+    """Level of the soft pad that the rigid one is measured against; None leaves those rows out."""
     markers: bool = False
-    """Measure the marker models against surface tracking too, on the simulated pad of level ``pad``, else ``marker_error.PAD``."""
+    """Measure the marker models against surface tracking too, on the soft pad of level ``pad``, else ``marker_error.PAD``."""
 
     def quickened(self) -> CompareSettings:
         """The first scene at 80 x 60 pixels with few samples, frames and modes."""
@@ -96,5 +96,5 @@ class CompareSettings:
 
     @property
     def uses_solver(self) -> bool:
-        """Whether anything is pressed into the simulated pad."""
+        """True if anything is pressed into the soft pad."""
         return self.markers or self.pad is not None

@@ -31,7 +31,7 @@ class Row:
 
     figures: dict[str, Value]
     image: np.ndarray
-    """What the mode made of the scene, (H, W, 3) uint8."""
+    """Image of the scene by the mode, (H, W, 3) uint8."""
 
 
 def row_key(basis: Mapping[str, object]) -> str:
