@@ -369,7 +369,7 @@ class DirectFit:
         return trial
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
-        """Levenberg and Marquardt's method from ``state``; ``tick`` is told every accepted state and its cost."""
+        """Levenberg and Marquardt's method from ``state``; ``tick`` is called with every accepted state and its cost."""
         damping, state, slow = 1e-2, self.inside_bounds(state), 0
         cost = self.cost(state, self.residuals(state))
         for _ in range(iterations):

@@ -1,6 +1,6 @@
 """The imprint of a ball as calibration sees it: one radial profile of slopes, shared by all presses, about each contact circle.
 
-Real photographs tell where a ball touched but not how the gel gave way around it. So the slope of the coat is a free function of the
+Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
 
     sin θ(t) = s(t) · a / R,  s linear between ``KNOTS``,

@@ -137,7 +137,7 @@ def fit_lights(
     ``start``: where the fit begins; None is the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles.
     ``rounds`` of defect correction follow the fit of direct light; 0 leaves it at that. Direct light is fitted from ``starts`` places, the
     given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``options`` of the ray tracer, such as
-    ``bounce``. ``tick`` is told the stage and the cost after every step.
+    ``bounce``. ``tick`` is called with the stage and the cost after every step.
 
     Raises:
         InputError: refraction, LEDs of no colour, or fewer values than parameters.

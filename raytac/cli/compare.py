@@ -25,7 +25,7 @@ class CompareArgs(SolverOptions):
     """Render the same gel surfaces with every optical mode, and report error beside time.
 
     Writes report.html (one file), pareto.png, a sheet of images a scene, results.parquet and metrics.json. Interrupted, it keeps what
-    is finished in the folder's rows/ and references/: the same command goes on from there.
+    is finished in the folder's rows/ and references/: the same command continues from there.
     """
 
     sensor: str = "gelsight_mini"
@@ -59,7 +59,7 @@ class CompareArgs(SolverOptions):
             comparison = run_comparison(settings, out)
             written = write_comparison(comparison, out, time.perf_counter() - start)
         except KeyboardInterrupt:
-            print(f"raytac: interrupted; finished rows are kept in {out}, the same command goes on from there", file=sys.stderr)
+            print(f"raytac: interrupted; finished rows are kept in {out}, the same command continues from there", file=sys.stderr)
             return 130
         for path in written:
             print(path)

@@ -19,23 +19,12 @@ from raytac.physics.soft.availability import check_solver, hush_solver
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
-__all__ = ["CASTING", "FROM_SCRATCH", "INNER", "OWN_LEDS", "ShadowOptions", "SolverOptions", "prior_of", "read_data"]
+__all__ = ["CASTING", "FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "read_data"]
 
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
 lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
-
-
-def prior_of(name: str) -> str | None:
-    """``--prior``: None is ``INNER``.
-
-    Raises:
-        InputError: neither that nor a name of ``STRENGTHS``.
-    """
-    if name not in (INNER, *STRENGTHS):
-        raise InputError("prior", value=name, rule="must be a known strength", choices=(INNER, *STRENGTHS))
-    return None if name == INNER else name
 
 
 def read_data(
@@ -67,6 +56,45 @@ def read_data(
 
 
 @dataclass(frozen=True, kw_only=True)
+class FitOptions(CommonOptions):
+    """Options of a command that fits models to photographs."""
+
+    ball_diameter_mm: float | None = None
+    """Needed by a dataPack.npz, which does not say it."""
+    sides: str = FROM_SCRATCH
+    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights. Where
+    these were fitted to photographs that are tested on, errors are not of held-out presses."""
+    split: int = 1
+    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
+    a diffuser light like a row."""
+    starts: int = 3
+    """Starts of a fit of direct light; the best goes on."""
+    rounds: int = 3
+    """Rounds with the ray tracer after direct light."""
+    prior: str = INNER
+    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
+    cross-validation between halves of the pad within the presses that are fitted to."""
+
+    @property
+    def chosen_prior(self) -> str | None:
+        """``--prior``: None is ``INNER``.
+
+        Raises:
+            InputError: neither that nor a name of ``STRENGTHS``.
+        """
+        if self.prior not in (INNER, *STRENGTHS):
+            raise InputError("prior", value=self.prior, rule="must be a known strength", choices=(INNER, *STRENGTHS))
+        return None if self.prior == INNER else self.prior
+
+    def read(self, data: Path, sensor: str) -> tuple[SensorSpec, RealPresses, Photographs]:
+        """As ``read_data``; doubtful circles are printed."""
+        spec, presses, shots, doubtful = read_data(data, sensor, self.ball_diameter_mm, self.sides, self.split, self.device)
+        for name in doubtful:
+            print(f"the circle of press {name} is doubtful")
+        return spec, presses, shots
+
+
+@dataclass(frozen=True, kw_only=True)
 class SolverOptions(CommonOptions):
     """Options of a command that may use the contact solver."""
 
@@ -90,6 +118,8 @@ CASTING = ("raytrace", "taxim")
 
 @dataclass(frozen=True, kw_only=True)
 class ShadowOptions:
+    """Options of a command that renders: shadows, whatever the sensor file says."""
+
     shadows: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Cast shadows, of a sensor whose file says otherwise too."""
     no_shadows: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

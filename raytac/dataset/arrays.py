@@ -104,7 +104,7 @@ COLUMNS: dict[str, Column] = {
     "yaw": Column("float64", "rad", "turn of the object about +z, before the lean"),
     "tilt": Column("float64", "rad", "lean of the object away from +z"),
     "tilt_direction": Column("float64", "rad", "where its upper end leans to, from +x to +y"),
-    "shear_x": Column("float64", "m", "way sideways after the indent, pad frame"),
+    "shear_x": Column("float64", "m", "sideways displacement after the indent, pad frame"),
     "shear_y": Column("float64", "m", "likewise"),
     "twist": Column("float64", "rad", "turn about +z after that"),
     "force_x": Column("float64", "N", f"x {_FORCE}; null without the output wrench, as for the next seven"),

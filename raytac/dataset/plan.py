@@ -85,7 +85,7 @@ class DatasetPlan:
     """
 
     def __init__(self, sweep: SweepSpec) -> None:
-        """Check all that can be told before anything is rendered.
+        """Check all that can be checked before anything is rendered.
 
         Raises:
             InputError: an output that no data set has, a model that the sensor lacks, or randomisation of markers that are not

@@ -83,7 +83,7 @@ def render_dataset(
         workers, address: of Ray, see ``render_on_ray``.
         compress: deflate the arrays; they then cannot be mapped into memory.
         progress: a bar of presses on standard error, if that is a terminal.
-        say: is told what is found and done, one line at a time.
+        say: called with one line at a time about what is done.
 
     Raises:
         InputError: a bad argument, a folder with another data set or in use by another run, or a disk without room enough.

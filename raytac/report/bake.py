@@ -62,7 +62,6 @@ def run_bake(
     from raytac.optics.taxim.bake.bake import bake
     from raytac.optics.taxim.cache import keep, table_folder
     from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
-    from raytac.report.bake import write_coverage, write_table_sheet
 
     with result_folder(out, (*CALIBRATION_FILES, "coverage.png", "sheet.png", "metrics.json")) as folder:
         size = sensor.camera.resolution if resolution is None else resolution

@@ -37,8 +37,8 @@ def run_press(
 ) -> list[Path]:
     """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
 
-    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: a bar for a simulated
-    pad, on a terminal. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
+    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: show the progress of a
+    soft pad. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
 
     Raises:
         SpecError: the scene does not fit this sensor.

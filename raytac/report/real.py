@@ -44,7 +44,7 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class Ablation:
-    """One thing left out of the ray tracer, fitted anew without it."""
+    """An ablation: one thing left out of the ray tracer, which is fitted again without it."""
 
     sensor: Callable[[SensorSpec], SensorSpec] = lambda sensor: sensor
     fixed: tuple[str, ...] = ()
@@ -148,7 +148,7 @@ def compare_real(
     priors: dict[str, list[str]] = {}
     starts: dict[str, list[tuple[float, ...]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
-    with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
+    with result_folder(out) as folder:  # before the fits, so that a folder that cannot be written is refused at once
         with Progress(total=len(splits) + len(ablations), desc="fits") as bar:
             for number, (kind, (train, test)) in enumerate(splits):
                 models = _fitted(sensor, shots.take(train), settings, bar)

@@ -76,7 +76,7 @@ def run_calibrate_optics(
     index = np.arange(len(shots.presses))
     is_test = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
     train, test = shots.take(index[~is_test]), shots.take(index[is_test])
-    with result_folder(out, FILES) as folder:  # now, so that a folder that cannot be written is told before the fit
+    with result_folder(out, FILES) as folder:  # before the fit, so that a folder that cannot be written is refused at once
         with Progress(desc=f"calibrate {model}", unit="step") as bar:
 
             def tick(stage: str, cost: float) -> None:

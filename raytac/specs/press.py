@@ -89,7 +89,7 @@ class ObjectSpec:
     quaternion: tuple[float, float, float, float]
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
-    """Mass on the drive [kg]; matters only for the way to a force, not for where it settles."""
+    """Mass on the drive [kg]; it affects the motion to a force, not the state that it settles in."""
     dynamics: str = "kinematic"
     """One of ``DYNAMICS``; the rigid pad takes every object as rigid and driven."""
     youngs_modulus: float = 1e6

@@ -82,7 +82,7 @@ class PressRanges:
     tilt: Range = (0.0, 0.0)
     """Lean of the object, turned by yaw, away from +z [rad]; the direction of the lean is uniform over the circle."""
     shear: Range = (0.0, 0.0)
-    """Length of the way sideways after the indent [m]; its direction is uniform over the circle."""
+    """Length of the sideways displacement after the indent [m]; its direction is uniform over the circle."""
     twist: Range = (0.0, 0.0)
     """Turn about +z after that, in contact [rad]."""
 

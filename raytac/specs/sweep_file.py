@@ -23,7 +23,7 @@ def load_sweep(name_or_path: str | Path) -> SweepSpec:
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, or a range whose ends are
-            the wrong way round; or as ``load_sensor`` and ``load_press``.
+            in the wrong order; or as ``load_sensor`` and ``load_press``.
     """
     path = find_file("sweep", name_or_path)
     top = read_toml(path)

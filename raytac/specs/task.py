@@ -111,7 +111,7 @@ BODY_SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class MountSpec:
-    """One sensor on a robot of one's own."""
+    """One sensor on a robot from a file."""
 
     name: str
     """Name of the sensor."""

@@ -219,7 +219,7 @@ def _boxed(text: str, colour: str) -> str:
 
 
 ARROW_SCALE = 2.0
-"""Length of a drawn arrow over the marker's way, so that tenths of a pixel are seen."""
+"""Length of a drawn arrow over the marker's displacement, so that tenths of a pixel are seen."""
 _LEAST_WIDTH = 480
 """Images are enlarged by a whole factor to at least this width [px], so that arrows are crisp."""
 _SHORTEST = 1.0
@@ -240,8 +240,8 @@ def picture(pad: PadView, *, arrows: bool) -> np.ndarray | None:
     image = Image.fromarray(pad.rgb).resize((factor * width, factor * height), Image.Resampling.BILINEAR)
     draw = ImageDraw.Draw(image)
     rest, moved = pad.markers_px
-    starts, ways = factor * rest, factor * ARROW_SCALE * moved
-    for (x, y), (dx, dy) in zip(starts, ways, strict=True):
+    starts, arrows_px = factor * rest, factor * ARROW_SCALE * moved
+    for (x, y), (dx, dy) in zip(starts, arrows_px, strict=True):
         if not np.isfinite([x, y, dx, dy]).all():
             continue
         length = float(np.hypot(dx, dy))

@@ -219,7 +219,7 @@ def split_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    # Edge k of a face runs from corner k to the next one; its partner in the neighbour runs the other way.
+    # Edge k of a face runs from corner k to the next one; its partner in the neighbour runs in the other direction.
     count = len(vertices)
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     order = np.argsort(start * count + end)

@@ -1,4 +1,4 @@
-"""What the rigid pad misses against the simulated one, on a shallow press at a small size."""
+"""Error of the rigid pad against the soft one, on a shallow press at a small size."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from raytac.calibrate.presses import by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.shared import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
+from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import write_png
@@ -209,9 +209,9 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
 
 
 def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
-    assert prior_of(INNER) is None and prior_of("tied") == "tied"
+    assert FitOptions().chosen_prior is None and FitOptions(prior="tied").chosen_prior == "tied"
     with pytest.raises(InputError, match="inner, free, tied"):
-        prior_of("strong")
+        _ = FitOptions(prior="strong").chosen_prior
 
 
 WRONG: dict[str, Any] = {

@@ -34,7 +34,7 @@ STYLE: dict[Any, Any] = {
     "ytick.labelsize": 7,
     "savefig.dpi": 300,
 }
-# Colours of Okabe and Ito, told apart by marker and line too.
+# Colours of Okabe and Ito; marker and line differ too.
 LOOK: dict[str, tuple[str, str, Any]] = {
     "fast": ("#0072B2", "o", "none"),
     "fast_4_rays": ("#0072B2", "D", "none"),
@@ -58,7 +58,7 @@ def write_pareto(comparison: Comparison, path: Path) -> None:
     """Error against time of a frame, log axes: a row of panels a resolution; whole frame, contact and shadow ring beside each other.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
-    the mean noise of the reference, below which no error can be told.
+    the mean noise of the reference, below which no error can be resolved.
     """
     rows, names = comparison.rows, resolutions(comparison.rows)
     shown = list(dict.fromkeys(summary.family for summary in summaries(rows)))

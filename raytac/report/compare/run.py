@@ -79,7 +79,7 @@ class Comparison:
     facts: dict[str, Metric]
     """Machine and versions."""
     physics: tuple[PhysicsError, ...] = ()
-    """Rigid pad against the simulated one, if that was asked for."""
+    """Rigid pad against the soft one, if that was asked for."""
     markers: MarkerErrors | None = None
     """Marker models against surface tracking, if that was asked for."""
 

@@ -6,6 +6,7 @@ import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from raytac.checks import check_seed
 from raytac.errors import BackendError, InputError
 from raytac.markers.fots import marker_motion_of
 from raytac.physics.soft.availability import check_solver
@@ -72,8 +73,7 @@ class CompareSettings:
             raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         if not self.budget_s > 0:
             raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
-        if not 0 <= self.seed < 2**32:
-            raise InputError("seed", value=self.seed, rule="must be a whole number in [0, 2^32)")
+        check_seed("seed", self.seed)
         for size in self.resolutions:
             if min(size) <= 2 * SSIM_BORDER or max(size) > LARGEST_SIDE:
                 rule = f"must have sides from {2 * SSIM_BORDER + 1} (the window of SSIM) to {LARGEST_SIDE} pixels"
