@@ -79,7 +79,10 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
 
 
 def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3); −1 where too little of it is in the image."""
+    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3).
+
+    It is −1 where too little of a circle is in the image.
+    """
     x, y, r = np.asarray(circles, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     sides, valid = [], True

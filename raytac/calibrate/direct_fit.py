@@ -1,4 +1,6 @@
-"""Lights, response, imprint and contact circles fitted at once to photographs of ball presses, with direct light as forward model.
+"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses.
+
+The forward model is direct light.
 
 Residuals are those of the presses with the real background B as flat field, and of the image at rest,
 
@@ -306,7 +308,10 @@ class DirectFit:
     def _gains(
         self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slopes of levels by light pressed, by light at rest in the same pixels (with the sign turned), and of the rest image."""
+        """Slopes of levels by light pressed, by light at rest (negated), and of the rest image.
+
+        The light at rest is that in the same pixels.
+        """
         gamma, *stray, _, _ = p.response
         black = np.array(stray) * self.darkest**gamma
 

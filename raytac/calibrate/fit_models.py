@@ -111,7 +111,9 @@ def fit_models(
     options: Mapping[str, Any] | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
-    """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
+    """Fit ``modes`` to the presses of ``shots``.
+
+    All use the imprint and the circles that the lights were fitted with.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
     ``shadow_table``: one of ``SHADOW_TABLES``.

@@ -1,4 +1,4 @@
-"""Fits of the image models to photographs of ball presses: Taxim's table, the network, and the colour shading of a sensor.
+"""Fits of table, network and colour shading to photographs of ball presses.
 
 Table and network are fitted to samples: slopes as the model's own front step sees them, beside the real colours. The imprints of the
 balls are known from a fit of the lights.

@@ -1,4 +1,6 @@
-"""The imprint of a ball as calibration sees it: one radial profile of slopes, shared by all presses, about each contact circle.
+"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle.
+
+All presses share it.
 
 Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:

@@ -140,7 +140,9 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
-    """A start for a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
+    """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
+
+    They stand side by side over ``SPREAD`` times its width.
 
     What would stick out of the case's walls is moved inside.
 
@@ -221,7 +223,9 @@ class Ties:
 
 
 def side_ties(p: LightParameters, size: int) -> Ties:
-    """Ties of the LEDs of every layer, which stand on one side of the pad: mirrored about the line from the pad's middle to theirs.
+    """Ties of the LEDs of every layer, which stand on one side of the pad.
+
+    They are mirrored about the line from the pad's middle to theirs.
 
     An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
     whose first entries are ``p.leds`` and ``p.power``.

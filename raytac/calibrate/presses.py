@@ -221,7 +221,9 @@ Split = tuple[np.ndarray, np.ndarray]
 
 
 def by_press(count: int, folds: int) -> list[Split]:
-    """``folds`` splits: fold k tests every ``folds``-th of ``count`` presses from the k-th, so that neighbours of a scan are apart.
+    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th.
+
+    Neighbours of a scan are thus in different folds.
 
     ``folds = count`` leaves one out.
 
@@ -235,7 +237,9 @@ def by_press(count: int, folds: int) -> list[Split]:
 
 
 def by_half(presses: RealPresses) -> list[Split]:
-    """Left half of the pad to the right one, and the reverse; a press belongs to the half that its circle's centre lies in.
+    """Splits from the left half of the pad to the right one, and the reverse.
+
+    A press belongs to the half that its circle's centre lies in.
 
     Raises:
         InputError: a half without a press.
@@ -248,7 +252,9 @@ def by_half(presses: RealPresses) -> list[Split]:
 
 
 def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
-    """The shallower ``share`` of the presses to the deeper ones; depth over the ball's radius grows with the circle over the ball.
+    """Split from the shallower ``share`` of the presses to the deeper ones.
+
+    Depth over the ball's radius grows with the circle over the ball.
 
     Raises:
         InputError: a share that leaves one side empty.

@@ -71,7 +71,10 @@ def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, s
 
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any]) -> Light:
-    """Light of every LED at power 1 that the ray tracer, with these further ``options``, has over direct light, at ``problem``'s pixels."""
+    """Light of every LED at power 1 that the ray tracer adds to direct light, at ``problem``'s pixels.
+
+    ``options`` are further ones of the ray tracer.
+    """
     sensor, p = problem.sensor, state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
@@ -196,7 +199,10 @@ def refine_circles(
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> np.ndarray:
-    """Circles (N, 3) [px] of presses that lights were not fitted to, moved from their labels by the finished lights, which stay."""
+    """Circles (N, 3) [px] of presses that the lights were not fitted to.
+
+    They are fitted from their labels, with the finished lights fixed.
+    """
     all_fixed = FitSettings(fixed=tuple(SIGMA))
     own = FitState(state.p, state.slopes, shots.circles.copy())
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)

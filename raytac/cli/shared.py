@@ -30,7 +30,9 @@ OWN_LEDS = "own"
 def read_data(
     data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str, split: int = 1, device: str = "auto"
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
-    """The sensor, its fully visible presses as read and as floats, and the names of those whose circles were found but are doubtful.
+    """The sensor, its fully visible presses as read and as floats, and names of doubtful ones.
+
+    A press is doubtful if its circle was found in the image without a clear step of colour.
 
     ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of
     ``AUTO`` is found, under the sensor's own lights.

@@ -31,7 +31,9 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 
 
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
-    """The first ``count`` presses, row by row: number, object and depth, the image, and under it the indentation of the whole pad.
+    """Figure of the first ``count`` presses, row by row.
+
+    Each shows its number, object and depth, the image, and under it the indentation of the whole pad.
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 

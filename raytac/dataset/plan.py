@@ -271,7 +271,10 @@ class DatasetPlan:
                 raise self._error(f"{axis}_mm", ends, rule)
 
     def _check_markers(self, sensor: SensorSpec) -> None:
-        """Refuse shifts and turns of the pattern that take a marker out of the view, now and not at the press that draws them."""
+        """Refuse shifts and turns of the pattern that take a marker out of the view.
+
+        They are refused here, before the press that draws them.
+        """
         largest = self.randomization.markers
         if self.sweep.markers is not None and largest.moves_pattern:
             ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])

@@ -138,7 +138,10 @@ class ShardRenderer:
     # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, of which the first are the presses; and the reason of each that failed, else an empty text."""
+        """Frame of B environments, of which the first are the presses, and why each failed.
+
+        The reason is empty for a press that succeeded.
+        """
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():

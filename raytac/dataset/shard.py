@@ -1,4 +1,7 @@
-"""Shards on disk: one ``.npz`` of arrays and one ``.json`` of rows each, written whole or not at all, and checked by SHA-256."""
+"""Shards on disk: one ``.npz`` of arrays and one ``.json`` of rows each, checked by SHA-256.
+
+They are written as a whole or not at all.
+"""
 
 from __future__ import annotations
 

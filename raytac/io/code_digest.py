@@ -58,7 +58,10 @@ def code_digest(*roots: str) -> str:
 
 @cache
 def git_state() -> dict[str, str | int]:
-    """``git.commit``, and ``git.changed``: how many tracked files of the package differ from it. Empty for an installed package."""
+    """``git.commit``, and ``git.changed``: the number of tracked files of the package that differ.
+
+    Empty for an installed package.
+    """
     package = Path(str(sys.modules["raytac"].__file__)).parent
     try:
         if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:

@@ -23,7 +23,9 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 @contextmanager
 def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
-    """Give a temporary folder; when the block ends well, move its files into ``out``, else delete them and leave ``out`` as it was.
+    """A temporary folder, whose files move into ``out`` when the block ends well.
+
+    Otherwise they are deleted, and ``out`` stays as it was.
 
     A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run
     that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` goes first and
@@ -79,7 +81,10 @@ def _check_no_folders(out: Path, names: Iterable[str]) -> None:
 
 
 def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
-    """Put the files of ``work`` into ``out``; if one cannot be put there, all that was there before goes back from ``old``."""
+    """Move the files of ``work`` into ``out``.
+
+    If one cannot be moved, all that was there before goes back from ``old``.
+    """
     written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
     try:
         for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):
@@ -102,7 +107,9 @@ _KIND = "must be a file that can be written, and no link: it is the lock of the 
 
 
 class FolderLock:
-    """A folder to oneself, made if need be, until ``release``, the end of a ``with`` block, or the end of the process, however it ends.
+    """Lock of a folder, which is made if need be.
+
+    It lasts until ``release``, the end of a ``with`` block, or the end of the process.
 
     Only runs that ask for the lock are kept out. Where the folder did not exist and nothing is written to it, it is removed again.
     """

@@ -1,4 +1,7 @@
-"""``metrics.json``: one flat object of dotted keys to numbers or strings, beside all that a command or experiment writes."""
+"""``metrics.json``: one flat object of dotted keys to numbers or strings.
+
+Every command and experiment writes one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Bake a table and write its folder: calibration files as Taxim has them, what was covered, and how far it is from the ray tracer."""
+"""Bake a table and write its folder: files as Taxim has them, coverage, and error.
+
+The error is that against the ray tracer, scene by scene.
+"""
 
 from __future__ import annotations
 
@@ -168,7 +171,10 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
 
 
 def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> None:
-    """One row a scene: ray tracer, table, table with shadows (if there are), and the table's signed error, mean of the channels."""
+    """Sheet of one row a scene: ray tracer, table, table with shadows, signed error of the table.
+
+    The error is the mean of the channels.
+    """
     import matplotlib
 
     matplotlib.use("Agg")

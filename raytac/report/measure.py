@@ -24,7 +24,9 @@ __all__ = ["machine", "moving", "once", "timed", "timed_within", "wilson_interva
 
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
-    """``count`` batches that take turns among ``surfaces`` (B = 1, one grid), each environment at 70 to 100 % of the indentation.
+    """``count`` batches from ``surfaces`` (B = 1, one grid) in turn.
+
+    Each environment has 70 to 100 % of the indentation.
 
     No two frames are alike, so that nothing is measured that a cache of the last frame would save.
     """
@@ -54,7 +56,9 @@ def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> 
 
 
 def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: int, budget_s: float) -> np.ndarray:
-    """As ``timed``, with fewer calls (at least three) where ``frames`` of them would take longer than ``budget_s`` seconds.
+    """As ``timed``, with fewer calls where ``frames`` of them take longer than ``budget_s`` seconds.
+
+    There are at least three calls.
 
     A slow call is warmed up once only, by the first input.
     """
@@ -88,7 +92,9 @@ def machine() -> dict[str, Metric]:
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a proportion (J. Am. Stat. Assoc. 22, 1927): the p with (p̂ − p)² = z² p (1 − p) / n; z = 1.96 is 95 %.
+    """Wilson's score interval of a proportion (J. Am. Stat. Assoc. 22, 1927).
+
+    Its ends are the p with (p̂ − p)² = z² p (1 − p) / n; z = 1.96 is 95 %.
 
     Unlike p̂ ± z √(p̂ (1 − p̂) / n) it stays within 0 and 1 and has a width at p̂ = 0 and 1. Raises ``InputError`` without trials.
     """

@@ -1,4 +1,4 @@
-"""Run one press and write its folder: rgb.png, frame.exr, height.npy, traction.npy, markers.npz, preview.png, metrics.json."""
+"""Run one press and write its folder: images, height, traction, markers, preview, metrics."""
 
 from __future__ import annotations
 

@@ -345,7 +345,9 @@ BOX_MARGIN = 15
 
 
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
-    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press; regions are those of the labelled circles.
+    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press.
+
+    Regions are those of the labelled circles.
 
     MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
     ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.

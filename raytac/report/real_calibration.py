@@ -55,7 +55,9 @@ def run_calibrate_optics(
     start: float,
     shadow_table: str = SHADOW_TABLES[0],
 ) -> list[Path]:
-    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
+    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``.
+
+    An error leaves nothing there.
 
     Raises:
         InputError: an unknown model, device or strength of priors, ``holdout`` of 1 or less than 0, too few presses, fewer than

@@ -1,4 +1,4 @@
-"""From a name or a path to the file that holds a sensor, its lights, its markers' motion, a press scene, a task scene or a sweep."""
+"""Files of sensors, lights, marker motions, scenes and sweeps, by name or path."""
 
 from __future__ import annotations
 

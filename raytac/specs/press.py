@@ -65,7 +65,10 @@ STAGE_SCHEMA: Final[dict[str, Schema]] = {
 
 
 def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
-    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
+    """``rigid`` or ``ipc``: the one asked for, ``ipc`` with a mesh level, that of the scene, ``rigid``.
+
+    The first of these that is given counts.
+    """
     return physics or ("ipc" if pad is not None else scene or "rigid")
 
 

@@ -249,7 +249,10 @@ class ResponseSpec:
 
 
 def shading_degree(count: int) -> int:
-    """Highest degree n of a colour shading that ``count`` coefficients are enough for, (n + 1)(n + 2)/2 of them; −1 for none."""
+    """Highest degree n of a colour shading of ``count`` coefficients; −1 for none.
+
+    A degree n has (n + 1)(n + 2)/2 coefficients.
+    """
     return (math.isqrt(8 * count + 1) - 3) // 2
 
 

@@ -38,7 +38,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
 
 def check_slab(sensor: SensorSpec) -> None:
-    """Check what optics with ``refraction.model = "slab"`` cannot do without: camera and all of every LED in the air below the slab.
+    """Check that camera and LEDs lie in the air below the slab of ``refraction.model = "slab"``.
 
     Raises:
         SpecError: as ``validate_sensor``.

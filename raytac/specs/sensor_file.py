@@ -169,7 +169,9 @@ _MOTION = "marker_motion.toml"
 
 
 def sensor_files(sensor: SensorSpec) -> dict[str, str]:
-    """Text by name of file: ``sensor.toml``, whose lights are those of ``lights.toml`` beside it, and what else it needs there.
+    """Texts by name of file: ``sensor.toml``, and further files that it needs.
+
+    Its lights are in a ``lights.toml`` beside it, which is not among them.
 
     A sensor whose lights, response and optics are all that it does not have from a shipped one names that as its base; any other holds
     every table itself. Markers' motion is a shipped name or a file beside it. No path of this machine is in it.

@@ -68,7 +68,9 @@ def check_shape(table: Table, kind: str, values: dict[str, Any]) -> None:
 
 
 def check_params(kind: str, params: Mapping[str, Any], schema: Schema, prefix: str) -> None:
-    """The rules of ``check_shape`` for a shape that is made in code, in SI; a file that it names is looked at where it is read.
+    """Check a shape that is made in code, in SI, by the rules of ``check_shape``.
+
+    A file that it names is checked where it is read.
 
     Raises:
         SpecError: a length or count that is missing or out of its range, lengths that contradict each other, or an unknown name.

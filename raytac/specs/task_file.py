@@ -147,7 +147,9 @@ def _check_names(tables: tuple[Table, ...], bodies: tuple[BodySpec, ...]) -> Non
 
 
 def load_scene(name_or_path: str | Path) -> PressScene | TaskScene:
-    """Read and check a press scene or a task scene: by its shipped name, or by the path of a file, where ``[robot]`` makes a task.
+    """Read and check a press scene or a task scene, by its shipped name or by the path of a file.
+
+    A file with ``[robot]`` is a task.
 
     Raises:
         SpecError: a name that neither has (the message lists all); as ``load_press`` and ``load_task``.

@@ -136,7 +136,10 @@ class _Field:
 
 @dataclass(frozen=True)
 class Number(_Field):
-    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval`` (in the unit of the file), or ``word`` in its place."""
+    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval``.
+
+    ``interval`` is in the unit of the file. ``word`` is accepted in place of the number.
+    """
 
     interval: str
     length: int = 0
@@ -261,7 +264,9 @@ Schema = Mapping[str, Number | Integer | Text | Flag]
 
 
 def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
-    """Check values in SI, by name, against the schema of the table that describes them in a file; ``vars`` gives those of a dataclass.
+    """Check values in SI, by name, against the schema of the table that describes them in a file.
+
+    ``vars`` gives those of a dataclass.
 
     Thus a specification that was made or changed in code obeys the rules of one from a file. The default of a field needs no check.
 

@@ -1,4 +1,7 @@
-"""The page: buttons, sliders, images and figures around the 3-D view; forwards what users do and draws what the player tells."""
+"""The page: buttons, sliders, images and figures around the 3-D view.
+
+It forwards what users do, and draws what the player reports.
+"""
 
 from __future__ import annotations
 

@@ -69,7 +69,10 @@ class Player:
         self._thread.start()
 
     def close(self, patience: float | None = None) -> bool:
-        """End the thread after the state it is computing; returns whether it ended within ``patience`` seconds (None: however long)."""
+        """End the thread after the state it is computing; True if it ended within ``patience`` seconds.
+
+        None waits however long it takes.
+        """
         with self._wakeup:
             self._is_closing = True
             self._wakeup.notify()

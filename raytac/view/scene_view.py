@@ -205,7 +205,9 @@ _SHARP = 35.0
 
 
 def split_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give both sides of every sharp edge vertices of their own, so that normals averaged over a vertex's faces are right.
+    """Give both sides of every sharp edge vertices of their own.
+
+    Normals that are averaged over the faces of a vertex are then right.
 
     Args:
         vertices: shape (V, 3).
@@ -262,7 +264,10 @@ def _table() -> np.ndarray:
 
 
 class ColourScale:
-    """From 0 to a round number that is at least what was seen since ``reset``, so that colours keep their meaning in a motion."""
+    """Scale from 0 to a round number that is at least the greatest value since ``reset``.
+
+    Colours thus keep their meaning in a motion.
+    """
 
     def __init__(self, quantity: Quantity) -> None:
         self.quantity = quantity

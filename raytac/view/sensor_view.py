@@ -1,4 +1,4 @@
-"""A sensor as the viewer draws it: gel block, case, lights and view of the camera once, its coat and image at every state."""
+"""Drawing of a sensor: gel block, case, lights and camera once, coat and image at every state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""viser's server with a guard before it: requests of other pages are refused, and messages are checked before viser sees them."""
+"""viser's server behind a guard: addresses of the page, and checked messages.
+
+Requests of other pages are refused, and messages are checked before viser sees them.
+"""
 
 from __future__ import annotations
 

@@ -208,7 +208,9 @@ _FREQUENCY = 60.0
 
 
 class Steering:
-    """A controller of one environment (see ``raytac.world.state.Controller``): ``aim`` sets ends, ``go`` moves on by one control step.
+    """Controller of one environment: ``aim`` sets targets, ``go`` advances by one control step.
+
+    It is a ``raytac.world.state.Controller``.
 
     Arms with torque motors follow by differential inverse kinematics and joint impedance, a driven frame by its servos. Other robots
     are held at their start.

@@ -55,7 +55,9 @@ PANELS = (("frame_mae", "whole frame"), ("contact_mae", "contact"), ("ring_mae",
 
 
 def write_pareto(comparison: Comparison, path: Path) -> None:
-    """Error against time of a frame, log axes: a row of panels a resolution; whole frame, contact and shadow ring beside each other.
+    """Error against time of a frame, with log axes: a row of panels a resolution.
+
+    Whole frame, contact and shadow ring are beside each other.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
     the mean noise of the reference, below which no error can be resolved.

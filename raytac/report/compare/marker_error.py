@@ -1,4 +1,7 @@
-"""Error of the cheap marker models against surface tracking, beside their time, on presses of the soft pad that no fit has seen."""
+"""Error and time of the cheap marker models against surface tracking.
+
+They are measured on presses of the soft pad that no fit has seen.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,10 @@ __all__ = ["PhysicsError", "physics_errors", "physics_metrics"]
 
 @dataclass(frozen=True)
 class PhysicsError:
-    """One press on both pads. Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255]."""
+    """Differences of one press on both pads.
+
+    Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255].
+    """
 
     scene: str
     resolution: str
