@@ -17,7 +17,7 @@ __all__ = ["FILES", "report_html", "write_comparison", "write_parquet"]
 
 FILES = ("report.html", "pareto.png", "results.parquet", "metrics.json")
 """Files of every comparison, besides ``sheet_<scene>_<resolution>.png``, ``rows/`` and ``references/``."""
-TEMPLATE = "report.html.j2"
+TEMPLATE = "compare_report.html.j2"
 
 
 def write_comparison(comparison: Comparison, out: Path, wall_s: float) -> list[Path]:
