@@ -23,12 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments.running import recorded, run
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names
+from raytac.io import CommonOptions, Metric, Progress, parse_names
 from raytac.report import (
     References,
     Tracers,
@@ -166,7 +165,7 @@ def speed(bench: Bench) -> dict[str, Metric]:
                 1
             ]
         tracer = bench.tracer(None if (width, height) == bench.size else (width, height))
-        for batch in tqdm(batches, desc=f"speed {name}", leave=False, disable=None):
+        for batch in Progress(batches, desc=f"speed {name}", leave=False):
             inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
 
             def on_device(heights: Any, tracer: Any = tracer) -> None:
@@ -198,7 +197,7 @@ def error(bench: Bench, references: References) -> dict[str, Metric]:
     metrics: dict[str, Metric] = {"reference.spp": bench.spp}
     inputs = moving(list(bench.surfaces.values()), 1, 6)
     variants = {"fast": FAST_VARIANTS["fast"]} if bench.args.quick else FAST_VARIANTS
-    for variant, options in tqdm(variants.items(), desc="error", leave=False, disable=None):
+    for variant, options in Progress(variants.items(), desc="error", leave=False):
         tracer = bench.tracer(**options)
         encode, key = tracer.response.encode_numpy, f"{variant}.{bench.key}"
         for scene, surface in bench.surfaces.items():
@@ -280,7 +279,7 @@ def peer(bench: Bench, references: References) -> dict[str, Metric]:
         tracer = bench.tracer(integrator=kind, progress=kind == "reference")
         rows_of: list[list[Row]] = []
         ratios: dict[str, list[float]] = {"": [], "_linear": [], "_without_rebuild": []}
-        for scene, surface in tqdm(bench.surfaces.items(), desc=f"peer {kind}", leave=False, disable=None):
+        for scene, surface in Progress(bench.surfaces.items(), desc=f"peer {kind}", leave=False):
             rows = trace_rows(bench, tracer, surface, references.linear(scene, surface))
             rebuild = rebuild_ms(tracer, surface, max(3, bench.frames // 6))
             rows_of.append(rows)

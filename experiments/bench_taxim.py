@@ -19,13 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.errors import BackendError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names
+from raytac.io import CommonOptions, Metric, Progress, parse_names
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -69,7 +68,7 @@ def speed(
         (family, batch) for family in ("taxim", "taxim_shadow", "phong") for batch in ((1, 2) if args.quick else BATCHES[device])
     ]
     modes: dict[str, Any] = {}
-    for family, batch in tqdm(jobs, desc=f"speed {name}", leave=False, disable=None):
+    for family, batch in Progress(jobs, desc=f"speed {name}", leave=False):
         mode = modes.setdefault(family, mode_of(spec, family, size, device, table))
         inputs = moving(surfaces, batch, 6 if batch < 64 else 3)
         host = timed(mode.render, inputs, frames)

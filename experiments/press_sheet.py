@@ -10,8 +10,8 @@ from pathlib import Path
 
 from experiments.running import recorded, run
 from raytac.frame import OUTPUTS
-from raytac.io import CommonOptions, read_metrics
-from raytac.report import run_press, write_sheet
+from raytac.io import CommonOptions, read_metrics, write_sheet
+from raytac.report import run_press
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 

@@ -39,9 +39,8 @@ from raytac.specs import load_lights, load_press, load_sensor, load_sweep
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import PressScene
-from raytac.specs.scene_file import load_scene
 from raytac.specs.sweep import PressRanges
-from raytac.specs.task_file import load_task
+from raytac.specs.task_file import load_scene, load_task
 
 LONGEST = 2500
 """Characters of a message, with the path of a temporary folder in it."""

@@ -12,9 +12,8 @@ from scipy.ndimage import map_coordinates
 import raytac
 from raytac.cli import main
 from raytac.frame import TactileFrame
-from raytac.io.exr import read_exr
+from raytac.io.images import read_exr, read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.specs import load_sensor
 
 ROOT = Path(__file__).parents[1]

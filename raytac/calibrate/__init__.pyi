@@ -6,5 +6,5 @@ from .light_parameters import leds_at_walls as leds_at_walls
 from .photographs import Photographs as Photographs
 from .photographs import read_photographs as read_photographs
 from .presses import RealPresses as RealPresses
+from .presses import by_press as by_press
 from .presses import read_presses as read_presses
-from .splits import by_press as by_press

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 
 from raytac.calibrate.direct_fit import SIGMA, FitSettings
+from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_cast_shadows, with_shading
 from raytac.calibrate.imprint import press_surface
-from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
-from raytac.calibrate.shading_fit import with_shading
-from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError
@@ -37,14 +34,14 @@ ALONE = "raytrace_alone"
 MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
 SHADOW_TABLES = ("none", "raytrace")
-"""Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
+"""Sources of a table's shadows: none, or the fitted ray tracer."""
 GRID_PITCH = 0.06e-3
 """Spacing of the pad's nodes [m], about a pixel's."""
 
 
 @dataclass(frozen=True)
 class Models:
-    """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
+    """Fits to one set of presses: the lights with imprint and circles, and a mode of each kind."""
 
     fitted: Fitted
     rest: np.ndarray
@@ -114,7 +111,9 @@ def fit_models(
     options: Mapping[str, Any] | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
-    """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
+    """Fit ``modes`` to the presses of ``shots``.
+
+    All use the imprint and the circles that the lights were fitted with.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
     ``shadow_table``: one of ``SHADOW_TABLES``.
@@ -142,7 +141,7 @@ def fit_models(
     )
     state, background, built = fitted.state, shots.background, {}
 
-    def told(images: int) -> None:
+    def count_rendered(images: int) -> None:
         if tick is not None:
             tick(f"{images} images of shadows", fitted.costs[-1])
 
@@ -157,7 +156,7 @@ def fit_models(
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
-                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
+                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
             built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
         elif name == "mlp":
             built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)

@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import FitOptions, SolverOptions
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
@@ -24,7 +23,7 @@ _OF_MARKERS = ("level", "quick", "verbose")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateArgs(SolverOptions):
+class CalibrateArgs(FitOptions, SolverOptions):
     """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the soft pad.
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
@@ -40,28 +39,13 @@ class CalibrateArgs(SolverOptions):
     what: Annotated[str, tyro.conf.Positional]
     """`markers`, or a folder of photographs or a dataPack.npz."""
     model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
-    """What a data set is fitted by; table and network take imprint and circles from a fit of the lights too."""
-    ball_diameter_mm: float | None = None
-    """Needed by a dataPack.npz, which does not say it."""
-    sides: str = FROM_SCRATCH
-    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
-    these were fitted to photographs that are tested on, errors are not of held-out presses."""
-    split: int = 1
-    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
-    a diffuser light like a row."""
+    """Model that is fitted to a data set; table and network take imprint and circles from a fit of the lights too."""
     holdout: int = 5
-    """Every so manieth press is held out and scored; 0 holds out none."""
+    """Interval of the presses that are held out and scored: 5 is every fifth; 0 holds out none."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat while it is fitted; sensor.toml says so, and is rendered so."""
+    """Let the ray tracer cast shadows on the coat while it is fitted; sensor.toml then asks for the same."""
     shadow_table: Literal["none", "raytrace"] = "none"
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
-    starts: int = 3
-    """Places that a fit of direct light starts from; the best goes on."""
-    rounds: int = 3
-    """Rounds with the ray tracer after direct light."""
-    prior: str = INNER
-    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
-    cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     level: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
@@ -103,12 +87,8 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        sensor, presses, shots, doubtful = read_data(
-            Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split, self.device
-        )
+        sensor, presses, shots = self.read(Path(self.what), self.sensor)
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
-        for name in doubtful:
-            print(f"the circle of press {name} is doubtful")
         for path in run_calibrate_optics(
             sensor,
             shots,
@@ -119,7 +99,7 @@ class CalibrateArgs(SolverOptions):
             holdout=self.holdout,
             starts=self.starts,
             rounds=self.rounds,
-            prior=prior_of(self.prior),
+            prior=self.chosen_prior,
             shadows=self.shadows,
             shadow_table=self.shadow_table,
             device=self.device,

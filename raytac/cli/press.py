@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from raytac.checks import check_known
-from raytac.cli.shadow_options import ShadowOptions
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import ShadowOptions, SolverOptions
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
@@ -19,7 +18,7 @@ from raytac.markers import MARKERS
 from raytac.optics import INTEGRATORS
 from raytac.report.press import run_press
 from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
-from raytac.specs import PADS, PHYSICS, load_press
+from raytac.specs import PADS, PHYSICS, press_of
 from raytac.specs.press import chosen_physics
 
 __all__ = ["PressArgs"]
@@ -35,7 +34,11 @@ class PressArgs(ShadowOptions, SolverOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press scene, such as coin, or path of a scene file."""
+    """Name of a shipped press scene, such as coin; path of a scene file; or an STL, OBJ or PLY file, with --depth."""
+    depth: float | None = None
+    """Depth that a mesh file is pressed in to [mm]; scenes have their own."""
+    scale: float | None = None
+    """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
@@ -69,7 +72,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
-        scene = load_press(self.scene)
+        scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
         physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":
             self.prepare_solver("physics='ipc'")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from raytac.checks import check_known, check_whole
-from raytac.cli.shadow_options import ShadowOptions
+from raytac.cli.shared import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS

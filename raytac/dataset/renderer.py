@@ -13,7 +13,7 @@ from raytac.dataset.arrays import ARRAYS
 from raytac.dataset.plan import DatasetPlan, Presses, press_scene_of
 from raytac.errors import AssetError, BackendError, RaytacError
 from raytac.frame import TactileFrame
-from raytac.io.git_state import git_state
+from raytac.io.code_digest import git_state
 from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
 from raytac.physics import NarrowContactWarning
@@ -32,7 +32,7 @@ Row = dict[str, str | int | float | None]
 
 @dataclass(frozen=True)
 class RenderJob:
-    """What every worker of a run is told."""
+    """Work order for every worker of a run."""
 
     plan: DatasetPlan
     device: str = "auto"
@@ -42,7 +42,7 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class ShardResult:
-    """What came of one shard."""
+    """Result of one shard."""
 
     shard: int
     arrays: dict[str, np.ndarray]
@@ -52,7 +52,7 @@ class ShardResult:
     made_by: dict[str, str | int | float]
     """Device, physics and optics, versions and state of the code."""
     worker: str = ""
-    """Who rendered it; goes into no file."""
+    """Name of the worker that rendered it; goes into no file."""
 
 
 @dataclass
@@ -138,7 +138,10 @@ class ShardRenderer:
     # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, of which the first are the presses; and the reason of each that failed, else an empty text."""
+        """Frame of B environments, of which the first are the presses, and why each failed.
+
+        The reason is empty for a press that succeeded.
+        """
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():
@@ -198,18 +201,20 @@ class ShardRenderer:
         return ""
 
     def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
-        found: dict[str, Any] = {name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")}
+        arrays: dict[str, Any] = {
+            name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")
+        }
         surface = frame.surface
-        found |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
+        arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
         if "contact" in self.plan.sweep.outputs:
-            found["contact"] = surface.contact
+            arrays["contact"] = surface.contact
         if frame.rgb is not None:
-            found["rgb"] = self._drifted(built, frame.rgb, presses)
+            arrays["rgb"] = self._drifted(built, frame.rgb, presses)
         if frame.markers is not None:
             m = frame.markers
-            found |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
-            found |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
-        return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in found.items()}
+            arrays |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
+            arrays |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
+        return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in arrays.items()}
 
     def _drifted(self, built: _Built, rgb: np.ndarray, presses: Presses) -> np.ndarray:
         if built.drift is None:
@@ -234,19 +239,19 @@ class ShardRenderer:
 
 def _figures(frame: TactileFrame, b: int) -> Row:
     """Figures of one press for the manifest."""
-    found: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
+    row: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
     if frame.wrench is not None:
         names = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-        found |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
+        row |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
     for name in ("contact_area", "contact_cells"):
         values = getattr(frame, name)
         if values is not None and np.isfinite(values[b]):
-            found[name] = float(values[b])
-    return found
+            row[name] = float(values[b])
+    return row
 
 
 def _not_finite(arrays: Mapping[str, np.ndarray]) -> str:
-    """Which array of a press holds a number that is not finite, where it ought to; empty if none."""
+    """Name of an array of a press that holds a number that is not finite and ought to be; empty if none."""
     lost = arrays.get("marker_visible")
     for name, values in arrays.items():
         if values.dtype.kind != "f":

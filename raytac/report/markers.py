@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.checks import check_known
 from raytac.device import resolve_device
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
+from raytac.io.progress import Progress
 from raytac.markers.calibration import ModelError, ProbeData, fit_motion, model_errors, probe_sensor
 from raytac.markers.calibration_presses import (
     FIT,
@@ -31,7 +31,7 @@ from raytac.markers.calibration_presses import (
 )
 from raytac.markers.registry import models_without_coat
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
-from raytac.report.machine import machine
+from raytac.report.measure import machine
 from raytac.report.press_store import PressStore, press_code
 from raytac.specs import validate_press
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
@@ -90,10 +90,10 @@ def run_calibrate_markers(
     solver = resolve_device(device, ray_tracing=False)
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
-        press_start = time.perf_counter()
-        store = PressStore(out / "presses", sensor.gelpad, pad=level, device=solver, code=press_code(), say=tqdm.write)
+        began = time.perf_counter()
+        store = PressStore(out / "presses", sensor.gelpad, pad=level, device=solver, code=press_code(), say=Progress.write)
         pressed = press_all(sensor, (*fit, *held_out), level, device, progress=progress, store=store)
-        press_s = time.perf_counter() - press_start
+        press_s = time.perf_counter() - began
         names = {press.name for press in fit}
         report = calibrate_markers(
             sensor,
@@ -131,7 +131,7 @@ def press_all(
         validate_press(sensor, press.scene())
     solver = resolve_device(device, ray_tracing=False)
     frames: list[PressFrame] = []
-    for press in tqdm(presses, desc=f"press {sensor.name}", unit="press", disable=None if progress else True):
+    for press in Progress(presses, desc=f"press {sensor.name}", unit="press", show=progress):
         states = None if store is None else store.read(press)
         if states is None:
             states = simulate_press(sensor, press, level=level, device=solver)

@@ -1,25 +1,27 @@
-"""Run one press and write its folder: rgb.png, frame.exr, height.npy, traction.npy, markers.npz, preview.png, metrics.json."""
+"""Run one press and write its folder: images, height, traction, markers, preview, metrics."""
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
+from raytac.gel.surface import GelSurface
 from raytac.io.arrays import npy_bytes
-from raytac.io.exr import vector_channels, write_exr
 from raytac.io.folder import result_folder
+from raytac.io.images import vector_channels, write_exr, write_png
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.io.png import write_png
 from raytac.markers import MARKERS
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
+from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "run_press"]
+__all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "press_peaks", "run_press"]
 
 FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "preview.png", "metrics.json")
 """Every file that a press may write; those of an earlier press that a new one does not write are removed."""
@@ -36,8 +38,8 @@ def run_press(
 ) -> list[Path]:
     """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
 
-    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: a bar for a simulated
-    pad, on a terminal. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
+    ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: show the progress of a
+    soft pad. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
 
     Raises:
         SpecError: the scene does not fit this sensor.
@@ -93,7 +95,7 @@ def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) ->
 
 
 def exr_header(sensor: TactileSensor, scene: PressScene, frame: TactileFrame) -> dict[str, str]:
-    """What is needed to know where an image came from; all text."""
+    """Origin of an image: sensor, scene, mode, seed, units and versions; all text."""
     size = _image_size(frame)
     header = {key: str(value) for key, value in sensor.sampling.items()}
     if size is not None:
@@ -204,3 +206,17 @@ def _write_preview(
         section=(float(surface.contact_centre[0, 0]), float(surface.contact_centre[0, 1])),
     )
     write_preview(path, data, sensor.spec)
+
+
+def press_peaks(
+    sensor: str | Path | SensorSpec, scenes: Sequence[str | Path], size: tuple[int, int], seed: int = 0
+) -> tuple[SensorSpec, dict[str, GelSurface]]:
+    """The sensor's specification, and the surface (B = 1) at the peak of each press scene by its name.
+
+    The grid's pitch is that of a pixel of ``size`` (width, height) on the pad, at most 0.1 mm.
+
+    Raises:
+        SpecError: an unknown sensor or scene, or a file that breaks a rule.
+    """
+    pressed = TactileSensor(sensor, outputs=("height",), resolution=size, device="cpu", seed=seed)
+    return pressed.spec, {Path(scene).stem: pressed.press(scene).surface for scene in scenes}

@@ -35,7 +35,7 @@ from raytac.sensor.options import (
     warn_of_other_shape,
 )
 from raytac.sensor.pad import load_pad, pad_forces, reading_forces, state_surface
-from raytac.specs import PressScene, SensorSpec, validate_press
+from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 from raytac.specs.press import PADS, chosen_physics
 
 if TYPE_CHECKING:
@@ -210,12 +210,18 @@ class TactileSensor:
 
     def press(
         self,
-        scene: str | Path | PressScene,
+        scene: str | Path | PressScene | np.ndarray,
         *,
+        depth: float | None = None,
+        scale: float | None = None,
+        pitch: float | None = None,
         progress: bool = False,
         **own: Any,
     ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
+
+        A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
+        ``raytac.specs.press_of``.
 
         ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a simulated pad, which takes seconds to
         minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
@@ -224,7 +230,7 @@ class TactileSensor:
             InputError: an argument of ``load`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
-        press = press_scene(scene)
+        press = press_of(scene, depth=depth, scale=scale, pitch=pitch)
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, **own)

@@ -1,4 +1,4 @@
-"""What a task scene is: a robot that carries sensors, bodies around it, and the steps in which they move. SI units, world frame.
+"""Task scenes: a robot that carries sensors, bodies around it, and the steps in which they move. SI units, world frame.
 
 World frame: base of the arm, z up, x ahead.
 """
@@ -36,11 +36,11 @@ __all__ = [
 ROBOTS = ("panda_one_sensor", "panda_two_fingers", "floating_gripper", "fixed_sensor")
 """Robots that raytac builds itself; any other is the path of an MJCF file."""
 OWNERS = ("ipc", "mujoco")
-"""Which simulator moves a free body where the pads are simulated."""
+"""Simulators that can move a free body where the pads are soft."""
 MOTIONS = ("fixed", "free", "soft")
-"""What a body can be: it never moves, it moves as a rigid body, it moves and deforms."""
+"""Dynamics of a body: it never moves, it moves as a rigid body, it moves and deforms."""
 COUPLINGS = ("two_way", "one_way")
-"""Whether what the pads feel acts back on the robot and on MuJoCo's bodies."""
+"""Couplings: forces on the pads act back on the robot and on MuJoCo's bodies, or do not."""
 PAIR_FRICTION = 0.5
 """Friction coefficient of a body that names none, against all but gel (a guess: dry plastics lie between 0.2 and 0.6)."""
 
@@ -111,7 +111,7 @@ BODY_SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class MountSpec:
-    """One sensor on a robot of one's own."""
+    """One sensor on a robot from a file."""
 
     name: str
     """Name of the sensor."""
@@ -131,20 +131,20 @@ class MountSpec:
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """What carries the sensors, and where it starts."""
+    """Carrier of the sensors, and its start."""
 
     model: str
     """One of ``ROBOTS``, or the absolute path of an MJCF file."""
     sensor: str | Path | SensorSpec = "gelsight_mini"
     """Every sensor on it: name or path of a sensor file, or a specification."""
     joints: tuple[float, ...] | None = None
-    """Where an arm's joints start [rad]; None: the Panda's READY, another robot's own start."""
+    """Start of an arm's joints [rad]; None: the Panda's READY, another robot's own start."""
     opening: float | None = None
     """Gap between both pads at the start [m]; None: as wide as the gripper opens."""
     position: Vec3 = (0.0, 0.0, 0.0)
-    """Where a ``floating_gripper`` (point midway between the pads) or a ``fixed_sensor`` (pad frame) starts [m]."""
+    """Start of a ``floating_gripper`` (point midway between the pads) or a ``fixed_sensor`` (pad frame) [m]."""
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """How it is turned there, wxyz."""
+    """Orientation there, wxyz."""
     mounts: tuple[MountSpec, ...] = ()
     """Sensors of an MJCF robot."""
     arm_joints: tuple[str, ...] = ()
@@ -225,7 +225,7 @@ class TaskScene:
     timestep: float = 0.002
     """Of MuJoCo [s]."""
     soft_timestep: float = 0.01
-    """Of the simulated pads [s], a whole multiple of ``timestep``."""
+    """Of the soft pads [s], a whole multiple of ``timestep``."""
     control_timestep: float = 0.01
     """Of the robot's control [s], a whole multiple of ``timestep`` and of ``soft_timestep``."""
     coupling: str = "two_way"

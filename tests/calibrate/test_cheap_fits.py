@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytac.calibrate.image_fits import PressSamples, fit_mlp, fit_table, press_samples, with_cast_shadows
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.press_samples import PressSamples, press_samples
-from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.gel.surface import make_grid
 from raytac.optics.image.mlp import MlpMode
 from raytac.optics.taxim.bake.settings import BakeSettings

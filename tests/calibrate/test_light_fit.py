@@ -10,11 +10,10 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
-from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.trace.fast_tracer import RayTracer

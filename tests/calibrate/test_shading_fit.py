@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from raytac.calibrate.image_fits import ShadingSettings, with_shading
 from raytac.calibrate.photographs import encode
-from raytac.calibrate.shading_fit import DEGREE, with_shading
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.response import shading_gain
@@ -34,7 +34,8 @@ def at_rest(sensor: SensorSpec) -> np.ndarray:
 def test_known_shading_is_found_again() -> None:
     """A photograph that the sensor itself took under a known shading, but for rounding to whole levels."""
     rng = np.random.default_rng(0)
-    known = [tuple(map(float, rng.normal(0, 0.08, (DEGREE + 1) * (DEGREE + 2) // 2))) for _ in range(3)]
+    degree = ShadingSettings().degree
+    known = [tuple(map(float, rng.normal(0, 0.08, (degree + 1) * (degree + 2) // 2))) for _ in range(3)]
     response = dataclasses.replace(
         BARE.response, **dict(zip(("shading_red", "shading_green", "shading_blue"), known, strict=True))
     )
@@ -53,7 +54,7 @@ def test_a_higher_degree_comes_nearer_to_a_photograph_with_a_spot() -> None:
     photograph = np.rint(encode(black + 0.1 + 0.2 * spot[..., None] * np.array([1.0, 0.5, 0.8]), gamma))
     off = []
     for degree in (0, 2, 4, 6):
-        shaded = with_shading(BARE, photograph, degree=degree, device="cpu", options=OPTIONS)
+        shaded = with_shading(BARE, photograph, settings=ShadingSettings(degree), device="cpu", options=OPTIONS)
         off.append(float(np.sqrt(((at_rest(shaded) - photograph) ** 2).mean())))
     assert all(finer < 0.75 * coarser for coarser, finer in itertools.pairwise(off)), off
     assert off[-1] < 4, off

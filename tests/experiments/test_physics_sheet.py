@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import physics_sheet
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.sensor import TactileSensor
 from tests.conftest import Shader
 

@@ -15,7 +15,7 @@ from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.views import Calibration
 from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.taxim.table import ShadowTable
-from raytac.report.table_error import SceneError, table_errors
+from raytac.report.bake import SceneError, table_errors
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 from raytac.specs.sensor import SensorSpec

@@ -13,8 +13,8 @@ import pytest
 from raytac.cli import main
 from raytac.errors import BackendError, InputError, RaytacError
 from raytac.gel.surface import GelSurface
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.optics.base import OpticalMode, OpticsImages
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.page import FILES, write_comparison

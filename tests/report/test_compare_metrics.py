@@ -9,8 +9,8 @@ import pytest
 
 from raytac.report.compare.figures import error_range, signed_error
 from raytac.report.compare.metrics import equal_errors, summaries
-from raytac.report.compare.row_store import Row, Value
 from raytac.report.compare.run import REGIONS
+from raytac.report.compare.store import Row, Value
 from raytac.report.image_error import METRICS
 
 

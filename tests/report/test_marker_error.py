@@ -1,4 +1,4 @@
-"""Marker rows of the comparison: on made-up presses whose truth is one of the models, and on the simulated pad by the command itself."""
+"""Marker rows of the comparison: on made-up presses whose truth is one of the models, and on the soft pad by the command itself."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from raytac.gel.surface import GelSurface
-from raytac.io.png import read_png
+from raytac.io.images import read_png
 from raytac.report.preview import (
     DIFFERENCE_RANGE,
     PreviewData,

@@ -14,14 +14,14 @@ from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import MODES, fit_models
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.splits import by_press
+from raytac.calibrate.presses import by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
+from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.io.png import write_png
+from raytac.io.images import write_png
 from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings, noise_floor, press_scores, summary, table_text
@@ -209,9 +209,9 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
 
 
 def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
-    assert prior_of(INNER) is None and prior_of("tied") == "tied"
+    assert FitOptions().chosen_prior is None and FitOptions(prior="tied").chosen_prior == "tied"
     with pytest.raises(InputError, match="inner, free, tied"):
-        prior_of("strong")
+        _ = FitOptions(prior="strong").chosen_prior
 
 
 WRONG: dict[str, Any] = {

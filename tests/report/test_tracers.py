@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.report.surfaces import press_peaks
+from raytac.report.press import press_peaks
 from raytac.report.tracers import Tracers
 
 SIZE = (80, 60)

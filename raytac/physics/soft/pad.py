@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.checks import check_whole
 from raytac.errors import InputError, SpecError
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.gel.traction import CoatTraction
+from raytac.io.progress import Progress
 from raytac.physics.base import ContactState
 from raytac.physics.press import (
     CLEARANCE,
@@ -134,7 +134,7 @@ class SoftPad:
         """
         check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self.reset()
-        with tqdm(desc=f"press {self.scene.name}", unit="step", disable=None if progress else True, leave=False) as bar:
+        with Progress(desc=f"press {self.scene.name}", unit="step", show=progress, leave=False) as bar:
             if self._drive is not None:
                 self._drive.bar = bar
             yield self._state(-1, "start", 1.0)

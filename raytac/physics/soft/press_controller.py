@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
+from raytac.io.progress import Progress
 from raytac.physics.press import CLEARANCE, PressTargets
 from raytac.physics.soft.placement import SoftPlaces
 from raytac.physics.soft.press_solver import SoftContact
@@ -63,7 +63,7 @@ class SoftDrive:
         self._d_hat = reader.mesh.d_hat
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
-        self.bar = tqdm(disable=True)
+        self.bar = Progress(desc="press", show=False)
         """Counts the solver's steps."""
         self._forget()
 

@@ -17,8 +17,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from raytac.report.compare.metrics import known, resolutions, select, summaries
 from raytac.report.compare.modes import FAMILIES
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import Comparison
+from raytac.report.compare.store import Row
 
 __all__ = ["error_range", "signed_error", "write_pareto", "write_sheet_of_scene"]
 
@@ -34,7 +34,7 @@ STYLE: dict[Any, Any] = {
     "ytick.labelsize": 7,
     "savefig.dpi": 300,
 }
-# Colours of Okabe and Ito, told apart by marker and line too.
+# Colours of Okabe and Ito; marker and line differ too.
 LOOK: dict[str, tuple[str, str, Any]] = {
     "fast": ("#0072B2", "o", "none"),
     "fast_4_rays": ("#0072B2", "D", "none"),
@@ -55,10 +55,12 @@ PANELS = (("frame_mae", "whole frame"), ("contact_mae", "contact"), ("ring_mae",
 
 
 def write_pareto(comparison: Comparison, path: Path) -> None:
-    """Error against time of a frame, log axes: a row of panels a resolution; whole frame, contact and shadow ring beside each other.
+    """Error against time of a frame, with log axes: a row of panels a resolution.
+
+    Whole frame, contact and shadow ring are beside each other.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
-    the mean noise of the reference, below which no error can be told.
+    the mean noise of the reference, below which no error can be resolved.
     """
     rows, names = comparison.rows, resolutions(comparison.rows)
     shown = list(dict.fromkeys(summary.family for summary in summaries(rows)))
@@ -102,14 +104,16 @@ def _scales(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _panel(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    found = summaries(rows)
-    for family in dict.fromkeys(summary.family for summary in found):
+    all_summaries = summaries(rows)
+    for family in dict.fromkeys(summary.family for summary in all_summaries):
         colour, marker, line = LOOK[family]
         if family.startswith("peer"):
-            for s in (s for s in found if s.family == family):
+            for s in (s for s in all_summaries if s.family == family):
                 axes.axvline(s.ms, color=colour, linestyle=line, linewidth=0.8, zorder=1)
             continue
-        points = sorted((s for s in found if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0)
+        points = sorted(
+            (s for s in all_summaries if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0
+        )
         for s in points:
             values = known(select(rows, mode=s.mode), column)
             axes.plot([s.ms, s.ms], [min(values), max(values)], color=colour, linewidth=0.6, alpha=0.5, zorder=2)
@@ -163,8 +167,8 @@ def write_sheet_of_scene(comparison: Comparison, scene: str, resolution: str, pa
         figure = Figure(figsize=(WIDTH_IN, total))
 
         def cell(k: int, lower: bool) -> Axes:
-            left, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
-            axes = figure.add_axes((left / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
+            x, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
+            axes = figure.add_axes((x / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
             axes.set_axis_off()
             return axes
 

@@ -11,8 +11,8 @@ import numpy as np
 from raytac.io.metrics import Metric
 from raytac.report.compare.marker_error import marker_error_metrics
 from raytac.report.compare.physics_error import physics_metrics
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import REGIONS, Comparison
+from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
 
 __all__ = [
@@ -71,7 +71,7 @@ class Summary:
     """``frame_mae`` …: means over scenes; RMSE and the PSNR that follows from it: over the mean square; worst scene's PSNR:
     ``frame_psnr_worst``."""
     at_noise: bool
-    """Whether the noise of the reference makes up half of the mean square error in some scene."""
+    """True if the noise of the reference makes up half of the mean square error in some scene."""
 
 
 def summaries(rows: Sequence[Row]) -> list[Summary]:
@@ -121,7 +121,7 @@ def _summary(rows: list[Row]) -> Summary:
 
 @dataclass(frozen=True)
 class EqualError:
-    """What a sampled family costs at the error of ``fast`` in one scene."""
+    """Cost of a sampled family at the error of ``fast`` in one scene."""
 
     resolution: str
     scene: str
@@ -141,7 +141,7 @@ def equal_errors(rows: Sequence[Row]) -> list[EqualError]:
 
     A denoised image is biased, so that its error need not fall on: beyond the last measured point nothing is said of it.
     """
-    found = []
+    costs = []
     for resolution in resolutions(rows):
         for fast in select(rows, resolution=resolution, mode="fast"):
             scene, target, ms = fast.figures["scene"], float(fast.figures["frame_rmse"] or 0), float(fast.figures["ms"] or 0)
@@ -149,8 +149,8 @@ def equal_errors(rows: Sequence[Row]) -> list[EqualError]:
                 sampled = select(rows, resolution=resolution, scene=scene, family=family)
                 sampled.sort(key=lambda row: int(row.figures["spp"] or 0))
                 if sampled and target > 0:
-                    found.append(_equal_error(resolution, str(scene), family, target, ms, sampled))
-    return found
+                    costs.append(_equal_error(resolution, str(scene), family, target, ms, sampled))
+    return costs
 
 
 def _equal_error(resolution: str, scene: str, family: str, target: float, ms: float, sampled: list[Row]) -> EqualError:
@@ -219,32 +219,32 @@ def _key(family: str, device: object, resolution: object, spp: object) -> str:
 
 
 def _row_metrics(row: Row) -> dict[str, Metric]:
-    figures, found = row.figures, {}
+    figures, metrics = row.figures, {}
     scene = figures["scene"]
     key = _key(str(figures["family"]), figures["device"], figures["resolution"], figures["spp"])
-    found[f"{key}.ms.{scene}"] = figures["ms"]
+    metrics[f"{key}.ms.{scene}"] = figures["ms"]
     for region in REGIONS:
         prefix = "" if region == "frame" else f"{region}_"
         for metric in METRICS:
-            found[f"{key}.{prefix}{KEYS[metric]}.{scene}"] = figures[f"{region}_{metric}"]
+            metrics[f"{key}.{prefix}{KEYS[metric]}.{scene}"] = figures[f"{region}_{metric}"]
     if figures["family"] == "fast":
         base = f"reference.{figures['resolution']}"
-        found[f"{base}.noise_levels.{scene}"] = figures["noise_frame_rmse"]
-        found[f"{base}.noise_psnr_db.{scene}"] = figures["noise_frame_psnr"]
-    return {name: value for name, value in found.items() if isinstance(value, (int, float, str))}
+        metrics[f"{base}.noise_levels.{scene}"] = figures["noise_frame_rmse"]
+        metrics[f"{base}.noise_psnr_db.{scene}"] = figures["noise_frame_psnr"]
+    return {name: value for name, value in metrics.items() if isinstance(value, (int, float, str))}
 
 
 def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
     """Time of the package over ours at the largest resolution that both ran at, medians over scenes, batch 1."""
-    found: dict[str, Metric] = {}
+    metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
         ours, peers = (
             known(select(rows, resolution=resolution, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer")
         )
         if ours and peers:
-            found[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
-            found[f"taxim{shadow}.vs_peer_resolution"] = resolution
-    return found
+            metrics[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
+            metrics[f"taxim{shadow}.vs_peer_resolution"] = resolution
+    return metrics
 
 
 def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) -> float:

@@ -69,7 +69,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
     import jinja2
 
     rows, settings = comparison.rows, comparison.settings
-    found = summaries(rows)
+    summary = summaries(rows)
     templates = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=templates, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     flip = any(row.figures["frame_flip"] is not None for row in rows)
@@ -89,14 +89,14 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
             {
                 "resolution": resolution.replace("x", " × "),
                 "scenes": f"over {scenes}",
-                "summaries": [s for s in found if s.resolution == resolution],
+                "summaries": [s for s in summary if s.resolution == resolution],
             }
             for resolution in resolutions(rows)
         ],
-        batch=next((s.batch for s in found), 0),
+        batch=next((s.batch for s in summary), 0),
         flip=flip,
         errors_wide=4 if flip else 3,
-        any_at_noise=any(s.at_noise for s in found),
+        any_at_noise=any(s.at_noise for s in summary),
         noise=noise,
         reference_spp=f"{settings.reference_spp:,}",
         equal=equal_errors(rows),

@@ -31,7 +31,9 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 
 
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
-    """The first ``count`` presses, row by row: number, object and depth, the image, and under it the indentation of the whole pad.
+    """Figure of the first ``count`` presses, row by row.
+
+    Each shows its number, object and depth, the image, and under it the indentation of the whole pad.
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 
@@ -88,8 +90,8 @@ def _dent(data: PressDataset, i: int) -> np.ndarray:
 
 def _bar(axis: Any, length: float, colour: str) -> None:
     """A scale bar of ``_BAR``, ``length`` in the axis' own unit, in the lower left corner."""
-    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    x, y = left + 0.05 * (right - left), bottom + 0.07 * (top - bottom)
+    (x_low, x_high), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    x, y = x_low + 0.05 * (x_high - x_low), bottom + 0.07 * (top - bottom)
     axis.plot([x, x + length], [y, y], color=colour, linewidth=2.0, solid_capstyle="butt", label="scale bar")
     axis.text(
         x + 0.5 * length,

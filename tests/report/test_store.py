@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.report.compare.row_store import Row, RowStore, row_key
+from raytac.report.compare.store import Row, RowStore, row_key
 
 
 def test_a_row_comes_back_as_it_was_kept(tmp_path: Path) -> None:

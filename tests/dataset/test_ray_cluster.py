@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from raytac.dataset import DatasetPlan, PressDataset, Presses, RenderJob, ShardResult, render_dataset, verify_dataset
-from raytac.dataset.ray_engine import render_on_ray
+from raytac.dataset.ray_cluster import render_on_ray
 from raytac.dataset.shard import ShardRecord, ShardStore
 from raytac.errors import BackendError, InputError
 from raytac.specs import SweepSpec

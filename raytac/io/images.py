@@ -1,12 +1,9 @@
-"""Multi-layer OpenEXR files of float32 channels by name, with text in the header.
-
-Conventions (OpenEXR technical introduction): ``R G B`` linear; ``led_red.R`` … one layer a light; ``N.X N.Y N.Z`` normals;
-``P.X P.Y P.Z`` position [m]; ``Z`` camera-axis depth [m], not distance along the ray.
-"""
+"""Images on disk: 8-bit PNG, linear OpenEXR with named channels, and sheets of several pictures."""
 
 from __future__ import annotations
 
 import errno
+import io
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,14 +12,50 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["HEADER_PREFIX", "read_exr", "vector_channels", "write_exr"]
+__all__ = ["HEADER_PREFIX", "png_bytes", "read_exr", "read_png", "vector_channels", "write_exr", "write_png", "write_sheet"]
+
+
+def png_bytes(rgb_u8: np.ndarray) -> bytes:
+    """``rgb_u8``, shape (H, W, 3), uint8, as the contents of a PNG file.
+
+    Raises:
+        InputError: another shape or type.
+    """
+    if rgb_u8.ndim != 3 or rgb_u8.shape[2] != 3 or rgb_u8.dtype != np.uint8:
+        raise InputError("rgb_u8", value=(rgb_u8.shape, str(rgb_u8.dtype)), rule="must have shape (H, W, 3) and type uint8")
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(rgb_u8)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def write_png(path: Path, rgb_u8: np.ndarray) -> None:
+    """Write ``png_bytes(rgb_u8)``.
+
+    Raises:
+        InputError: another shape or type.
+    """
+    path.write_bytes(png_bytes(rgb_u8))
+
+
+def read_png(path: Path) -> np.ndarray:
+    """The image as RGB, shape (H, W, 3), uint8."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
 
 HEADER_PREFIX = "raytac:"
 """Header attributes of this package are ``raytac:sensor``, ``raytac:seed``, …; all are text."""
 
 
 def vector_channels(name: str, image: np.ndarray, suffixes: str = "XYZ") -> dict[str, np.ndarray]:
-    """``("N", (H, W, 3))`` to ``{"N.X": (H, W), …}``; an empty name gives ``{"R": …}`` for suffixes ``"RGB"``."""
+    """Channels of a vector image.
+
+    ``("N", (H, W, 3))`` gives ``{"N.X": (H, W), …}``; an empty name with the suffixes ``"RGB"`` gives ``{"R": …}``.
+    """
     if image.ndim != 3 or image.shape[2] != len(suffixes):
         raise InputError(f"channels {name!r}", value=image.shape, rule=f"must have shape (H, W, {len(suffixes)})")
     return {f"{name}.{s}" if name else s: image[:, :, i] for i, s in enumerate(suffixes)}
@@ -84,3 +117,21 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     except (RuntimeError, ValueError) as error:
         raise InputError("EXR file", value=path, rule=f"must be readable as OpenEXR ({error})") from error
     return channels, header
+
+
+def write_sheet(pictures: list[Path], out: Path, *, gap: int = 24) -> None:
+    """Stack PNG files under each other, ``gap`` white pixels apart, narrower ones filled up with white on the right.
+
+    Raises:
+        InputError: no pictures.
+    """
+    if not pictures:
+        raise InputError("pictures", value=[], rule="must name at least one picture")
+    images = [read_png(path) for path in pictures]
+    width = max(image.shape[1] for image in images)
+    sheet = np.full((sum(image.shape[0] for image in images) + gap * (len(images) - 1), width, 3), 255, np.uint8)
+    top = 0
+    for image in images:
+        sheet[top : top + image.shape[0], : image.shape[1]] = image
+        top += image.shape[0] + gap
+    write_png(out, sheet)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.report import timing
-from raytac.report.timing import moving, timed
+from raytac.report import measure
+from raytac.report.measure import moving, timed
 from tests.clock import steady_clock
 from tests.conftest import make_surface
 
@@ -27,7 +27,7 @@ def test_moving_takes_turns_among_surfaces() -> None:
 
 def test_timed_warms_up_with_each_input_and_then_takes_them_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    steady_clock(monkeypatch, timing, 0.25)
+    steady_clock(monkeypatch, measure, 0.25)
     ms = timed(seen.append, [1, 2, 3], 4)
     assert seen == [1, 2, 3, 1, 2, 3, 1] and ms.tolist() == [250.0] * 4
 
@@ -35,5 +35,5 @@ def test_timed_warms_up_with_each_input_and_then_takes_them_in_turn(monkeypatch:
 def test_a_slow_call_is_timed_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 1 s a call a budget of 5 s holds five of ten, and one of 1 s the least, three."""
     for budget, count in ((5.0, 5), (1.0, 3), (10.0, 10)):
-        steady_clock(monkeypatch, timing, 1.0)
-        assert timing.timed_within(lambda _: None, [1, 2], 10, budget).tolist() == [1000.0] * count
+        steady_clock(monkeypatch, measure, 1.0)
+        assert measure.timed_within(lambda _: None, [1, 2], 10, budget).tolist() == [1000.0] * count

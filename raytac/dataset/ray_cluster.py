@@ -104,10 +104,10 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
     count = min(count, max(len(waiting), 1))
     settings = {"num_cpus": 1, "num_gpus": 1 if gpus else 0, "max_restarts": -1, "max_task_retries": 0}
     Worker = ray.remote(**settings)(_Worker)
-    told = replace(
+    local_job = replace(
         job, device=job.device if gpus else "cpu"
     )  # by value: what Ray starts again must not depend on an object's life
-    actors = [Worker.options(scheduling_strategy="SPREAD").remote(told) for _ in range(count)]
+    actors = [Worker.options(scheduling_strategy="SPREAD").remote(local_job) for _ in range(count)]
     # One before the others: it may bake a table, which those on its machine then find.
     for some in (actors[:1], actors[1:]) if waiting else ():
         try:
@@ -119,7 +119,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
     waiting.reverse()
     begun: dict[int, int] = {}
     running: dict[Any, tuple[Any, int | None]] = {}
-    """What workers are at: a shard, or None while one that died comes back."""
+    """Shard that each worker renders, or None while one that died comes back."""
 
     def give(actor: Any) -> None:
         if waiting:
