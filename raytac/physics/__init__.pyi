@@ -13,4 +13,5 @@ from .soft.pad import SoftPad as SoftPad
 from .soft.scene import ScenePad as ScenePad
 from .soft.scene import SceneState as SceneState
 from .soft.scene import SoftScene as SoftScene
+from .soft.settings import Correction as Correction
 from .soft.substeps import Poses as Poses

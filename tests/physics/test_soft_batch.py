@@ -45,7 +45,7 @@ def test_a_press_at_the_border_is_sound_and_leaves_the_others_as_they_are():
 
 def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
     scene, offsets = press(indent(0.1e-3)), np.array([[0.0, 0.0], [2e-3, 0.0]])
-    seen = SoftContact.seen
+    seen = SoftContact.coat_state
 
     def spoilt(contact, poses):
         found = seen(contact, poses)
@@ -53,7 +53,7 @@ def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
         return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(SoftContact, "seen", spoilt)
+        patch.setattr(SoftContact, "coat_state", spoilt)
         many = soft(scene, num_envs=2, offsets=offsets)
         state = many.peak(many.run())
         surface, wrench = many.surface(state), many.wrench(state)

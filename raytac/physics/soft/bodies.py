@@ -13,6 +13,7 @@ import ipc
 from raytac.errors import InputError
 from raytac.io.cache import cache_folder
 from raytac.physics.soft.mesh import PadMesh
+from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.physics.soft.skin import SoftSkin
 from raytac.se3 import rigid_poses
 from raytac.shapes.facets import SAG
@@ -242,6 +243,8 @@ class ScenePad:
     mesh: PadMesh
     pitch: float = 0.1e-3
     """Spacing of the grid that its surface is read on [m]."""
+    correction: Correction | None = DEFAULT_CORRECTION
+    """Of the surface that is read; None: the spline through the solver's vertices."""
 
 
 class Cast:

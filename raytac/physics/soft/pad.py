@@ -28,6 +28,7 @@ from raytac.physics.soft.placement import SoftPlaces
 from raytac.physics.soft.press_controller import SoftDrive
 from raytac.physics.soft.press_solver import SoftContact
 from raytac.physics.soft.reading import SoftReader, SoftReading
+from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -75,6 +76,7 @@ class SoftPad:
         shears: np.ndarray | None = None,
         twists: np.ndarray | None = None,
         device: str = "cpu",
+        correction: Correction | None = DEFAULT_CORRECTION,
     ) -> None:
         """Cut the pad, make the object's surface and put both into the solver.
 
@@ -88,6 +90,7 @@ class SoftPad:
             offsets, depths, rotations, shears, twists: what environments do each in their own way, see ``PressTargets``; not finite:
                 that environment fails.
             device: where the solver runs, ``cpu`` or ``cuda``.
+            correction: of what the mesh gets wrong below the size of its cells; None shows the plain finite-element surface.
 
         Raises:
             InputError: an unknown level, arguments of the wrong shape, ``depths`` deeper than the pad.
@@ -102,7 +105,7 @@ class SoftPad:
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
         check_trajectory(scene, sensor.gelpad, self.parts, targets.depths)
-        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid)
+        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, correction)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
         self.solver: SoftContact | None = None
@@ -224,7 +227,7 @@ class SoftPad:
                 *(stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed),
                 *(self.scene, none_yet, reading),
             )
-        reading = self._reader.read(self.solver.seen(self._drive.poses()), self._drive.failed)
+        reading = self._reader.read(self.solver.coat_state(self._drive.poses()), self._drive.failed)
         failed = self._drive.failed = reading.failed
         self._last = reading
         self._drive.read(reading.clearance)

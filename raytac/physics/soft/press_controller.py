@@ -205,7 +205,7 @@ class SoftDrive:
 
     def _off(self) -> np.ndarray:
         """How much more the barrier keeps than the object is held higher by [m], (B,); 0 out of contact, or where a force is kept."""
-        clearance = self._reader.clearance(self._solver.seen(self.poses()))
+        clearance = self._reader.clearance(self._solver.coat_state(self.poses()))
         return np.where(np.isfinite(clearance) & ~self.failed & ~np.isfinite(self._force), clearance - self._kept, 0.0)
 
     def _settle_depth(self) -> None:

@@ -8,7 +8,7 @@ import ipc
 from raytac.errors import OverlapError, RaytacError
 from raytac.physics.soft.bodies import OBJECT, PAD, SceneBody
 from raytac.physics.soft.mesh import PadMesh
-from raytac.physics.soft.reading import SeenObject, SeenPad
+from raytac.physics.soft.reading import CoatState, ContactObject
 from raytac.physics.soft.scene import ScenePad, SoftScene
 from raytac.physics.soft.substeps import SceneReport
 from raytac.se3 import inverse
@@ -147,9 +147,11 @@ class SoftContact:
         """What the object does to each vertex of the coat [N], shape (B, V, 3)."""
         return self.scene.coat_forces(PAD)
 
-    def seen(self, driven: np.ndarray) -> SeenPad:
-        """What a reader needs; ``driven``: ``pad_from_object`` (B, 4, 4) of an object that is not free."""
+    def coat_state(self, driven: np.ndarray) -> CoatState:
+        """Coat, forces and object, for a reader; ``driven``: ``pad_from_object`` (B, 4, 4) of an object that is not free."""
         free = not self.body.is_driven
         pose = inverse(self._world_from_pad) @ self.scene.pose(OBJECT) if free else driven
         surface = self.scene.skin(OBJECT, PAD) if self.body.is_soft else None
-        return SeenPad(self.scene.coat(PAD), self.forces(), (SeenObject(self.body.parts, pose, surface, None, self._friction),))
+        return CoatState(
+            self.scene.coat(PAD), self.forces(), (ContactObject(self.body.parts, pose, surface, None, self._friction),)
+        )

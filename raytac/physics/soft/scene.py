@@ -14,7 +14,7 @@ from raytac.errors import InputError, OverlapError
 from raytac.gel.surface import PadGrid, chosen_envs, make_grid
 from raytac.physics.soft.bodies import Cast, SceneBody, ScenePad, pad_body
 from raytac.physics.soft.mesh import pad_stiffness
-from raytac.physics.soft.reading import SeenObject, SeenPad, SoftReader, SoftReading
+from raytac.physics.soft.reading import CoatState, ContactObject, SoftReader, SoftReading
 from raytac.physics.soft.substeps import MOST_SUBSTEPS, Poses, SceneReport, Travel
 from raytac.se3 import batch_of, inverse, nearest_rotation, quaternion, quaternions, rigid_poses
 
@@ -288,20 +288,20 @@ class SoftScene:
         mine = self._cast.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(mine.mesh, d_hat=self.world.d_hat)
-            self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad))
-        return self._readers[pad].read(self.seen(pad), self._failed if failed is None else self._failed | failed)
+            self._readers[pad] = SoftReader(mesh, mine.sensor.gelpad, grid or self.grid(pad), mine.correction)
+        return self._readers[pad].read(self.coat_state(pad), self._failed if failed is None else self._failed | failed)
 
-    def seen(self, pad: str) -> SeenPad:
-        """What the reader needs: a pad's coat and forces, and what it touches."""
+    def coat_state(self, pad: str) -> CoatState:
+        """A pad's coat with the forces on it, and the objects that it touches."""
         frame = inverse(self.pose(self._cast.pad(pad).name))
         objects = []
         for name, near in self.world.touching(pad).items():
             body = self.bodies.get(name)
             if body is not None and not body.is_soft:
-                objects.append(SeenObject(body.parts, frame @ self.pose(name), None, near, self._friction_between(pad, name)))
+                objects.append(ContactObject(body.parts, frame @ self.pose(name), None, near, self._friction_between(pad, name)))
             elif name != pad:
-                objects.append(SeenObject((), frame @ self.pose(name), self.skin(name, pad), near))
-        return SeenPad(self.coat(pad), self.coat_forces(pad), tuple(objects))
+                objects.append(ContactObject((), frame @ self.pose(name), self.skin(name, pad), near))
+        return CoatState(self.coat(pad), self.coat_forces(pad), tuple(objects))
 
     def _friction_between(self, pad: str, body: str) -> float:
         """μ as the solver has it, which takes the last where a pair was given both ways round."""
