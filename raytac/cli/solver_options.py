@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from raytac.io.options import CommonOptions
-from raytac.physics.soft.availability import check_solver, hush_solver
+from raytac.physics.soft.availability import check_solver, quiet_solver
 
 __all__ = ["SolverOptions"]
 
@@ -25,4 +25,4 @@ class SolverOptions(CommonOptions):
         """
         check_solver(user)
         if not self.verbose:
-            hush_solver()
+            quiet_solver()

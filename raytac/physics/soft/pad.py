@@ -24,11 +24,11 @@ from raytac.physics.press import (
 )
 from raytac.physics.soft.bodies import object_body
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
-from raytac.physics.soft.placement import SoftPlaces
-from raytac.physics.soft.press_controller import SoftDrive
-from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.placement import PressPlacement
+from raytac.physics.soft.press_controller import PressController
+from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.reading import SoftReader, SoftReading
-from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
+from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
 from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -77,6 +77,7 @@ class SoftPad:
         twists: np.ndarray | None = None,
         device: str = "cpu",
         correction: Correction | None = DEFAULT_CORRECTION,
+        control: PressControl = DEFAULT_CONTROL,
     ) -> None:
         """Cut the pad, make the object's surface and put both into the solver.
 
@@ -91,6 +92,7 @@ class SoftPad:
                 that environment fails.
             device: where the solver runs, ``cpu`` or ``cuda``.
             correction: of what the mesh gets wrong below the size of its cells; None shows the plain finite-element surface.
+            control: tolerances and search of the solver and its controller.
 
         Raises:
             InputError: an unknown level, arguments of the wrong shape, ``depths`` deeper than the pad.
@@ -108,23 +110,23 @@ class SoftPad:
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, correction)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
-        self.solver: SoftContact | None = None
+        self.solver: PressSolver | None = None
         """Pad and object in the contact solver; None without an object."""
-        self._drive: SoftDrive | None = None
+        self._drive: PressController | None = None
         if self.parts:
-            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, targets)
+            self._places = PressPlacement(scene, self.parts, sensor.gelpad, self.grid, targets)
             above = self._places.poses(
                 np.full(num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((num_envs, 2)), np.zeros(num_envs)
             )
-            self.solver = SoftContact(sensor, self.mesh, self._body(), above, device)
-            self._drive = SoftDrive(scene, self.solver, self._reader, self._places, targets)
+            self.solver = PressSolver(sensor, self.mesh, self._body(), above, device, control)
+            self._drive = PressController(scene, self.solver, self._reader, self._places, targets)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[SoftState]:
         """States along the trajectory from the start: one before it (lifted by ``CLEARANCE``), ``steps_per_stage`` through each stage.
 
-        Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
+        Between states the solver takes as many steps as it needs. An ``indent`` to a depth ends when the *coat* is at that
         depth: what the barrier keeps between it and the object is added to the object's height; on the way the coat is there within some
         micrometres, and never deeper than the stage's end; in a shear or twist that follows, it stays there. One to a force moves the
         object until the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to
@@ -230,7 +232,7 @@ class SoftPad:
         reading = self._reader.read(self.solver.coat_state(self._drive.poses()), self._drive.failed)
         failed = self._drive.failed = reading.failed
         self._last = reading
-        self._drive.read(reading.clearance)
+        self._drive.set_clearance(reading.clearance)
         surface, forces = reading.surface, reading.forces
         total = forces.sum(axis=1)
         arm = reading.vertices[:, :, :2] - np.nan_to_num(surface.contact_centre)[:, None]

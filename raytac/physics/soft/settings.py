@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from raytac.checks import check_number, check_truth, check_whole
 from raytac.errors import InputError
 
-__all__ = ["DEFAULT_CORRECTION", "Correction", "PressControl", "SceneSettings", "SubstepLimits"]
+__all__ = ["DEFAULT_CONTROL", "DEFAULT_CORRECTION", "Correction", "PressControl", "SceneSettings", "SubstepLimits"]
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,7 @@ class SceneSettings(_Settings):
     linear_tolerance: float = 1e-6
     """Relative residual of the linear solve: a grasped body must follow to a small share of ε_v dt, or friction would slip."""
     substeps: SubstepLimits = SubstepLimits()
+    """Division of steps near contact."""
 
 
 @dataclass(frozen=True)
@@ -163,3 +164,8 @@ class PressControl(_Settings):
     """Steps of a release may be so many times as long."""
     rest_speed: float = 2e-5
     """Speed below which a free object lies still [m/s]."""
+    substeps: SubstepLimits = SubstepLimits()
+    """Only ``step`` and ``turn`` apply: a press is moved in steps of that size from the start."""
+
+
+DEFAULT_CONTROL = PressControl()
