@@ -46,7 +46,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     q = quaternion(rotation)
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     sine = np.sqrt(np.square(q[..., 1:]).sum(axis=-1, keepdims=True))
-    # θ / sin(θ/2), 2 where there is no turn
+    # θ / sin(θ/2), which is 2 at θ = 0
     factor = np.where(sine > 0.0, 2.0 * np.arctan2(sine, q[..., :1]) / np.where(sine > 0.0, sine, 1.0), 2.0)
     return factor * q[..., 1:]
 
@@ -54,8 +54,8 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 def quaternion(r: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz (…, 4) of rotation matrices (…, 3, 3).
 
-    The component is rooted that is greatest (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so that
-    they are as accurate at no turn as at half a turn.
+    The root is taken of the greatest component (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so
+    that the result is accurate for any angle.
     """
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     x, y, z = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
@@ -75,12 +75,12 @@ def quaternion(r: np.ndarray) -> np.ndarray:
 
 def inverse(poses: np.ndarray) -> np.ndarray:
     """Inverses of rigid transforms (…, 4, 4)."""
-    found = np.zeros_like(poses)
-    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
-    found[..., :3, :3] = turned
-    found[..., :3, 3] = -(turned @ poses[..., :3, 3, None])[..., 0]
-    found[..., 3, 3] = 1.0
-    return found
+    result = np.zeros_like(poses)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ poses[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
 
 
 def turn_angle(rotations: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Poses (B, 4, 4) a ``share`` of the way: positions along the line, rotations along the shorter arc (slerp)."""
+    """Interpolated poses (B, 4, 4) at a ``share``: positions along the line, rotations along the shorter arc (slerp)."""
     if share <= 0.0 or share >= 1.0:
         return (start if share <= 0.0 else end).copy()
     a, b = quaternions(start), quaternions(end)
@@ -101,10 +101,10 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     small = half < 1e-6
     sine = np.where(small, 1.0, np.sin(half))
     q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
-    found = np.tile(np.eye(4), (len(start), 1, 1))
-    found[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
-    found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
-    return found
+    result = np.tile(np.eye(4), (len(start), 1, 1))
+    result[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
+    result[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
+    return result
 
 
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
@@ -126,14 +126,14 @@ def rotations(vectors: np.ndarray) -> np.ndarray:
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
-    """Environments that poses with a first axis speak of; 1 if none has one."""
+    """Number of environments of poses with a batch axis; 1 if none has one."""
     given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
     given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
     return given[0][0] if given else 1
 
 
 def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = None) -> np.ndarray:
-    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis; raises ``InputError``."""
+    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from ``values`` with or without the batch axis; raises ``InputError``."""
     array = np.asarray(values, float)
     shape = (4, 4) if count is None else (count, 4, 4)
     if array.shape not in (shape, (batch, *shape)):

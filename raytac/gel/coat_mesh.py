@@ -1,4 +1,4 @@
-"""The coat as a triangle mesh that moves with the gel: what a simulated pad knows of its skin besides the height."""
+"""The coat as a triangle mesh that moves with the gel: vertices of a soft pad's surface at rest and deformed."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class CoatMesh:
 
 @dataclass(frozen=True, repr=False)
 class DeformedCoat:
-    """The coat of B pads at one instant; ``GelSurface.coat`` holds it wherever the physics simulates the gel, None elsewhere."""
+    """The coat of B pads at one instant: ``GelSurface.coat`` of a soft pad."""
 
     mesh: CoatMesh
     positions: np.ndarray
-    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (the barrier's stand-off is taken out)."""
+    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (see ``SoftReader``)."""
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 3 or self.positions.shape[1:] != self.mesh.rest.shape:
@@ -59,5 +59,5 @@ class DeformedCoat:
 
     @property
     def displacement(self) -> np.ndarray:
-        """Way of every vertex from rest [m], shape (B, V, 3)."""
+        """Displacement of every vertex from rest [m], shape (B, V, 3)."""
         return self.positions - self.mesh.rest[None]

@@ -1,4 +1,4 @@
-"""Connected components of contact masks, by runs: few NumPy calls for all environments, then plain Python over some dozens of runs."""
+"""Connected components of contact masks, by runs of True along the rows."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def find_edges(mask: np.ndarray) -> np.ndarray:
-    """The runs of ``find_runs`` by where each begins and has ended, (2 R,), in order; a place is row · (Nx + 1) + column."""
+    """Beginnings and ends of the runs of ``find_runs``, (2 R,), in order, as row · (Nx + 1) + column."""
     batch, ny, nx = mask.shape
-    # One False before every row, so that edges are in turn where a run begins and where it has ended.
+    # One False before every row, so that beginnings and ends alternate.
     padded = np.zeros(batch * ny * (nx + 1) + 1, dtype=bool)
     padded[:-1].reshape(batch * ny, nx + 1)[:, 1:] = mask.reshape(batch * ny, nx)
     return np.flatnonzero(padded[1:] != padded[:-1])

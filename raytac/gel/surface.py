@@ -1,4 +1,4 @@
-"""The deformed coat surface: the one thing that physics hands to optics, markers and force outputs."""
+"""The deformed gel surface, which physics passes to optics, markers and force outputs."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class GelSurface:
 
 
 def rounded_envs(envs: list[int], batch: int) -> list[int]:
-    """The same with the last of them named again, up to a power of two or ``batch``: kernels are recorded for each number of rows."""
+    """``envs`` padded with its last entry to a power of two or ``batch``: kernels are recorded for each number of rows."""
     count = min(1 << max(len(envs) - 1, 0).bit_length(), batch)
     return [*envs, *envs[-1:] * (count - len(envs))]
 
@@ -166,9 +166,9 @@ COARSEST_PITCH = 0.1e-3
 
 
 MOST_CELLS = 8192
-"""Most cells of the pad's grid along an axis, as many as an image can have pixels."""
+"""Most cells of the pad's grid along an axis: the most pixels of an image."""
 _SAME = 1e-6
-"""Difference within which a grid is of a pad [m]."""
+"""Tolerance of a grid's edges and rest heights [m]."""
 
 
 def grid_pitch(pixel: tuple[float, float]) -> float:
@@ -188,9 +188,9 @@ def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
     """Raise ``InputError`` unless ``grid`` spans this gelpad, to a micrometre, and rests on its dome."""
     ends = [float(nodes[k]) for nodes in (grid.x, grid.y) for k in (0, -1)]
-    own = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
-    if not np.allclose(ends, own, rtol=0.0, atol=_SAME):
-        rule = f"must be a grid of this sensor's pad, x and y from {own} m"
+    expected = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
+    if not np.allclose(ends, expected, rtol=0.0, atol=_SAME):
+        rule = f"must be a grid of this sensor's pad, x and y from {expected} m"
         raise InputError("surface.grid", value=ends, rule=rule)
     off = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
     if not off <= _SAME:

@@ -12,7 +12,7 @@ __all__ = ["looks_down", "relief_part", "relief_underside"]
 
 _STEPS = 60
 _LIMIT = 0.7
-"""Greatest slope · tan τ for the iteration: the factor by which each step shrinks the error at worst."""
+"""Greatest slope · tan τ for the iteration: the factor on the error in each step, at worst."""
 
 
 def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.ndarray | None = None) -> Part:
@@ -30,7 +30,7 @@ def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.n
 
 
 def looks_down(part: Part, pose: np.ndarray) -> bool:
-    """Whether the relief's face is turned down so far that ``relief_underside`` converges; if not, use its triangles."""
+    """True if the face looks down enough for ``relief_underside`` to converge; if not, use its triangles."""
     tangent = float(np.hypot(pose[2, 0], pose[2, 1]))
     return bool(pose[2, 2] > 0.0 and tangent * part.max_slope <= _LIMIT * pose[2, 2])
 
@@ -40,7 +40,7 @@ def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray)
 
     On the line o + t d (part frame) the underside solves p_z + e(p_x, p_y) = 0. Face down the line is vertical in the part frame
     too and t is read off. Tilted by τ, t ← t − (p_z + e) / d_z is iterated; it converges while slope · tan τ < 1, which
-    ``looks_down`` must have found.
+    ``looks_down`` checks.
     """
     o, d = line_in_part(pose, x, y)
     half_width = part.size[0]
