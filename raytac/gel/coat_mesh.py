@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,6 +41,17 @@ class CoatMesh:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of vertices (ny, nx)."""
         return len(self.lines_y), len(self.lines_x)
+
+    @cached_property
+    def face_areas(self) -> np.ndarray:
+        """Area of each face at rest [m²], shape (F,)."""
+        a, b, c = (self.rest[self.faces[:, k]] for k in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    @cached_property
+    def vertex_areas(self) -> np.ndarray:
+        """A third of the areas of the faces around each vertex [m²], shape (V,)."""
+        return np.bincount(self.faces.ravel(), np.repeat(self.face_areas / 3.0, 3), len(self.rest))
 
 
 @dataclass(frozen=True, repr=False)

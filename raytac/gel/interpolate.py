@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["SplineAxis", "hat_matrix", "sampled"]
+__all__ = ["SplineAxis", "cell_lengths", "hat_matrix", "sampled"]
 
 
 class SplineAxis:
@@ -47,6 +47,11 @@ class SplineAxis:
         out[rows, cell] += a
         out[rows, cell + 1] += b
         return out
+
+
+def cell_lengths(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Length of the cell between ``lines`` (n,) around each place ``t`` (P,), shape (P,)."""
+    return np.diff(lines)[np.clip(np.searchsorted(lines, t, side="right") - 1, 0, len(lines) - 2)]
 
 
 def hat_matrix(lines: np.ndarray, t: np.ndarray) -> np.ndarray:

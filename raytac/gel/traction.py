@@ -40,10 +40,7 @@ class CoatTraction:
             raise InputError("pitch", value=grid.pitch, rule=rule)
         self._shape = grid.shape
         self._faces = mesh.faces
-        corners = mesh.rest[mesh.faces]
-        face_area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        self._third = face_area[:, None, None] / 3.0
-        self._lumped = np.bincount(mesh.faces.ravel(), np.repeat(face_area / 3.0, 3), len(mesh.rest))[:, None]
+        self._third, self._lumped = mesh.face_areas[:, None, None] / 3.0, mesh.vertex_areas[:, None]
 
     def __call__(self, forces: np.ndarray) -> np.ndarray:
         """Traction [Pa], shape (B, Ny, Nx, 3), float32, of forces [N], shape (B, V, 3)."""

@@ -189,7 +189,9 @@ def object_body(
         return SceneBody(ipc.KinematicBody(OBJECT, surface), tuple(parts))
     try:
         if spec.dynamics == "affine":
-            volume = _volume(surface)
+            volume = enclosed_volume(surface)
+            if not volume > 0.0:
+                raise InputError("object.dynamics", value="affine", rule="needs a closed surface with its faces outwards")
             return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
             tets = ipc.tetrahedralize(surface, edge_length, cache_folder("tets"))
@@ -224,14 +226,6 @@ def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMes
             text = f"the parts of {name!r} overlap: {crossings.text(1e-3, 'mm')}; tests of whether a pad passes through it see them too"
             warnings.warn(text, stacklevel=3)
     return surface
-
-
-def _volume(surface: ipc.TriMesh) -> float:
-    """Volume [m³] that a closed surface bounds."""
-    volume = enclosed_volume(surface)
-    if not volume > 0.0:
-        raise InputError("object.dynamics", value="affine", rule="needs a closed surface with its faces outwards")
-    return volume
 
 
 @dataclass(frozen=True)

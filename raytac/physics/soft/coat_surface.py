@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh
-from raytac.gel.interpolate import SplineAxis, hat_matrix
+from raytac.gel.interpolate import SplineAxis, cell_lengths, hat_matrix
 from raytac.gel.matmul import sandwich
 from raytac.gel.surface import rest_height
 from raytac.specs.sensor import GelpadSpec
@@ -125,7 +125,7 @@ class BarrierClearance:
             hat_matrix(lines, t).astype(np.float32) for lines, t in ((mesh.lines_y, y), (mesh.lines_x, x))
         )
         self._weights = np.outer(self._hat_y.sum(axis=0), self._hat_x.sum(axis=0))
-        cell_x, cell_y = (_cell_length(lines, t) for lines, t in ((mesh.lines_x, x), (mesh.lines_y, y)))
+        cell_x, cell_y = (cell_lengths(lines, t) for lines, t in ((mesh.lines_x, x), (mesh.lines_y, y)))
         self._reach = d_hat + _SLACK * np.maximum(cell_y[:, None], cell_x[None, :])
 
     def heights(self, rise: np.ndarray) -> np.ndarray:
@@ -172,8 +172,3 @@ def _refine(lines: np.ndarray) -> np.ndarray:
     """Lines with every cell divided into ``_FINER`` equal ones."""
     share = np.arange(_FINER) / _FINER
     return np.append((lines[:-1, None] + share * np.diff(lines)[:, None]).ravel(), lines[-1])
-
-
-def _cell_length(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
-    cell = np.clip(np.searchsorted(lines, t, side="right") - 1, 0, len(lines) - 2)
-    return np.diff(lines)[cell]

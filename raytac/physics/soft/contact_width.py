@@ -8,6 +8,7 @@ import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.components import find_runs, join_runs
+from raytac.gel.interpolate import cell_lengths
 from raytac.gel.surface import GelSurface
 from raytac.specs import PressScene
 from raytac.specs.press import PADS
@@ -77,18 +78,13 @@ def _narrowest(contact: np.ndarray, surface: GelSurface, mesh: CoatMesh) -> floa
     order = np.lexsort((-radius, of_node))
     _, first, count = np.unique(of_node[order], return_index=True, return_counts=True)
     centre = order[first]
-    cell = np.maximum(_cell(mesh.lines_x, x[columns[centre]]), _cell(mesh.lines_y, y[rows[centre]]))
+    cell = np.maximum(cell_lengths(mesh.lines_x, x[columns[centre]]), cell_lengths(mesh.lines_y, y[rows[centre]]))
     # Distances reach to the first node out of contact, so a strip comes out up to two nodes too wide; a disc's centre lies between nodes,
     # which takes as much off.
     width = 2.0 * radius[centre] / cell
     by_width = np.argsort(width)
     area = np.cumsum(count[by_width])
     return float(width[by_width[np.searchsorted(area, _SMALL * area[-1])]])
-
-
-def _cell(lines: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Length [m] of the cell between ``lines`` (N,) around each place."""
-    return np.diff(lines)[np.clip(np.searchsorted(lines, at, side="right") - 1, 0, len(lines) - 2)]
 
 
 def _inscribed(mask: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:

@@ -134,9 +134,6 @@ class SoftReader:
         self._warned = False
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
-        corners = mesh.coat.rest[mesh.coat.faces]
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        self._vertex_area = np.bincount(mesh.coat.faces.ravel(), np.repeat(area / 3.0, 3), len(mesh.coat.rest))
 
     def clearance(self, state: CoatState) -> np.ndarray:
         """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact."""
@@ -227,7 +224,7 @@ class SoftReader:
         if len(state.objects) > 1:
             smooth = self._clearance.heights(self._surface.rise(places, displacement[:, 2]))
             under[under < smooth - _BEHIND] = np.inf
-        return places, self._clearance.measure(places, displacement[:, 2], -forces[:, 2] / self._vertex_area, under)
+        return places, self._clearance.measure(places, displacement[:, 2], -forces[:, 2] / self.mesh.coat.vertex_areas, under)
 
     def _height_at(self, height: np.ndarray, place: np.ndarray) -> np.ndarray:
         """z of a shown ``height`` (Ny, Nx) [m] at places (V, 2); beyond the pad's edge, the height of the edge."""

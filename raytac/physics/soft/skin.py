@@ -92,13 +92,9 @@ def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple
             return vertices, faces
         middle = np.where(split, len(vertices) + np.cumsum(split) - 1, -1)[which.ravel()].reshape(-1, 3)
         vertices = np.concatenate([vertices, 0.5 * (vertices[edges[split, 0]] + vertices[edges[split, 1]])])
-        faces = np.concatenate([_split(faces[rows], middle[rows]) for rows in _by_count(middle) if len(rows)])
-
-
-def _by_count(middle: np.ndarray) -> list[np.ndarray]:
-    """Rows of triangles with none, one, two and three of their edges split."""
-    count = (middle >= 0).sum(axis=1)
-    return [np.flatnonzero(count == k) for k in range(4)]
+        count = (middle >= 0).sum(axis=1)
+        alike = (np.flatnonzero(count == k) for k in range(4))  # triangles with none, one, two and three edges to split
+        faces = np.concatenate([_split(faces[rows], middle[rows]) for rows in alike if len(rows)])
 
 
 def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
