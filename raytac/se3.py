@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms of a batch: matrices, quaternions, rotation vectors, and checks of poses that users give."""
+"""Rotations and rigid transforms of a batch, and checks of poses that users give."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Interpolated poses (B, 4, 4) at a ``share``: positions along the line, rotations along the shorter arc (slerp)."""
+    """Poses (B, 4, 4) at a ``share``: linear positions, rotations along the shorter arc (slerp)."""
     if share <= 0.0 or share >= 1.0:
         return (start if share <= 0.0 else end).copy()
     a, b = quaternions(start), quaternions(end)
@@ -108,7 +108,7 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
 
 
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
-    """The rotations closest to matrices (…, 3, 3) in the Frobenius norm: the orthogonal factors of their polar decompositions."""
+    """Rotations closest to matrices (…, 3, 3) in the Frobenius norm (polar decomposition)."""
     u, _, v = np.linalg.svd(matrices)
     mirrored = np.linalg.det(u @ v) < 0.0
     u[mirrored, :, 2] *= -1.0
@@ -133,7 +133,7 @@ def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLik
 
 
 def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = None) -> np.ndarray:
-    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from ``values`` with or without the batch axis; raises ``InputError``."""
+    """Rigid transforms (B, 4, 4) or (B, count, 4, 4) of ``values`` that may lack the batch axis."""
     array = np.asarray(values, float)
     shape = (4, 4) if count is None else (count, 4, 4)
     if array.shape not in (shape, (batch, *shape)):

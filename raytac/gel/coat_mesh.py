@@ -1,4 +1,4 @@
-"""The coat as a triangle mesh that moves with the gel: vertices of a soft pad's surface at rest and deformed."""
+"""The coat as a triangle mesh: a soft pad's surface at rest and deformed."""
 
 from __future__ import annotations
 

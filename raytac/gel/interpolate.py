@@ -55,7 +55,7 @@ def cell_lengths(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def hat_matrix(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Linear interpolation from ``lines`` (n,) to ``t`` (P,), shape (P, n): rows are >= 0 and sum to 1."""
+    """Matrix (P, n) of linear interpolation from ``lines`` (n,) to ``t`` (P,); rows sum to 1."""
     cell, (a, b, _, _) = SplineAxis(lines).weights(t)
     out = np.zeros((len(cell), len(lines)))
     rows = np.arange(len(cell))
@@ -64,7 +64,7 @@ def hat_matrix(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def sampled(field: np.ndarray, x: np.ndarray, y: np.ndarray, at_x: np.ndarray, at_y: np.ndarray) -> np.ndarray:
-    """Bilinear interpolation of fields (…, Ny, Nx) over evenly spaced lines ``x``, ``y`` at places (V,); shape (…, V).
+    """Bilinear interpolation of fields (…, Ny, Nx) on regular lines at places (V,); (…, V).
 
     Beyond the edges the value at the edge is taken. A place that is NaN gives NaN.
     """

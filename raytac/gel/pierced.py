@@ -16,7 +16,7 @@ _ROUNDING = 1e-8
 
 
 def without_pierced(surface: GelSurface, gelpad: GelpadSpec) -> GelSurface:
-    """The surface, with NaN and no contact in environments whose gel lies below the bonded face anywhere."""
+    """The surface, with NaN and no contact where an environment's gel is below its bonded face."""
     pierced = surface.height.min(axis=(1, 2)) < -gelpad.thickness - _ROUNDING
     if not pierced.any():
         return surface

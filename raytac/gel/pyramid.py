@@ -28,7 +28,7 @@ _REACH = 4.8
 
 
 class ElasticSurround:
-    """From the overlap of object and resting gel to the deformed surface (after Si & Yuan, RA-L 2022, section III).
+    """Deformed surface from the overlap of object and resting gel (Si & Yuan, RA-L 2022, III).
 
     With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every width
     of the pyramid, wide to narrow, w ← Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface
@@ -99,7 +99,7 @@ class ElasticSurround:
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
     def _displacement(self, overlap: np.ndarray, deepest: float, touched: Piece, window: Piece) -> tuple[np.ndarray, np.ndarray]:
-        """w [m] on the window, and the contact where the object has touched the resting gel; ``overlap`` is that there."""
+        """w [m] on the window, and the contact on ``touched``, for the ``overlap`` there."""
         pressed = np.maximum(overlap, 0.0)
         full = overlap > self.contact_scale * deepest
         field, w = self._field(pressed, touched, window), pressed
@@ -114,7 +114,7 @@ class ElasticSurround:
         return field.over(window), contact
 
     def _field(self, pressed: np.ndarray, touched: Piece, window: Piece) -> SmoothedField:
-        """The cheaper method for this contact: local, if it is narrower than the reach of the Gaussians."""
+        """The cheaper method: local, if the contact is narrower than the reach of the Gaussians."""
         widths = (pitch * (line.stop - line.start) for line, pitch in zip(touched, reversed(self.grid.pitch), strict=True))
         if self._composed.fits and max(widths) <= self._reach:
             return LocalField(pressed, touched, self._composed, len(self._pyramid), self._final is not None, _REACH)

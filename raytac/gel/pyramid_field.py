@@ -1,4 +1,4 @@
-"""Two equivalent methods to smooth a field by successive Gaussians and re-impose the contact in between."""
+"""Smoothing by successive Gaussians with the contact re-imposed: two equivalent methods."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LARGEST = 512
 
 
 class SmoothedField(Protocol):
-    """A field that starts as 0 outside a piece ``touched``, on which it may be set again after every Gaussian."""
+    """A field, 0 at first outside a piece ``touched``, which is set again after every Gaussian."""
 
     def smooth(self) -> np.ndarray:
         """Apply the next Gaussian; returns the field on ``touched``."""
@@ -31,7 +31,7 @@ class SmoothedField(Protocol):
         ...
 
     def over(self, window: Piece) -> np.ndarray:
-        """The field on the window that was given at the start, with the last Gaussian if there is one."""
+        """The field on the initial window, with the last Gaussian if there is one."""
         ...
 
 
@@ -80,7 +80,7 @@ class ComposedGaussians:
         return float(np.sqrt(self._squares[first : last + 1].sum()))
 
     def apply(self, first: int, last: int, values: np.ndarray, touched: Piece, piece: Piece) -> np.ndarray:
-        """Smooth a field of ``values`` on ``touched``, 0 elsewhere, by the Gaussians ``first`` to ``last``; returns it on ``piece``."""
+        """Field on ``piece`` after the Gaussians ``first`` to ``last`` of ``values`` on ``touched``."""
         if (first, last) not in self._matrices:
             sigma = self.sigma(first, last)
             self._matrices[first, last] = tuple(  # type: ignore[assignment]
@@ -91,7 +91,7 @@ class ComposedGaussians:
 
 
 class LocalField:
-    """The field as a sum of increments on ``touched``, each smoothed by all later Gaussians; for small contacts.
+    """The field as a sum of increments on ``touched``, each smoothed by all later Gaussians.
 
     Only the re-imposed contact is not linear, and it acts on ``touched`` alone. So the field is computed there, and at the end over the
     window. With m nodes along a side of ``touched`` and n Gaussians this takes about n² m³ multiply-adds, whatever the window.

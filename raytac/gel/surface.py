@@ -30,7 +30,7 @@ __all__ = [
 
 
 def summary(record: Any) -> str:
-    """A dataclass on one line: arrays by type and shape instead of their values, and without the fields that are None or empty."""
+    """A dataclass on one line: arrays by type and shape, without empty fields."""
     shown = []
     for name, value in ((f.name, getattr(record, f.name)) for f in fields(record)):
         if isinstance(value, dict):
@@ -128,18 +128,18 @@ class GelSurface:
 
     @property
     def indentation(self) -> np.ndarray:
-        """Indentation depth rest − height [m], shape (B, Ny, Nx); negative where the gel bulges outwards."""
+        """Depth rest − height [m], (B, Ny, Nx); negative where the gel bulges outwards."""
         return self.grid.rest[None] - self.height
 
 
 def rounded_envs(envs: list[int], batch: int) -> list[int]:
-    """``envs`` padded with its last entry to a power of two or ``batch``: kernels are recorded for each number of rows."""
+    """``envs`` padded with its last entry to a power of two: kernels are recorded by row count."""
     count = min(1 << max(len(envs) - 1, 0).bit_length(), batch)
     return [*envs, *envs[-1:] * (count - len(envs))]
 
 
 def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
-    """Numbers of the environments that a mask (B,) or a list names, in its order; None names all.
+    """Environment numbers of a mask (B,) or a list, in its order; None names all.
 
     Raises:
         InputError: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
@@ -172,7 +172,7 @@ _SAME = 1e-6
 
 
 def grid_pitch(pixel: tuple[float, float]) -> float:
-    """Spacing [m] of the nodes for an image whose pixels cover ``pixel`` (x, y) [m] of the pad: as fine as the image."""
+    """Node spacing [m] for an image whose pixels cover ``pixel`` (x, y) [m] of the pad."""
     return min(COARSEST_PITCH, *pixel)
 
 
@@ -186,7 +186,7 @@ def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
-    """Raise ``InputError`` unless ``grid`` spans this gelpad, to a micrometre, and rests on its dome."""
+    """Raise ``InputError`` unless ``grid`` spans this gelpad and rests on its dome."""
     ends = [float(nodes[k]) for nodes in (grid.x, grid.y) for k in (0, -1)]
     expected = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
     if not np.allclose(ends, expected, rtol=0.0, atol=_SAME):

@@ -1,4 +1,4 @@
-"""Traction on the coat: force per area over the pad's grid, from vertex forces or from a total force."""
+"""Traction on the coat's grid, from vertex forces or from a total force."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["CoatTraction", "cell_areas", "foundation_traction"]
 
 
 def cell_areas(grid: PadGrid) -> np.ndarray:
-    """Area of each node [m²], shape (Ny, Nx): a cell, half of one at the edges, a quarter in the corners."""
+    """Area of each node [m²], (Ny, Nx): a cell, half of one at edges, a quarter in corners."""
     along = [np.full(n, pitch) for n, pitch in zip(reversed(grid.shape), grid.pitch, strict=True)]
     for line in along:
         line[[0, -1]] *= 0.5
@@ -20,7 +20,7 @@ def cell_areas(grid: PadGrid) -> np.ndarray:
 
 
 class CoatTraction:
-    """Traction of forces on a coat's vertices, over a grid, linear on each of the coat's triangles.
+    """Traction of forces on a coat's vertices, over a grid, linear on each triangle.
 
     Contact with facets loads neighbouring vertices unevenly: vertices of eight triangles more than those of four, by about 15 % against
     their areas. One pass averages each vertex's traction over its triangles and back by area; it keeps the sum and costs one cell of
@@ -57,7 +57,7 @@ class CoatTraction:
 
 
 def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the triangle that each node lies in at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
+    """Triangle around each node at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
     rows, columns = mesh.shape
     x, y = (a.ravel() for a in np.meshgrid(grid.x, grid.y))
     column = np.clip(np.searchsorted(mesh.lines_x, x, side="right") - 1, 0, columns - 2)
@@ -82,7 +82,7 @@ def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray
 
 
 def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Traction [Pa], shape (B, Ny, Nx, 3), of a contact with known total force, distributed as by an elastic foundation.
+    """Traction [Pa], (B, Ny, Nx, 3), of a total force, distributed as by an elastic foundation.
 
     The normal traction is proportional to the indentation in contact (K. L. Johnson, Contact Mechanics, section 4.3). The tangential
     force is distributed like the normal one, and the twist likewise times the distance from the contact's centre. The sum of

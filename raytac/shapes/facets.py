@@ -19,13 +19,13 @@ _RELIEF_SHARE = 0.04
 
 
 def around(radius: float, sag: float) -> int:
-    """Facets around a circle [m], a multiple of 4 so that the polygon is symmetric as the circle is."""
+    """Number of facets around a circle [m], a multiple of 4 for symmetry."""
     steps = np.pi / np.arccos(1.0 - min(sag / radius, 0.5))
     return 4 * int(np.clip(np.ceil(steps / 4.0), _FEWEST // 4, _MOST // 4))
 
 
 def coarse_relief(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (n,) [m] along both axes and elevation (n, n) [m] of a relief's map, read at a wider spacing, with a margin of 0."""
+    """Coordinates (n,) and elevation (n, n) [m] of a relief at a wider spacing, 0 around it."""
     assert part.elevation is not None
     half_width, data = part.size[0], part.elevation
     spacing = 2.0 * half_width / (len(data) - 1)

@@ -1,4 +1,4 @@
-"""One rigid part of an object, as plain numbers and arrays: the input of the height-field code."""
+"""One rigid part of an object, as plain numbers and arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes and environments at once.
+"""Undersides of primitive shapes: the exact first hit of vertical lines from below.
 
 Each function takes the shape's size [m], its poses ``pad_from_part`` (B, 4, 4) and node positions ``x`` (B or 1, 1, Nx), ``y``
 (B or 1, Ny, 1) [m], and returns the z [m], shape (B, Ny, Nx), of the solid's lowest point on each node's vertical line; ``inf`` where
@@ -109,7 +109,7 @@ def _box(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray
 
 
 def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Sphere at the tip joined tangentially to a conical frustum whose base, ``radius`` wide, lies ``height`` above the tip.
+    """Sphere at the tip, joined tangentially to a frustum with the base ``height`` above it.
 
     With ρ the tangent of the half angle the flank is √(x² + y²) = ρ (z − z_a); the tip's centre lies at z_a + r √(1 + ρ²) / ρ
     and its sphere touches z = 0, so the virtual apex is at z_a = r − r √(1 + ρ²) / ρ.
@@ -188,7 +188,7 @@ def _torus(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarr
 
 
 def _cubic(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Real roots of t³ + p t + q, ascending; a single one is repeated three times (Viète's and Cardano's formulas)."""
+    """Real roots of t³ + p t + q, ascending, a single one three times (Viète, Cardano)."""
     square = np.maximum(-p / 3.0, 0.0)
     amplitude = np.sqrt(square)
     rest = q * q / 4.0 + (p / 3.0) ** 3
@@ -201,7 +201,7 @@ def _cubic(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _flank(size: tuple[float, ...]) -> float:
-    """tan of the half angle of the flank: tangent to the tip's sphere and through the base's rim."""
+    """tan of the flank's half angle: tangent to the tip's sphere, through the base's rim."""
     radius, height, tip = size
     return float(np.tan(np.arctan2(radius, height - tip) - np.arcsin(tip / np.hypot(radius, height - tip))))
 
@@ -255,7 +255,7 @@ def _where_flat(flat: np.ndarray, inside: np.ndarray, interval: Interval) -> Int
 
 
 def _common(first: Interval, *others: Interval) -> np.ndarray:
-    """Start of the intersection of intervals, of which the first is overwritten; inf where it is empty."""
+    """Start of the intersection of intervals, overwriting the first; inf where it is empty."""
     start, end = first
     for other_start, other_end in others:
         np.maximum(start, other_start, out=start)

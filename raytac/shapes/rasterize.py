@@ -1,4 +1,4 @@
-"""A z-buffer for triangle meshes seen from below: exact heights at grid nodes, vectorised over triangles, no OpenGL."""
+"""A z-buffer for triangle meshes seen from below, vectorised over triangles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BARELY_FLAT = 1e-12
 
 
 def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Lowest z [m] of a set of triangles above each node, shape (Ny, Nx); ``inf`` where there is none.
+    """Lowest z [m] of triangles above each node, shape (Ny, Nx); ``inf`` where there is none.
 
     ``corners`` [m], shape (T, 3, 3): triangle, corner, xyz in the pad frame. ``x`` (Nx,), ``y`` (Ny,): evenly spaced, ascending.
 
@@ -75,7 +75,7 @@ def _row_span(p: np.ndarray, triangle: np.ndarray, y: np.ndarray, slack: float) 
 
 
 def _runs(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For runs of the given lengths laid end to end: the run of each element, and its place in the run."""
+    """Run of each element, and its place in it, of runs of these lengths laid end to end."""
     lengths = np.maximum(lengths, 0)
     run = np.repeat(np.arange(len(lengths)), lengths)
     return run, np.arange(len(run)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

@@ -16,7 +16,7 @@ _LIMIT = 0.7
 
 
 def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.ndarray | None = None) -> Part:
-    """A relief from its elevation [m], (N, N), over a square of the given half width [m] (see ``Part``)."""
+    """A relief from its elevation [m], (N, N), over a square of a half width [m]."""
     data = np.array(elevation, float)
     if data.ndim != 2 or data.shape[0] != data.shape[1] or len(data) < 4 or not np.isfinite(data).all() or data.min() < 0.0:
         raise InputError("elevation", value=data.shape, rule="must be square (N, N), N >= 4, finite and >= 0")
@@ -30,7 +30,7 @@ def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.n
 
 
 def looks_down(part: Part, pose: np.ndarray) -> bool:
-    """True if the face looks down enough for ``relief_underside`` to converge; if not, use its triangles."""
+    """True if ``relief_underside`` converges at this tilt; if not, use the triangles."""
     tangent = float(np.hypot(pose[2, 0], pose[2, 1]))
     return bool(pose[2, 2] > 0.0 and tangent * part.max_slope <= _LIMIT * pose[2, 2])
 

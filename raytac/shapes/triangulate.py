@@ -41,7 +41,7 @@ def object_surface(parts: Sequence[Part], sag: float = SAG) -> ipc.TriMesh:
 
 
 def part_surface(part: Part, sag: float = SAG) -> ipc.TriMesh:
-    """One part as triangles, part frame [m], counter-clockwise from outside, closed unless the part is an open mesh.
+    """One part as triangles, part frame [m], closed unless the part is an open mesh.
 
     Curved parts are inscribed: their vertices lie on them, their facets up to ``sag`` [m] inside (with at least 16 and at most 256
     facets around). A relief gets facets 0.2 mm apart, closed by its plane z = 0.
@@ -153,7 +153,7 @@ def _relief(part: Part) -> ipc.TriMesh:
 
 
 def _joined_surface(parts: Sequence[Part], sag: float = SAG) -> ipc.TriMesh:
-    """The closed surface of a first part and those ``joined`` to its lower face, without walls between them, object frame [m].
+    """Closed surface of a first part and those ``joined`` to its lower face, object frame [m].
 
     Raises:
         InputError: anything but a disc under which lies one relief as wide, or a box whose lower face is divided into equal squares with
@@ -170,7 +170,7 @@ def _joined_surface(parts: Sequence[Part], sag: float = SAG) -> ipc.TriMesh:
 
 
 def _disc_with_relief(disc: Part, relief: Part, sag: float) -> ipc.TriMesh:
-    """The relief's facets over the whole disc, flat where nothing rises, with the disc's wall and upper face.
+    """The relief's facets over the disc, with the disc's wall and upper face.
 
     The facets' outline is a polygon of grid nodes around the disc. Its corners, projected onto the disc's rim, are those of the wall. Every
     facet between the two lies in a sector of its own, so none can cross another.
@@ -254,6 +254,6 @@ def _plate_with_pins(plate: Part, pins: Sequence[Part], sag: float) -> ipc.TriMe
 
 
 def enclosed_volume(surface: ipc.TriMesh) -> float:
-    """Volume [m³] that a closed surface bounds (divergence theorem); positive where its faces look outwards."""
+    """Volume [m³] inside a closed surface (divergence theorem); > 0 with outward faces."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)

@@ -28,10 +28,11 @@ def check_solver(user: str) -> None:
 
 
 def quiet_solver() -> None:
-    """Let Warp print only warnings and errors in this process; without Warp or raytac's own ``ipc`` nothing happens.
+    """Let Warp print only warnings and errors in this process.
 
     Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
-    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used.
+    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used. Nothing happens without Warp or
+    raytac's own ``ipc``.
     """
     if importlib.util.find_spec("warp") is None or foreign_ipc() is not None:
         return
@@ -47,7 +48,7 @@ def quiet_solver() -> None:
 
 @contextlib.contextmanager
 def _no_standard_error() -> Iterator[None]:
-    """Drop output of native code to standard error: without a device, a missing CUDA driver is no news."""
+    """Drop native code's standard error: without a device, a missing driver is no news."""
     original = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:

@@ -1,4 +1,4 @@
-"""Bodies of the contact solver: bonded pads, and the driven, free and soft bodies that touch them."""
+"""Bodies of the contact solver: bonded pads, and driven, free and soft bodies."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class SceneBody:
 
 
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
-    """The gel of a pad: stable neo-Hookean, fixed at the bonded vertices of ``mesh``, with self-contact."""
+    """The gel of a pad: stable neo-Hookean, fixed where bonded, with self-contact."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
     return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
 

@@ -1,4 +1,4 @@
-"""The coat as a smooth surface, and the clearance that the solver's barrier keeps between it and an object."""
+"""The coat as a smooth surface, and the barrier's clearance between it and an object."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class CoatPlaces:
 
 
 class CoatSurface:
-    """The coat as a C² surface: bicubic splines through the displacements of its vertices, as a height field.
+    """The coat as a C² height field: bicubic splines through its vertices' displacements.
 
     The three components of the displacement d are splines of the material position (u, v). So the surface at rest is exactly the dome,
     and the deformed one has continuous normals and curvature: no facet of the mesh shows. A height field needs the height at a *place*.
@@ -64,7 +64,7 @@ class CoatSurface:
         self._rest = rest_height(gelpad, self._x, self._y)
 
     def places(self, displacement: np.ndarray) -> CoatPlaces:
-        """Material points at the lattice's places, for a ``displacement`` of the vertices [m], shape (V, 3)."""
+        """Material points at the lattice's places, for a ``displacement`` (V, 3) [m]."""
         sideways = self._fields(displacement[:, :2])
         u, v = self._x, self._y
         for _ in range(_ITERATIONS):
@@ -80,13 +80,13 @@ class CoatSurface:
         return CoatPlaces(rest_height(self._gelpad, *on_pad) - self._rest, corner, along_x, along_y)
 
     def rise(self, places: CoatPlaces, upwards: np.ndarray) -> np.ndarray:
-        """Height over rest [m] on the lattice, (rows, columns), for a displacement of the vertices along z [m], (V,)."""
+        """Height over rest on the lattice [m], (rows, columns), for a displacement along z (V,)."""
         fields = self._fields(upwards[:, None])
         d_z = _evaluate(fields, places.corner, places.along_x, places.along_y, self.mesh.shape[1])[0]
         return (places.sag + d_z).reshape(len(self._lattice_y.lines), len(self._lattice_x.lines))
 
     def matrices(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(rows, columns): over grid lines ``x``, ``y`` [m] the height over rest is rows @ ``rise(…)`` @ columns."""
+        """(rows, columns) of grid lines [m]: rows @ ``rise(…)`` @ columns is the height over rest."""
         return self._lattice_y.matrix(y), self._lattice_x.matrix(x).T
 
     def _cells(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -95,7 +95,7 @@ class CoatSurface:
         return row * self.mesh.shape[1] + column, (along_x, along_y)
 
     def _fields(self, values: np.ndarray) -> np.ndarray:
-        """Values (V, C) at the vertices with their second derivatives along x, y and both, shape (2, 2, C, V)."""
+        """Vertex values (V, C) and second derivatives along x, y and both, (2, 2, C, V)."""
         rows, columns = self.mesh.shape
         f = np.moveaxis(values, -1, 0).reshape(-1, rows, columns)
         bending_x, bending_y = self._axis_x.bending, self._axis_y.bending
@@ -116,7 +116,7 @@ class BarrierClearance:
     """
 
     def __init__(self, surface: CoatSurface, rest: np.ndarray, x: np.ndarray, y: np.ndarray, d_hat: float) -> None:
-        """Sample at ``x`` (Nx,) and ``y`` (Ny,) [m], where the coat at rest has the height ``rest`` (Ny, Nx) [m]."""
+        """Sample at ``x`` (Nx,), ``y`` (Ny,) [m], where the coat rests at ``rest`` (Ny, Nx) [m]."""
         self.x, self.y, self.rest = x, y, rest
         self._surface = surface
         self._rows, self._columns = (m.astype(np.float32) for m in surface.matrices(x, y))

@@ -1,4 +1,4 @@
-"""Width of a contact in cells of the soft pad's mesh: with too few cells across it, its force is inaccurate."""
+"""Width of a contact in cells of the soft pad's mesh, on which the force's accuracy depends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class NarrowContactWarning(UserWarning):
 
 
 def cells_across(surface: GelSurface, mesh: CoatMesh) -> np.ndarray:
-    """Width of the narrowest patch of contact in cells of the coat, shape (B,); NaN without contact.
+    """Width of the narrowest contact patch in cells of the coat, (B,); NaN without contact.
 
     A patch is an 8-connected piece of ``surface.contact``; its width is the diameter of its largest inscribed circle, over the longer
     side of the coat's cell at that circle's centre. The narrowest is the first at which patches, in order of width, make up a tenth of
@@ -36,7 +36,7 @@ def cells_across(surface: GelSurface, mesh: CoatMesh) -> np.ndarray:
 
 
 def holds_force(scene: PressScene, stage: int) -> bool:
-    """True if the contact bears a prescribed force at a stage, whose total is then right on every mesh."""
+    """True if a force is prescribed at a stage: the total is then right on every mesh."""
     indents = [s for s in scene.trajectory[: stage + 1] if s.kind == "indent"]
     return bool(indents) and indents[-1].force is not None
 
@@ -88,7 +88,7 @@ def _narrowest(contact: np.ndarray, surface: GelSurface, mesh: CoatMesh) -> floa
 
 
 def _inscribed(mask: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
-    """Distance from every node of a mask to the nearest node outside it, or beyond the grid [m]; 0 outside the mask.
+    """Distance from every node of a mask to the nearest outside it [m]; 0 outside the mask.
 
     Exact, one axis after the other (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions, 2012, without their
     envelopes: contacts are some dozens of nodes wide).

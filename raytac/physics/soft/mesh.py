@@ -1,4 +1,4 @@
-"""Tetrahedral mesh of a gelpad, graded towards the contact face and the centre, with mirrored cells that do not lock."""
+"""Tetrahedral mesh of a gelpad, graded towards the contact face and the centre."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _lines(size: float, level: PadLevel) -> np.ndarray:
 
 
 def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarray:
-    """Triangles of the uppermost layer in its own vertex numbers, counter-clockwise seen from +z; shape (F, 3)."""
+    """Triangles (F, 3) of the uppermost layer, in its own numbers, counter-clockwise from +z."""
     faces = tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
     faces = faces[(faces >= first).all(axis=1)]
     a, b, c = (vertices[faces[:, k], :2] for k in range(3))

@@ -1,4 +1,4 @@
-"""Placement of a press: poses of object and case from first touch, depth, shear and twist, for B environments."""
+"""Placement of a press: poses of object and case from first touch, shear and twist."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PressPlacement:
         return np.array([origin[2] - self._touch(b, x, y, angle) for b, (origin, (x, y), angle) in enumerate(places)])
 
     def stiffness(self, b: int, twist: float, force: float) -> float:
-        """Force over depth [N/m] by the bonded layer's law at ``force`` [N]: a first guess for a search."""
+        """Force over depth [N/m] by the bonded layer's law at ``force`` [N]: a first guess."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
         law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
@@ -93,7 +93,7 @@ class PressPlacement:
                     raise targets.stage_error(index, targets.stage(stage, b), b, error) from error
 
     def _touch(self, b: int, x: float, y: float, twist: float) -> float:
-        """Height of the object's origin at which it first touches the pad at rest [m]; cached, since environments share poses."""
+        """Height of the object's origin at first touch [m]; cached, since environments share poses."""
         pose = np.eye(4)
         pose[:3, :3] = about_z(twist) @ self._rotations[b]
         pose[:2, 3] = x, y

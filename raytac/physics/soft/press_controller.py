@@ -1,4 +1,4 @@
-"""Controller of a press into the soft pad: to a depth of the coat or a normal force, through shear and twist, and release."""
+"""Controller of a soft press: depth or normal force, shear, twist and release."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class PressController:
             self.bar.update()
 
     def _converge(self) -> None:
-        """Repeat a step that did not meet the solver's tolerance, at rest; what does not meet it then has failed."""
+        """Repeat at rest a step that did not meet the tolerance; what never meets it has failed."""
         for _ in range(self._control.refinements):
             if (self._solver.converged | self.failed).all():
                 return
@@ -199,7 +199,7 @@ class PressController:
             self._load()
 
     def _clearance_error(self) -> np.ndarray:
-        """Present clearance less the one that the object is raised by [m], (B,); 0 out of contact, or where a force is prescribed."""
+        """Measured less applied clearance [m], (B,); 0 out of contact or at a prescribed force."""
         clearance = self._reader.clearance(self._solver.coat_state(self.poses()))
         return np.where(np.isfinite(clearance) & ~self.failed & ~np.isfinite(self._force), clearance - self._clearance, 0.0)
 
@@ -223,7 +223,7 @@ class PressController:
         self._settle_friction()
 
     def _load(self) -> None:
-        """Reach the prescribed normal force: a free object by its weight, a driven one by a secant search of its depth."""
+        """Reach the normal force: a free object by its weight, a driven one by a secant search."""
         if self._is_free:
             self._rest()
             return

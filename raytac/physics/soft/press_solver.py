@@ -22,7 +22,7 @@ GRAVITY = 9.81
 
 
 class PressSolver:
-    """B copies of a bonded pad and one object. Every pose and vector is in the pad frame unless its name says otherwise."""
+    """B copies of a bonded pad and one object; pad frame unless a name says otherwise."""
 
     def __init__(
         self, sensor: SensorSpec, mesh: PadMesh, body: SceneBody, start: np.ndarray, device: str, control: PressControl
@@ -71,13 +71,13 @@ class PressSolver:
         self._world_from_pad = np.tile(np.eye(4), (len(self._world_from_pad), 1, 1))
 
     def fail(self, envs: np.ndarray) -> None:
-        """Freeze the environments of a mask (B,) until the next ``reset``, so that they cost nothing and delay no other."""
+        """Freeze the environments of a mask (B,) until the next ``reset``; they cost nothing then."""
         new = envs & ~self.scene.failed
         if new.any():
             self.scene.fail(new)
 
     def step(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None = None) -> np.ndarray:
-        """Move a driven object to ``pad_from_object`` and, if given, the case to ``world_from_pad``, (B, 4, 4) each, in one step.
+        """Move a driven object, and if given the case, to poses (B, 4, 4) in one step.
 
         Where a contact jams, the barrier is stiffened and the step repeated. Returns the mask (B,) of environments that failed.
         """
@@ -104,7 +104,7 @@ class PressSolver:
         return report
 
     def settle_friction(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None, failed: np.ndarray) -> np.ndarray:
-        """Repeat steps at rest until friction agrees with the present normal forces; poses as for ``step``.
+        """Repeat steps at rest until friction agrees with the normal forces; poses as for ``step``.
 
         Friction is bounded by the normal forces at the beginning of a step. In an unloading these are too large, and some belong to
         contacts that the step has opened: friction would pull on the pad where nothing touches it any more. Environments that
@@ -123,7 +123,7 @@ class PressSolver:
         return failed
 
     def obeys_friction(self) -> np.ndarray:
-        """Mask (B,): the total force is within Coulomb's cone and no vertex is pulled, within ``friction_tolerance``."""
+        """Mask (B,): total force in Coulomb's cone and no tension, within ``friction_tolerance``."""
         forces, tolerance, least = self.forces(), self.control.friction_tolerance, self.control.friction_force
         total = forces.sum(axis=1)
         normal = np.maximum(-total[:, 2], 0.0)

@@ -1,4 +1,4 @@
-"""Reading of a soft pad: from the solver's state to the surface, contact and forces that a sensor shows."""
+"""Reading of a soft pad: surface, contact and forces from the solver's state."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class CoatState:
         return np.all([np.isfinite(values).all(axis=(1, 2)) for values in arrays], axis=0)
 
     def friction(self, b: int) -> float | None:
-        """Coulomb's coefficient if a single rigid object touches pad ``b``; several may drag the skin in different directions."""
+        """Coulomb's coefficient if a single rigid object touches pad ``b``, else None."""
         things = [thing for thing in self.objects if thing.touches(b)]
         return things[0].friction if len(things) == 1 and things[0].surface is None else None
 
@@ -140,7 +140,7 @@ class SoftReader:
         return np.array([self._measure(state, b)[1] for b in range(len(state.vertices))])
 
     def read(self, state: CoatState, failed: np.ndarray) -> SoftReading:
-        """Surface, contact and forces of every pad; NaN for those that ``failed``, (B,), or have a number that is not finite."""
+        """Surface, contact and forces of every pad; NaN where ``failed`` (B,) or not finite."""
         coat, vertices, forces = state.vertices.copy(), state.vertices.copy(), state.forces.copy()
         poses = tuple(thing.poses.copy() for thing in state.objects)
         batch = len(coat)
@@ -227,7 +227,7 @@ class SoftReader:
         return places, self._clearance.measure(places, displacement[:, 2], -forces[:, 2] / self.mesh.coat.vertex_areas, under)
 
     def _height_at(self, height: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """z of a shown ``height`` (Ny, Nx) [m] at places (V, 2); beyond the pad's edge, the height of the edge."""
+        """z of a ``height`` field (Ny, Nx) [m] at places (V, 2), extended beyond the pad's edge."""
         x, y = (np.clip(place[:, k], line[0], line[-1]) for k, line in enumerate((self.grid.x, self.grid.y)))
         return rest_height(self._gelpad, x, y) + sampled(height - self._rest, self.grid.x, self.grid.y, x, y)
 
@@ -245,7 +245,7 @@ class SoftReader:
             )
 
     def _correction_stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
-        """Stages of the correction, made at the first contact because the mesh's compliance takes a while."""
+        """Stages of the correction, made at the first contact: the compliance takes a while."""
         if self._stages is None:
             assert self.correction is not None
             x, y = self._fine_grid.x, self._fine_grid.y
@@ -273,7 +273,7 @@ class SoftReader:
 
 
 def _touched_pose(state: CoatState, poses: tuple[np.ndarray, ...]) -> np.ndarray | None:
-    """Pose (B, 4, 4) of the only object, or of the first that touches in each environment; None without one."""
+    """Pose (B, 4, 4) of the first object that touches in each environment; None without objects."""
     if not poses:
         return None
     result = poses[0].copy()

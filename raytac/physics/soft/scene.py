@@ -171,7 +171,7 @@ class SoftScene:
         return total
 
     def advance(self, world_from_pad: np.ndarray, driven: Mapping[str, np.ndarray], dt: float | None = None) -> SceneReport:
-        """One undivided step of the solver, to (B, S, 4, 4) and (B, 4, 4) by name; ``dt`` [s]: None for the scene's."""
+        """One undivided solver step to (B, S, 4, 4) and (B, 4, 4) by name; ``dt`` as for ``step``."""
         for k, name in enumerate(self.pads):
             self.world.set_target(name, world_from_pad[:, k, :3, 3], quaternions(world_from_pad[:, k]))
         for name, pose in driven.items():
@@ -187,7 +187,7 @@ class SoftScene:
     # --- reading ---------------------------------------------------------------------------------------------------------------
 
     def wrench(self, pad: str) -> np.ndarray:
-        """Contact force on a pad [N] and its torque about the pad frame's origin [N m], world axes, shape (B, 6).
+        """Contact force on a pad and torque about its origin, world axes, [N], [N m], (B, 6).
 
         The whole gel surface counts, its sides too. At rest it equals ``bond_wrench``, the wrench on the link that carries the pad, but
         for the gel's weight and inertia, since the link's model has the gel's mass.
@@ -195,16 +195,16 @@ class SoftScene:
         return self._contact_wrench(self._registry.pad(pad).name)
 
     def bond_wrench(self, pad: str) -> np.ndarray:
-        """Force [N] and torque about the pad frame's origin [N m] of a pad on its case, world axes, shape (B, 6), with its weight."""
+        """Force and torque of a pad on its case, with its weight, as ``wrench``, (B, 6)."""
         wrench = self.world.wrench(self._registry.pad(pad).name)
         return np.concatenate([wrench.force, wrench.torque], axis=1)
 
     def body_wrench(self, name: str) -> np.ndarray:
-        """Contact force on a body [N] and its torque about the body's origin [N m], world axes, shape (B, 6)."""
+        """Contact force on a body and torque about its origin, as ``wrench``, (B, 6)."""
         return self._contact_wrench(self._registry.body(name).name)
 
     def stiffness(self, pad: str) -> np.ndarray:
-        """Upper bound of a pad's contact stiffness, (B, 6, 6), world axes, about the contact's centre: see ``pad_stiffness``."""
+        """Upper bound of a pad's contact stiffness (B, 6, 6), world axes (``pad_stiffness``)."""
         gelpad = self._registry.pad(pad).sensor.gelpad
         index = self.world.layout.names.index(pad)
         first, last = self.world.layout.vert_start[index : index + 2]
@@ -245,14 +245,14 @@ class SoftScene:
         return (positions if frame is None else self._to_pad(frame, positions)), faces
 
     def skin(self, name: str, frame: str) -> tuple[np.ndarray, np.ndarray]:
-        """Present surface of a soft body, smooth if it has a ``SoftSkin``, or of another pad; as ``mesh``."""
+        """As ``mesh``, but smooth if the body has a ``SoftSkin``."""
         skin = None if name in self.pads else self._registry.body(name).skin
         if skin is None:
             return self.mesh(name, frame)
         return skin.deform(self._to_pad(frame, self.world.positions(name))), skin.faces
 
     def coat(self, pad: str) -> np.ndarray:
-        """Vertices of a pad's coat in the solver [m], pad frame, shape (B, V, 3), with the barrier's clearance."""
+        """The solver's vertices of a pad's coat [m], pad frame, shape (B, V, 3)."""
         return self.world.positions(pad, frame="body")[:, self._registry.pad(pad).mesh.coat_vertices]
 
     def coat_forces(self, pad: str) -> np.ndarray:
@@ -264,7 +264,7 @@ class SoftScene:
         return make_grid(self._registry.pad(pad).sensor.gelpad, self._registry.pad(pad).pitch)
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
-        """Surface, contact and forces of a pad, on its own grid or another; NaN in environments that failed.
+        """Surface, contact and forces of a pad, on its own grid or another; NaN where failed.
 
         ``failed``: mask (B,) of environments that failed elsewhere.
         """

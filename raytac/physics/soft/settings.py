@@ -1,4 +1,4 @@
-"""Settings of soft pads: correction of the surface, substeps, the scene's solver and the control of a press."""
+"""Settings of soft pads: surface correction, substeps, scene solver, press control."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["DEFAULT_CONTROL", "DEFAULT_CORRECTION", "Correction", "PressControl"
 
 @dataclass(frozen=True)
 class _Settings:
-    """Numbers that must be greater than 0, whole where the default is; switches; and settings within settings."""
+    """Switches, and numbers greater than 0, whole where the default is."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -27,7 +27,7 @@ class _Settings:
 
 @dataclass(frozen=True)
 class Correction(_Settings):
-    """Correction of what a soft pad's mesh gets wrong below the size of its cells, in three stages; without one, pass None.
+    """Correction of a soft pad's surface below the size of its mesh's cells, in three stages.
 
     Each stage exchanges the mesh's linear response for that of the gel layer (defect correction, see ``NormalCorrection``). All need the
     pressure on the fine grid, so that is solved for if any stage is on. The plain finite-element surface of ``None`` is the spline through
@@ -90,7 +90,7 @@ DEFAULT_CORRECTION = Correction()
 
 @dataclass(frozen=True)
 class SubstepLimits(_Settings):
-    """Largest relative motion of two nearby bodies in one solver step, and the number of substeps of one step."""
+    """Limits on the relative motion of near bodies in a substep, and on the number of these."""
 
     step: float = 1e-4
     """Longest relative displacement [m]."""

@@ -1,4 +1,4 @@
-"""Smooth surface of a soft body, deformed with its tetrahedra: a pad in contact is shown to touch it, without facets."""
+"""Smooth surface of a soft body, deformed with its tetrahedra, for pads that touch it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SoftSkin:
     """
 
     def __init__(self, parts: Sequence[Part], tets: ipc.TetMesh) -> None:
-        """Compute the weights of an exact shape ``parts`` over the ``tets`` of the body, in the same frame."""
+        """Compute weights of the exact shape ``parts`` over the body's ``tets``, in one frame."""
         edges = np.linalg.norm(
             tets.vertices[tets.tets[:, [0, 0, 0, 1, 1, 2]]] - tets.vertices[tets.tets[:, [1, 2, 3, 2, 3, 3]]], axis=-1
         )
@@ -83,7 +83,7 @@ def _squares(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles without edges over ``longest`` [m]: longer ones are halved, in both of their triangles, until there is none."""
+    """Triangles with edges of at most ``longest`` [m]: longer ones are halved in both triangles."""
     while True:
         sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
         edges, which = np.unique(sides, axis=0, return_inverse=True)

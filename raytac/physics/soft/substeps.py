@@ -1,4 +1,4 @@
-"""Substeps of a soft scene: driven poses, and the number of parts into which a step must be divided near contact."""
+"""Substeps of a soft scene: division of a step where bodies are near each other."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SceneQuery(Protocol):
 
 
 class Substeps:
-    """Divides the steps of a scene into halves, quarters and so on, so that near bodies move little against each other in each."""
+    """Divides steps into halves, quarters and so on, so that near bodies move little in each."""
 
     def __init__(
         self, pads: Mapping[str, ScenePad], bodies: Mapping[str, SceneBody], query: SceneQuery, limits: SubstepLimits
@@ -80,13 +80,13 @@ class Substeps:
         return InputError("world_from_pad", value=f"displacements of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
     def _room(self, done: int, motions: Mapping[str, BoxMotion]) -> tuple[np.ndarray, list[Pair | None]]:
-        """Parts of the step that these motions allow in every environment (B,), and the pairs that limit it."""
+        """Parts of the step that these motions allow, (B,), and the pairs that limit it."""
         pairs = [(a, b) for a, b in self.pairs if not (motions[a].is_still() and motions[b].is_still())]
         share, limiting = allowed_share(motions, pairs, self.limits.reach * self._query.world.d_hat, self.limits)
         return (self.limits.most - done) * share * (1.0 + 1e-9), limiting
 
     def _motions(self, now: Poses, goal: Poses, remaining: float) -> dict[str, BoxMotion]:
-        """Motions of all pads and bodies to ``goal``; free ones keep their velocity for the ``remaining`` time [s]."""
+        """Motions of pads and bodies to ``goal``; free ones keep their velocity, ``remaining`` [s]."""
         motions = {}
         for k, (name, pad) in enumerate(self._pads.items()):
             rest, vertices = pad.mesh.tets.vertices, self._query.world.positions(name, frame="body")
@@ -124,7 +124,7 @@ class Substeps:
         return _move(start, motion.centre, remaining * motion.velocity, remaining * motion.spin)
 
     def _contact_end(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, remaining: float) -> np.ndarray:
-        """Pose of a driven soft body whose places in contact keep their velocity; its ``goal`` where nothing touches it."""
+        """Pose of a driven soft body whose contact keeps its velocity; ``goal`` without contact."""
         world = self._query.world
         load = np.linalg.norm(world.contact_forces(solid.name), axis=2)
         touched = load.sum(axis=1) > 0.0
@@ -144,7 +144,7 @@ class Substeps:
 
 @dataclass(frozen=True)
 class BoxMotion:
-    """Motion of a box between two poses, in B environments; or of a half-space, z <= 0 of its frame."""
+    """Motion of a box, or of a half-space z <= 0 of its frame, in B environments."""
 
     start: np.ndarray
     """``world_from_box`` (B, 4, 4)."""
@@ -166,7 +166,7 @@ class BoxMotion:
 def allowed_share(
     motions: Mapping[str, BoxMotion], pairs: Sequence[Pair], reach: float, limits: SubstepLimits
 ) -> tuple[np.ndarray, list[Pair | None]]:
-    """Largest share of all motions, in (0, 1], that takes no pair of bodies too far, and the pair that limits it, by environment.
+    """Largest share of all motions, in (0, 1], that takes no pair too far, and that pair, (B,).
 
     Two bodies whose boxes are farther apart than ``reach`` [m] may use up the excess. Closer ones move by at most ``limits.step`` and
     ``limits.turn`` against each other. The distance of two boxes is bounded from below by their separation along the normals of their
@@ -241,7 +241,7 @@ def _transform(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _move(poses: np.ndarray, centre: np.ndarray, displacement: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Poses (B, 4, 4) after a rotation vector about a centre [m] and a displacement, (B, 3) each."""
+    """Poses (B, 4, 4) after a rotation vector about a centre and a displacement, (B, 3) each."""
     rotation, result = rotations(turn), poses.copy()
     result[:, :3, :3] = rotation @ poses[:, :3, :3]
     result[:, :3, 3] = centre + displacement + np.einsum("bij,bj->bi", rotation, poses[:, :3, 3] - centre)

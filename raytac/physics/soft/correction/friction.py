@@ -1,4 +1,4 @@
-"""Friction below the size of the mesh's cells: how far the skin around a sheared or twisted contact follows it."""
+"""Correction of friction below the size of the mesh's cells."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PlaneMotion:
 
     @staticmethod
     def fit(displacement: np.ndarray, place: np.ndarray, weight: np.ndarray) -> PlaneMotion:
-        """The motion nearest to a ``displacement`` (n, 2) [m] of ``place`` (n, 2) [m], by ``weight`` (n,)."""
+        """The motion nearest to a ``displacement`` (n, 2) of ``place`` (n, 2) [m], by ``weight``."""
         share = weight / weight.sum()
         centre, shift = share @ place, share @ displacement
         arm = place - centre
@@ -66,7 +66,7 @@ class TangentialContact:
 
 
 class FrictionCorrection:
-    """Exchanges the mesh's response to friction for the layer's, one pad at a time (*defect correction*, see ``NormalCorrection``).
+    """Exchanges the mesh's response to friction for the layer's (*defect correction*).
 
     Let v be the sideways displacement that friction has given to the vertices in contact. E q is what *the same mesh* does, by linear
     elasticity, under tangential forces q on these vertices that hold them at v. A τ is what *the gel layer* does under a traction τ on
@@ -151,7 +151,7 @@ class FrictionCorrection:
         return blend * (layer - mesh).T.astype(float)
 
     def solve(self, pressure: np.ndarray, goal: PlaneMotion, friction: float) -> TangentialContact | None:
-        """Stick and slip under a ``pressure`` [Pa], (Ny, Nx) on the fine grid, whose mean displacement is ``goal``.
+        """Stick and slip under ``pressure`` (Ny, Nx) [Pa] whose mean displacement is ``goal``.
 
         None where no node is in contact, or none of those can move.
         """
@@ -222,14 +222,14 @@ class FrictionCorrection:
         return np.stack([sandwich(cos_y, waves[0], sin_x), sandwich(sin_y, waves[1], cos_x)])
 
     def _blend(self, layer: np.ndarray, displacement: np.ndarray, weight: np.ndarray) -> float:
-        """Weight of the correction in [0, 1], by the part of the ``displacement`` in contact that the ``layer`` does not explain."""
+        """Weight of the correction in [0, 1]: less, the less the ``layer`` explains."""
         s = self._settings
         error, size = (float(weight @ (field**2).sum(axis=1)) for field in (layer - displacement, displacement))
         missed = np.sqrt(error / (size + weight.sum() * s.small_motion**2))
         return float(np.clip((s.no_blend - missed) / (s.no_blend - s.full_blend), 0.0, 1.0))
 
     def _mesh_forces(self, compliance: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-        """Forces [N], (n,), whose linear response is ``displacement`` [m], (n,), by conjugate gradients; float32.
+        """Forces [N] whose linear response is ``displacement`` [m], (n,), by conjugate gradients.
 
         Unknowns that cannot move (the pad's sides across themselves, whose rows of ``compliance`` are 0) bear no force.
         """
@@ -262,7 +262,7 @@ def _project_gradient(
     respond: Callable[[np.ndarray], np.ndarray],
     iterations: int,
 ) -> np.ndarray:
-    """Traction with |τ| <= ``bound`` (n, m) whose response approaches ``target``, (2, n, m), from a first guess.
+    """Traction |τ| <= ``bound`` (n, m) whose response approaches ``target`` (2, n, m).
 
     Accelerated projected gradients with restarts (B. O'Donoghue and E. Candès, Found. Comput. Math. 15, 2015).
     """
@@ -285,7 +285,7 @@ def _project(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:
 
 
 def _largest_compliance(respond: Callable[[np.ndarray], np.ndarray], inside: np.ndarray) -> float:
-    """Slightly more than the largest displacement over traction [m/Pa] inside, by power iteration; 0 where nothing can move."""
+    """Bound of displacement over traction [m/Pa], by power iteration; 0 if nothing can move."""
     trial = np.stack([inside, inside]).astype(np.float32)
     size = 0.0
     for _ in range(3):

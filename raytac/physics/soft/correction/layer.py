@@ -1,4 +1,4 @@
-"""Compliance of a gel layer bonded at its back, wave by wave: closed forms of linear elasticity, and series of cosines."""
+"""Compliance of a gel layer bonded at its back, wave by wave, in closed form."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LONG = 1e-3
 
 
 def layer_compliance(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Normal displacement over pressure [m/Pa] of a wave of that ``wave_number`` [rad/m], same shape.
+    """Normal displacement over pressure [m/Pa] at each ``wave_number`` [rad/m], same shape.
 
     With α = k h and K = 3 − 4ν it is 2 (1 − ν²)/(E k) · (K sinh 2α − 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), small strain and
     no friction (K. L. Johnson, Contact Mechanics, 1985, section 5.8 has the layer; tests compare it with finite elements). For short
@@ -27,7 +27,7 @@ def layer_compliance(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
 
 
 def layer_spread(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Sideways displacement over pressure [m/Pa], same shape: under p cos kx it is this times p sin kx.
+    """Sideways displacement over pressure [m/Pa]: under p cos kx it is this times p sin kx.
 
     2 (1 + ν)/(E k) · (α² − (1 − 2ν)(3 − 4ν) sinh² α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same solution of the layer's plane
     strain as ``layer_compliance``. Long waves squeeze gel out from under the load (> 0). Short ones draw the face towards it:
@@ -39,7 +39,7 @@ def layer_spread(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
 
 
 def layer_shear(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Sideways displacement over traction [m/Pa] under a wave of traction along its wave vector, and across it; same shape twice.
+    """Sideways displacement over traction [m/Pa] along the wave vector, and across it.
 
     Along: 2 (1 − ν²)/(E k) · (K sinh 2α + 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same plane strain as
     ``layer_compliance``. Across, where gel is only sheared: 2 (1 + ν)/(E k) · tanh α. Both tend to h/G for long waves.
@@ -59,7 +59,7 @@ def _layer(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.
 
 
 class CosineSeries:
-    """Cosine series through values at evenly spaced nodes from edge to edge of the pad, with zero slope at both edges."""
+    """Cosine series through values at evenly spaced nodes, with zero slope at both edges."""
 
     def __init__(self, nodes: np.ndarray) -> None:
         """``nodes`` [m], shape (n,), evenly spaced from one edge to the other."""

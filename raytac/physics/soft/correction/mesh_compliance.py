@@ -19,7 +19,7 @@ _SAME = 1e-9
 
 
 def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False, along: tuple[int, ...] = (2,)) -> np.ndarray:
-    """Displacement along x, y, z of each coat vertex under 1 N on each [m], shape (A, 3, V, V); small strain, float64.
+    """Displacement of each coat vertex under 1 N on each [m], shape (A, 3, V, V), float64.
 
     Entry (a, c, i, j): component c of vertex i, force on vertex j along the axis ``along[a]`` (0, 1, 2: x, y, z).
 
@@ -97,7 +97,7 @@ def _layers(mesh: PadMesh) -> np.ndarray:
 
 
 def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Sparse]:
-    """Orthonormal bases of the free unknowns, one for each kind of symmetry; rows are unknowns, columns are sparse."""
+    """Orthonormal bases of the free unknowns, one for each kind of symmetry."""
     vertices = mesh.tets.vertices
     n = len(vertices)
     mirrors = []

@@ -1,4 +1,4 @@
-"""Normal contact below the size of the mesh's cells: linear elasticity on a fine grid in place of the mesh's."""
+"""Correction of normal contact below the size of the mesh's cells."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ContactSampler:
         return (contact.pressure > 0.0)[np.ix_(*self._nearest)]
 
     def lay(self, height: np.ndarray, contact: NormalContact, underside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lay the coat on the object between the nodes of the fine grid; returns height and contact mask, both (Ny, Nx).
+        """Lay the coat on the object between fine nodes; returns height and contact mask (Ny, Nx).
 
         Overlaps are removed. Gaps under pressure are closed, g → g³/(1 + g²) with g = gap / 20 µm (``Correction.closed_gap``).
 
@@ -81,7 +81,7 @@ class ContactSampler:
 
 
 class NormalCorrection:
-    """Corrects a coat's height for what its mesh cannot resolve (*defect correction*), one pad at a time.
+    """Corrects a coat's height for its coarse mesh (*defect correction*), one pad at a time.
 
     A mesh whose cells are wider than a contact, or than the bend at its rim, makes the dent too wide and uneven. The part of that error
     that is linear elasticity can be undone. Let w be the solver's height over rest and C its vertices in contact. E w is the linear
@@ -174,7 +174,7 @@ class NormalCorrection:
 
 
 class _Window:
-    """Rows and columns of the fine grid outside which nothing can touch; restricting the search to them saves work."""
+    """Rows and columns of the fine grid outside which nothing can touch, to save work."""
 
     def __init__(self, correction: NormalCorrection, rows: slice, columns: slice) -> None:
         c, sampler = correction, correction.sampler
@@ -185,7 +185,7 @@ class _Window:
         self._border = sampler.border_y[rows], sampler.border_x[:, columns]
 
     def respond(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Dent under a pressure p [Pa] in this window: the layer's amplitudes, and what the sides add at the coat's vertices [m]."""
+        """Dent under p [Pa] [m]: the layer's amplitudes, and the sides' part at the coat's vertices."""
         force = sandwich(self._force[0], p, self._force[1])
         border = product(self._sides, force.reshape(-1, 1)).reshape(force.shape)
         return self._layer * sandwich(self._analysis[0], p, self._analysis[1]), border
@@ -196,7 +196,7 @@ class _Window:
         return sandwich(self._waves[0], waves, self._waves[1]) + sandwich(self._border[0], border, self._border[1])
 
     def solve(self, overlap: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
-        """Pressure p >= 0 [Pa] with gap g = A p − ``overlap`` >= 0 and g p = 0, and the residual [m].
+        """Pressure p >= 0 [Pa] with g = A p − ``overlap`` >= 0 and g p = 0, and the residual [m].
 
         Conjugate gradients over the nodes in contact, which are revised in every step (I. A. Polonsky and L. M. Keer, A numerical method
         for solving rough contact problems, Wear 231, 1999): g is their gap, t the direction, G = g·g, τ the step length, δ is 0
@@ -228,7 +228,7 @@ class _Window:
 
 
 def _smoothing(lines: np.ndarray) -> np.ndarray:
-    """Filter (n, n) that removes waves of two cells from values on ``lines`` (n,) and keeps straight ones; the ends stay.
+    """Filter (n, n) that removes waves of two cells on ``lines`` (n,) and keeps straight slopes.
 
     A wave of λ even cells keeps the share cos²(π/λ): half at four cells, 0.85 at eight.
     """

@@ -1,4 +1,4 @@
-"""Sideways displacement of the coat's vertices, corrected with the normal contact of the fine grid."""
+"""Correction of the sideways displacement of the coat's vertices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["TangentialCorrection"]
 
 
 class TangentialCorrection:
-    """Corrects how far the skin spreads under pressure, and how far friction drags it, one pad at a time.
+    """Corrects the skin's spread under pressure and its drag by friction, one pad at a time.
 
     Nearly incompressible gel moves sideways under pressure. A mesh whose cells are as wide as the contact pushes it out far too much.
     Let E be what the mesh does sideways under the normal forces of ``NormalContact``, and L the layer's own response to the pressure on the
@@ -80,7 +80,7 @@ class TangentialCorrection:
         return corrected
 
     def _layer(self, contact: NormalContact, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """L: sideways displacement [m], (V, 2), of the layer under the fine grid's pressure, with the pad's free sides."""
+        """L: sideways displacement of the layer under the fine grid's pressure [m], (V, 2)."""
         waves = contact.waves[self._resolved]
         field = np.stack(
             [
@@ -94,7 +94,7 @@ class TangentialCorrection:
 
 
 def _share(pattern: np.ndarray, displacement: np.ndarray, place: np.ndarray) -> float:
-    """Share in [0, 1] of a ``pattern`` (T, 2) in a ``displacement`` (T, 2) of ``place`` (T, 2), besides rigid motions."""
+    """Share in [0, 1] of a ``pattern`` (T, 2) in a ``displacement``, besides rigid motions."""
     displacement = displacement - PlaneMotion.fit(displacement, place, np.ones(len(place))).at(place)
     arm = place - place.mean(axis=0)
     turn = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
