@@ -188,7 +188,7 @@ class FrictionCorrection:
         traction, solution = np.zeros((2, *bound.shape), np.float32), None
         for _ in range(settings.slip_iterations):
             target = np.moveaxis(motion.at(place), -1, 0)
-            traction = _project_gradient(
+            traction = _projected_gradients(
                 traction, target, bound.astype(np.float32), 1.0 / largest, respond, settings.traction_iterations
             )
             waves = amplitudes(traction)
@@ -254,7 +254,7 @@ class FrictionCorrection:
         return force
 
 
-def _project_gradient(
+def _projected_gradients(
     τ: np.ndarray,
     target: np.ndarray,
     bound: np.ndarray,
