@@ -20,7 +20,7 @@ from experiments.running import run
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
-from raytac.physics import hush_solver
+from raytac.physics import quiet_solver
 from raytac.report import machine
 from raytac.sensor import OPTICS
 from raytac.specs import PHYSICS, SweepSpec, load_sweep
@@ -65,7 +65,7 @@ class Args(CommonOptions):
 def main(args: Args) -> RunReport | None:
     """Render, or verify, and write ``metrics.json`` beside the data set's own files."""
     start = time.perf_counter()
-    hush_solver()
+    quiet_solver()
     out = args.out if args.out is not None else Path("runs") / "dataset"
     if args.verify:
         check = verify_dataset(out, progress=True)

@@ -32,7 +32,7 @@ from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
 from raytac.gel import cell_areas
 from raytac.io import CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
-from raytac.physics import SoftPad, hush_solver
+from raytac.physics import SoftPad, quiet_solver
 from raytac.report import machine
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PHYSICS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
@@ -80,7 +80,7 @@ def main(args: Args) -> dict[str, Metric]:
     out = args.out or Path("runs/stress")
     settings = {"seed": args.seed, "deepest": args.deepest, "pad": args.pad, "device": device}
     if "ipc" in names:
-        hush_solver()
+        quiet_solver()
     with FolderLock(out):
         kept = {name: resumed(out / f"{name}.json", settings) for name in names}
         metrics: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}

@@ -81,7 +81,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     q = quaternion(rotation)
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     sine = np.sqrt(np.square(q[..., 1:]).sum(axis=-1, keepdims=True))
-    # θ / sin(θ/2), 2 where there is no turn
+    # θ / sin(θ/2), which is 2 at θ = 0
     factor = np.where(sine > 0.0, 2.0 * np.arctan2(sine, q[..., :1]) / np.where(sine > 0.0, sine, 1.0), 2.0)
     return factor * q[..., 1:]
 
@@ -89,8 +89,8 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 def quaternion(r: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz (…, 4) of rotation matrices (…, 3, 3).
 
-    The component is rooted that is greatest (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so that
-    they are as accurate at no turn as at half a turn.
+    The root is taken of the greatest component (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so
+    that the result is accurate for any angle.
     """
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     x, y, z = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
@@ -126,7 +126,7 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Poses (B, 4, 4) interpolated by ``share`` in [0, 1]: positions along the line, rotations along the shorter arc (slerp)."""
+    """Poses (B, 4, 4) at a ``share``: linear positions, rotations along the shorter arc (slerp)."""
     if share <= 0.0 or share >= 1.0:
         return (start if share <= 0.0 else end).copy()
     a, b = quaternions(start), quaternions(end)
@@ -143,7 +143,7 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
 
 
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
-    """The rotations closest to matrices (…, 3, 3) in the Frobenius norm: the orthogonal factors of their polar decompositions."""
+    """Rotations closest to matrices (…, 3, 3) in the Frobenius norm (polar decomposition)."""
     u, _, v = np.linalg.svd(matrices)
     mirrored = np.linalg.det(u @ v) < 0.0
     u[mirrored, :, 2] *= -1.0
@@ -162,7 +162,7 @@ def rotations(vectors: np.ndarray) -> np.ndarray:
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
-    """Environments that poses with a first axis speak of; 1 if none has one."""
+    """Number of environments of poses with a batch axis; 1 if none has one."""
     given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
     given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
     return given[0][0] if given else 1
@@ -180,7 +180,7 @@ def check_pose(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = None) -> np.ndarray:
-    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis; raises ``InputError``."""
+    """Rigid transforms (B, 4, 4) or (B, count, 4, 4) of ``values`` that may lack the batch axis."""
     array = np.asarray(values, float)
     shape = (4, 4) if count is None else (count, 4, 4)
     if array.shape not in (shape, (batch, *shape)):

@@ -15,7 +15,7 @@ from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import INNER, STRENGTHS
 from raytac.errors import InputError
 from raytac.io.options import CommonOptions
-from raytac.physics.soft.availability import check_solver, hush_solver
+from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
@@ -111,7 +111,7 @@ class SolverOptions(CommonOptions):
         """
         check_solver(user)
         if not self.verbose:
-            hush_solver()
+            quiet_solver()
 
 
 CASTING = ("raytrace", "taxim")

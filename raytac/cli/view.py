@@ -13,7 +13,7 @@ from raytac.cli.shared import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
-from raytac.physics.soft.availability import check_solver, hush_solver
+from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.sensor import OPTICS, TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs import PADS, PHYSICS, PressScene, TaskScene, load_scene
@@ -84,7 +84,7 @@ class ViewArgs(ShadowOptions):
         if physics == "ipc":
             check_solver("physics='ipc'")
             if not self.verbose:
-                hush_solver()
+                quiet_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")

@@ -2,7 +2,8 @@ from .base import ContactState as ContactState
 from .base import PadReading as PadReading
 from .geoms import body_parts as body_parts
 from .rigid.pad import RigidPad as RigidPad
-from .soft.availability import hush_solver as hush_solver
+from .soft.availability import quiet_solver as quiet_solver
+from .soft.bodies import ScenePad as ScenePad
 from .soft.bodies import scene_body as scene_body
 from .soft.contact_width import NarrowContactWarning as NarrowContactWarning
 from .soft.mesh import PAD_LEVELS as PAD_LEVELS
@@ -10,7 +11,10 @@ from .soft.mesh import PadLevel as PadLevel
 from .soft.mesh import PadMesh as PadMesh
 from .soft.mesh import pad_mesh as pad_mesh
 from .soft.pad import SoftPad as SoftPad
-from .soft.scene import ScenePad as ScenePad
-from .soft.scene import SceneState as SceneState
 from .soft.scene import SoftScene as SoftScene
-from .soft.substeps import Poses as Poses
+from .soft.scene_state import Poses as Poses
+from .soft.scene_state import SceneState as SceneState
+from .soft.settings import Correction as Correction
+from .soft.settings import PressControl as PressControl
+from .soft.settings import SceneSettings as SceneSettings
+from .soft.settings import SubstepLimits as SubstepLimits

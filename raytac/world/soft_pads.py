@@ -22,9 +22,10 @@ from raytac.gel.surface import PadGrid
 from raytac.gel.traction import CoatTraction
 from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
-from raytac.physics.soft.bodies import SceneBody, scene_body
+from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
 from raytac.physics.soft.mesh import pad_mesh
-from raytac.physics.soft.scene import ScenePad, SceneReport, SoftScene
+from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.scene_state import SceneReport
 from raytac.robots.frames import body_poses, site_poses
 from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
@@ -357,7 +358,7 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
         youngs_modulus=body.youngs_modulus,
         poisson_ratio=body.poisson_ratio,
         cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
-        held=bonded,
+        bonded=bonded,
         friction=body.friction_on_gel,
     )
 

@@ -13,8 +13,9 @@ from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.pad import SoftPad
-from raytac.physics.soft.reading import UNSOLVED, UnsolvedContactWarning
+from raytac.physics.soft.reading import UnsolvedContactWarning
 from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.settings import Correction
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft
@@ -122,17 +123,56 @@ def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
     assert under.sum() == 5 and mesh.max() > 25e-6 and skin.max() < 6e-6
 
 
-def test_a_contact_that_is_not_found_is_told_of_once(monkeypatch):
-    from raytac.physics.soft.correction import normal as fine_contact
-
+def test_a_contact_that_is_not_solved_is_warned_of_once():
     pad = soft(press(indent(0.3e-3)))
     state = pad.peak(pad.run())
     assert state.reading is not None and state.reading.residual[0] < 1e-6
-    monkeypatch.setattr(fine_contact, "_ROUNDS", 2)
-    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as told:
+    pad = soft(press(indent(0.3e-3)), correction=Correction(normal_iterations=2))
+    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as warned:
         states = list(pad.run(2))
-    left = [state.reading.residual[0] for state in states if state.reading is not None]
-    assert len(told) == 1 and np.isnan(left[0]) and left[-1] > UNSOLVED
+    residuals = [state.reading.residual[0] for state in states if state.reading is not None]
+    assert len(warned) == 1 and np.isnan(residuals[0]) and residuals[-1] > Correction().unsolved
+
+
+def test_without_correction_the_surface_goes_through_the_solvers_vertices():
+    """The press is the same, and so are its forces; the stages can be left out one by one."""
+    scene = press(indent(0.4e-3), StageSpec("shear", shear=(0.15e-3, 0.0)))
+    readings = {}
+    for name, correction in {
+        "none": None,
+        "all": Correction(),
+        "height": Correction(tangential=False, friction=False),
+        "sideways": Correction(normal=False),
+    }.items():
+        pad = soft(scene, correction=correction)
+        readings[name] = pad.peak(pad.run()).reading
+    plain, grid = readings["none"], pad.grid
+    vertices, height = plain.vertices[0], plain.surface.height[0].astype(float)
+    assert np.array_equal(plain.surface.coat.positions[0], vertices) and np.isnan(plain.residual[0])
+    inside = (np.abs(vertices[:, 0]) < 8e-3) & (np.abs(vertices[:, 1]) < 6e-3)
+    node = [np.interp(vertices[inside, k], line, np.arange(len(line))) for k, line in ((1, grid.y), (0, grid.x))]
+    assert np.abs(map_coordinates(height, node, order=3) - vertices[inside, 2]).max() < 1e-6
+    gap = (plain.underside - plain.surface.height)[plain.surface.contact]
+    assert gap.size > 20 and gap.max() < pad.mesh.d_hat and np.abs(gap).max() > 10e-6  # cells of a millimetre
+    whole = readings["all"]
+    for reading in readings.values():
+        assert np.array_equal(reading.forces, plain.forces) and np.array_equal(reading.vertices, plain.vertices)
+    assert np.array_equal(readings["height"].surface.height, whole.surface.height)
+    assert np.array_equal(readings["height"].surface.coat.positions[..., :2], plain.vertices[..., :2])
+    assert np.array_equal(readings["sideways"].surface.height, plain.surface.height)
+    assert np.array_equal(readings["sideways"].surface.coat.positions[..., :2], whole.surface.coat.positions[..., :2])
+    assert np.abs(whole.surface.coat.positions[..., :2] - plain.vertices[..., :2]).max() > 5e-6
+
+
+def test_settings_of_the_correction_are_checked():
+    with pytest.raises(InputError, match=r"normal_iterations = 0.*whole number >= 1"):
+        Correction(normal_iterations=0)
+    with pytest.raises(InputError, match=r"gap_tolerance = nan.*\(0, inf\)"):
+        Correction(gap_tolerance=float("nan"))
+    with pytest.raises(InputError, match=r"no_blend.*greater than full_blend"):
+        Correction(no_blend=0.2)
+    with pytest.raises(InputError, match=r"correction.*None shows the plain surface"):
+        Correction(normal=False, tangential=False, friction=False)
 
 
 def test_a_release_leaves_the_pad_at_rest(pressed):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
-from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.settings import PressControl
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import indent, press, soft
 
@@ -45,7 +46,7 @@ def test_a_press_at_the_border_is_sound_and_leaves_the_others_as_they_are():
 
 def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
     scene, offsets = press(indent(0.1e-3)), np.array([[0.0, 0.0], [2e-3, 0.0]])
-    seen = SoftContact.seen
+    seen = PressSolver.coat_state
 
     def spoilt(contact, poses):
         found = seen(contact, poses)
@@ -53,7 +54,7 @@ def test_a_number_that_is_not_finite_fails_its_own_environment(monkeypatch):
         return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(SoftContact, "seen", spoilt)
+        patch.setattr(PressSolver, "coat_state", spoilt)
         many = soft(scene, num_envs=2, offsets=offsets)
         state = many.peak(many.run())
         surface, wrench = many.surface(state), many.wrench(state)
@@ -110,9 +111,8 @@ def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_fol
         assert unconverged(next(iter(many.run()))) == [0, 0]
 
 
-def test_a_solver_that_never_converges_fails_the_press(monkeypatch):
-    monkeypatch.setattr("raytac.physics.soft.press_solver._CLOSE", 1e-40)
-    pad = soft(press(indent(0.02e-3)))
+def test_a_solver_that_never_converges_fails_the_press():
+    pad = soft(press(indent(0.02e-3)), control=PressControl(tolerance=1e-40))
     state = pad.peak(pad.run())
     assert state.failed.all() and unconverged(state)[0] >= 2
 

@@ -12,7 +12,7 @@ from raytac.physics.rigid.load_law import LoadLaw
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.pad import SoftPad
-from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.press_solver import PressSolver
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft
 
@@ -90,8 +90,8 @@ def test_a_force_after_a_depth_begins_from_what_is_borne_and_forgets_no_shear(ma
 def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
     """The contact's stiffness is known from the states before: six steps of the solver a state at most, on the mean."""
     steps = []
-    drive = SoftContact.drive
-    monkeypatch.setattr(SoftContact, "drive", lambda self, *args: steps.append(1) or drive(self, *args))
+    step = PressSolver.step
+    monkeypatch.setattr(PressSolver, "step", lambda self, *args: steps.append(1) or step(self, *args))
     pad = soft(press(indent(force=1.0)))
     states = list(pad.run(8))[1:]
     assert [state.normal_force[0] for state in states] == pytest.approx(list(np.arange(1, 9) / 8), rel=1e-3)

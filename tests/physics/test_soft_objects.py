@@ -52,7 +52,7 @@ def test_a_soft_balls_imprint_has_no_facets(soft):
     """Ripple in contact, what a polynomial of degree 8 leaves: less than a third of that of the ball's own triangles."""
     pad, _ = soft
     assert pad.solver is not None
-    seen = pad.solver.seen(pad._drive.poses())
+    seen = pad.solver.coat_state(pad._drive.poses())
     facets = replace(seen.objects[0], surface=pad.solver.scene.mesh("object", "pad"))
     x, y = (a / 3e-3 for a in np.meshgrid(pad.grid.x, pad.grid.y))
     inside = np.hypot(x, y) < 0.3

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 import mujoco
 import numpy as np
 
-from raytac.physics.soft.bodies import SceneBody
+from raytac.physics.soft.bodies import SceneBody, ScenePad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
-from raytac.physics.soft.scene import ScenePad, SoftScene
+from raytac.physics.soft.scene import SoftScene
 from raytac.specs import load_sensor
 from raytac.world.coupling import Coupling, coupling_inputs
 

@@ -31,7 +31,7 @@ def finger_over_a_column(height: float, drive: str = "", **options) -> Coupled:
         density=1000.0,
         youngs_modulus=5e4,
         cell=4e-3,
-        held=lambda at: at[:, 2] < -0.99 * HALF[2],
+        bonded=lambda at: at[:, 2] < -0.99 * HALF[2],
     )
     xml = SLIDER.format(h=1e-3, g=0.0, z=height, m=0.04, drive=drive)
     return Coupled(xml, ["finger"], [column], FOOT, **options)

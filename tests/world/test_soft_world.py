@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.physics.soft.scene import SceneReport, SoftScene
+from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.scene_state import SceneReport
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 

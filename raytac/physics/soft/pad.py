@@ -24,10 +24,11 @@ from raytac.physics.press import (
 )
 from raytac.physics.soft.bodies import object_body
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
-from raytac.physics.soft.placement import SoftPlaces
-from raytac.physics.soft.press_controller import SoftDrive
-from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.placement import PressPlacement
+from raytac.physics.soft.press_controller import PressController
+from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.reading import SoftReader, SoftReading
+from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
 from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -75,6 +76,8 @@ class SoftPad:
         shears: np.ndarray | None = None,
         twists: np.ndarray | None = None,
         device: str = "cpu",
+        correction: Correction | None = DEFAULT_CORRECTION,
+        control: PressControl = DEFAULT_CONTROL,
     ) -> None:
         """Cut the pad, make the object's surface and put both into the solver.
 
@@ -88,6 +91,8 @@ class SoftPad:
             offsets, depths, rotations, shears, twists: what environments do each in their own way, see ``PressTargets``; not finite:
                 that environment fails.
             device: where the solver runs, ``cpu`` or ``cuda``.
+            correction: of what the mesh gets wrong below the size of its cells; None shows the plain finite-element surface.
+            control: tolerances and search of the solver and its controller.
 
         Raises:
             InputError: an unknown level, arguments of the wrong shape, ``depths`` deeper than the pad.
@@ -102,26 +107,26 @@ class SoftPad:
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
         check_trajectory(scene, sensor.gelpad, self.parts, targets.depths)
-        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid)
+        self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, correction)
         self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
-        self.solver: SoftContact | None = None
+        self.solver: PressSolver | None = None
         """Pad and object in the contact solver; None without an object."""
-        self._drive: SoftDrive | None = None
+        self._drive: PressController | None = None
         if self.parts:
-            self._places = SoftPlaces(scene, self.parts, sensor.gelpad, self.grid, targets)
+            self._places = PressPlacement(scene, self.parts, sensor.gelpad, self.grid, targets)
             above = self._places.poses(
                 np.full(num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((num_envs, 2)), np.zeros(num_envs)
             )
-            self.solver = SoftContact(sensor, self.mesh, self._body(), above, device)
-            self._drive = SoftDrive(scene, self.solver, self._reader, self._places, targets)
+            self.solver = PressSolver(sensor, self.mesh, self._body(), above, device, control)
+            self._drive = PressController(scene, self.solver, self._reader, self._places, targets)
 
     # --- trajectory ------------------------------------------------------------------------------------------------------------
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[SoftState]:
         """States along the trajectory from the start: one before it (lifted by ``CLEARANCE``), ``steps_per_stage`` through each stage.
 
-        Between states the solver takes as many steps as ``STEP`` asks for. An ``indent`` to a depth ends when the *coat* is at that
+        Between states the solver takes as many steps as it needs. An ``indent`` to a depth ends when the *coat* is at that
         depth: what the barrier keeps between it and the object is added to the object's height; on the way the coat is there within some
         micrometres, and never deeper than the stage's end; in a shear or twist that follows, it stays there. One to a force moves the
         object until the contact bears it, and keeps it through a shear or twist that follows; a free object is laid down and comes to
@@ -224,10 +229,10 @@ class SoftPad:
                 *(stage, kind, fraction, poses, poses, zero, zero, np.zeros((batch, 2)), zero, zero, failed),
                 *(self.scene, none_yet, reading),
             )
-        reading = self._reader.read(self.solver.seen(self._drive.poses()), self._drive.failed)
+        reading = self._reader.read(self.solver.coat_state(self._drive.poses()), self._drive.failed)
         failed = self._drive.failed = reading.failed
         self._last = reading
-        self._drive.read(reading.clearance)
+        self._drive.set_clearance(reading.clearance)
         surface, forces = reading.surface, reading.forces
         total = forces.sum(axis=1)
         arm = reading.vertices[:, :, :2] - np.nan_to_num(surface.contact_centre)[:, None]

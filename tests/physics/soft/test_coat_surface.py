@@ -11,8 +11,7 @@ from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.surface import make_grid, rest_height
 from raytac.gel.traction import CoatTraction, cell_areas, foundation_traction
-from raytac.physics.soft.correction.splines import CoatSurface
-from raytac.physics.soft.correction.standoff import StandOff
+from raytac.physics.soft.coat_surface import BarrierClearance, CoatSurface
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.specs import load_sensor
 
@@ -83,26 +82,26 @@ def ball(x, y, depth, radius=4e-3):
     return np.where(square > 0, radius - depth - np.sqrt(np.maximum(square, 0.0)), np.inf)
 
 
-def test_stand_off_is_measured():
+def test_clearance_is_measured():
     """A coat held 40 µm off a ball everywhere in contact: the clearance is found."""
     mesh, grid = pad_mesh(GELPAD, "medium").coat, make_grid(GELPAD, 0.2e-3)
     surface, d_hat = CoatSurface(mesh, GELPAD), 60e-6
-    stand_off = StandOff(surface, grid.rest, grid.x, grid.y, d_hat)
+    clearance = BarrierClearance(surface, grid.rest, grid.x, grid.y, d_hat)
     rho = np.hypot(mesh.rest[:, 0], mesh.rest[:, 1])
     bowl = np.minimum(4e-3 - 0.8e-3 - np.sqrt(np.maximum((4e-3) ** 2 - rho**2, 0.0)) - 40e-6, mesh.rest[:, 2])
     moved = np.zeros_like(mesh.rest)
     moved[:, 2] = bowl - mesh.rest[:, 2]
     pressure = np.where(rho < 2e-3, np.sqrt(np.maximum(1.0 - (rho / 2e-3) ** 2, 0.0)), 0.0) * 1e5
     places, under = surface.places(moved), ball(grid.x, grid.y, 0.8e-3)
-    assert stand_off.clearance(places, moved[:, 2], pressure, under) == pytest.approx(40e-6, abs=2e-6)
+    assert clearance.measure(places, moved[:, 2], pressure, under) == pytest.approx(40e-6, abs=2e-6)
 
 
-def test_stand_off_without_contact_is_none():
+def test_clearance_without_contact_is_none():
     mesh, grid = pad_mesh(GELPAD, "coarse").coat, make_grid(GELPAD, 0.5e-3)
     surface = CoatSurface(mesh, GELPAD)
     still = np.zeros(len(mesh.rest))
-    stand_off = StandOff(surface, grid.rest, grid.x, grid.y, 5e-5)
-    assert np.isnan(stand_off.clearance(surface.places(np.zeros_like(mesh.rest)), still, still, np.full(grid.shape, np.inf)))
+    clearance = BarrierClearance(surface, grid.rest, grid.x, grid.y, 5e-5)
+    assert np.isnan(clearance.measure(surface.places(np.zeros_like(mesh.rest)), still, still, np.full(grid.shape, np.inf)))
 
 
 def test_traction_integrates_to_the_forces():
