@@ -116,7 +116,7 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
     (name,) = world.sensor_names
     state = world.reset()
     goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
-    controller = RollingController(world, 0, goals, STROKES[world.physics])
+    controller = RollingController(world, 0, goals, STROKES[world.physics.label.partition("-")[0]])
     record = Record([], [], [], [], [], [], [], [], [], [], [])
     frame = world.observe()[name]  # kernels are compiled here
     next_picture = 0.0
@@ -217,7 +217,7 @@ def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
     above.plot(*(1e3 * (pad[:, :2, 3] - start)).T, color="0.75", lw=0.8, label="pad's middle")
     above.plot(*(1e3 * (ball[:, :2] - start)).T, color="C0", label="ball")
     above.plot(*np.array(args.goals_mm).T, "x", color="C3", ms=9, label="goals")
-    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics} pad, from above")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics.label} pad, from above")
     above.legend(loc="best", fontsize="small")
     rows = (
         ("force on\nthe pad [N]", (wrench[:, :3], ("x", "y", "z"))),
@@ -276,7 +276,7 @@ def strip(record: Record, world: TactileWorld, path: Path, count: int = 8) -> No
         )
         place.set_xlabel("x [mm]" if n + columns >= len(chosen) else "")
         place.set_ylabel("y [mm]" if n % columns == 0 else "")
-    figure.suptitle(f"{world.physics} pad: tactile image, displacements of the markers × {ARROW_SCALE:g}", fontsize=11)
+    figure.suptitle(f"{world.physics.label} pad: tactile image, displacements of the markers × {ARROW_SCALE:g}", fontsize=11)
     figure.savefig(path, dpi=110)
 
 

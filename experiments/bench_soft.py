@@ -29,7 +29,7 @@ import tyro
 
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
-from raytac.physics import PadLevel, SoftPad, pad_mesh
+from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
@@ -80,7 +80,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
     scene = ball(StageSpec("indent", depth=DEPTH))
     for level in [*levels, *(["refined"] if refined else [])]:
         pad = pad_mesh(spec.gelpad, REFINED) if level == "refined" else level
-        sensor = TactileSensor(spec, physics="ipc", pad=pad, device=device, seed=seed)
+        sensor = TactileSensor(spec, physics=Ipc(pad), device=device, seed=seed)
         metrics["device"] = sensor.device_used
         sensor.rest()
         loaded = sensor.load(scene)

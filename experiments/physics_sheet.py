@@ -30,6 +30,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.frame import TactileFrame
 from raytac.gel import GelSurface
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.physics import Ipc
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, load_press
 
@@ -73,8 +74,7 @@ class Args(CommonOptions):
             sensors = {
                 physics: TactileSensor(
                     self.sensor,
-                    physics=physics,
-                    pad=self.pad if physics == "ipc" else None,
+                    physics=Ipc(self.pad) if physics == "ipc" else physics,
                     outputs=("rgb", "wrench"),
                     device=self.device,
                     seed=self.seed,
@@ -107,7 +107,7 @@ class Args(CommonOptions):
                 surfaces = {}
                 for level in PADS[PADS.index(self.against) :: -1]:
                     sensor = TactileSensor(
-                        self.sensor, physics="ipc", pad=level, outputs=("height", "wrench"), device=self.device, seed=self.seed
+                        self.sensor, physics=Ipc(level), outputs=("height", "wrench"), device=self.device, seed=self.seed
                     )
                     frame = sensor.press(load_press(name))
                     surfaces[level] = frame.surface

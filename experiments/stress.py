@@ -32,16 +32,17 @@ from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
 from raytac.gel import cell_areas
 from raytac.io import CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
-from raytac.physics import SoftPad, hush_solver
+from raytac.physics import Ipc, SoftPad, hush_solver
 from raytac.report import machine
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PHYSICS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
+from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
 
 SENSORS = ("gelsight_mini", "gelsight_dome")
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh", "soft_ball")
 """Shipped scenes whose objects are pressed; a soft one on the simulated pad alone."""
 SHALLOW = 0.6
 """Share of the thickness that a pad should hold anywhere."""
+PHYSICS = ("rigid", "ipc")
 DEEP = {"rigid": 0.5, "ipc": 0.2}
 """Share of the presses that go deeper."""
 BALANCE = 1e-3
@@ -103,7 +104,7 @@ def main(args: Args) -> dict[str, Metric]:
 def make_sensor(name: str, physics: str, args: Args, device: str) -> TactileSensor:
     """A sensor without images."""
     outputs = ("height", "wrench", "traction")
-    return TactileSensor(name, physics=physics, pad=args.pad if physics == "ipc" else None, outputs=outputs, device=device)
+    return TactileSensor(name, physics=Ipc(args.pad) if physics == "ipc" else physics, outputs=outputs, device=device)
 
 
 def random_press(physics: str, seed: int, number: int, deepest: float) -> tuple[str, str, PressScene]:
@@ -153,7 +154,7 @@ def pressed(physics: str, number: int, args: Args, sensors: dict[str, TactileSen
             warnings.simplefilter("ignore")
             validate_press(sensor.spec, scene)
             pad = sensor.load(scene)
-            frame = sensor.update(pad.peak(pad.run()))  # type: ignore[arg-type]
+            frame = sensor.update(pad.peak(pad.run()))
         row |= rigid_faults(sensor, frame) if physics == "rigid" else soft_faults(pad, frame)  # type: ignore[arg-type]
     except (InputError, SpecError) as error:
         row["refused"] = str(error)

@@ -20,7 +20,7 @@ from raytac.specs.press import PADS
 __all__ = ["CalibrateArgs"]
 
 _OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
-_OF_MARKERS = ("pad", "quick", "verbose")
+_OF_MARKERS = ("level", "quick", "verbose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +64,8 @@ class CalibrateArgs(SolverOptions):
     cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
-    pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
-    """How finely the simulated pad is cut."""
+    level: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
+    """Resolution of the soft pad's mesh."""
     quick: bool = False
     """Few presses: shows that all runs; a poor fit."""
 
@@ -80,7 +80,7 @@ class CalibrateArgs(SolverOptions):
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
         try:
             written = run_calibrate_markers(
-                sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
+                sensor, out, pad=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )
         except KeyboardInterrupt:
             print(

@@ -11,16 +11,16 @@ import tyro
 
 from raytac.checks import check_known
 from raytac.cli.shadow_options import ShadowOptions
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.solver_options import SolverOptions, chosen_physics
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKER_MODELS
 from raytac.optics import INTEGRATORS
+from raytac.physics import PHYSICS
 from raytac.report.press import run_press
 from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
-from raytac.specs import PADS, PHYSICS, load_press
-from raytac.specs.press import chosen_physics
+from raytac.specs import PADS, load_press
 
 __all__ = ["PressArgs"]
 
@@ -38,11 +38,11 @@ class PressArgs(ShadowOptions, SolverOptions):
     """Name of a shipped press scene, such as coin, or path of a scene file."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
     scene says if not given, else rigid."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
     mlp (a network, which a calibration must give)."""
@@ -70,13 +70,12 @@ class PressArgs(ShadowOptions, SolverOptions):
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         scene = load_press(self.scene)
-        physics = chosen_physics(self.physics, self.pad, scene.physics)
-        if physics == "ipc":
-            self.prepare_solver("physics='ipc'")
+        physics = chosen_physics(self.physics, self.level, scene)
+        if physics.is_simulated:
+            self.prepare_solver(f"physics={PHYSICS.name_of(physics)!r}")
         sensor = TactileSensor(
             self.sensor,
             physics=physics,
-            pad=self.pad or scene.pad if physics == "ipc" else self.pad,
             optics=self.optics,
             outputs=computed,
             resolution=parse_resolution(self.resolution) if self.resolution is not None else None,
@@ -87,7 +86,7 @@ class PressArgs(ShadowOptions, SolverOptions):
             markers=self.markers,
             optics_options=self._optics_options(),
         )
-        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)
+        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, PHYSICS.name_of(physics))
         for path in run_press(sensor, scene, out, outputs=outputs, start=start, progress=True):
             print(path)
         return 0

@@ -18,9 +18,7 @@ from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
 from raytac.physics import NarrowContactWarning
 from raytac.sensor import TactileSensor
-from raytac.sensor.pad import load_pad
 from raytac.specs import PressScene, SensorSpec
-from raytac.specs.press import PADS
 
 __all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
 
@@ -184,11 +182,8 @@ class ShardRenderer:
         """Why a press cannot be, found by trying it alone; empty if it can."""
         own = self._own(press, 1)
         del own["seeds"]
-        level, sweep = self.plan.sweep.pad or PADS[0], self.plan.sweep
         try:
-            pad = load_pad(
-                sensor.spec, scene, physics=sweep.physics, level=level, device=self.job.device, pitch=sensor.pitch, **own
-            )
+            pad = self.plan.physics.build(sensor.spec, scene, pitch=sensor.pitch, num_envs=1, device=self.job.device, **own)
             for _ in pad.run():
                 pass
         except (BackendError, AssetError):

@@ -17,9 +17,10 @@ from raytac.envs.variation import VariationDraws
 from raytac.errors import InputError
 from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import checked_physics, scene_physics
 from raytac.robots.pose import pose_error
 from raytac.se3 import inverse
-from raytac.specs.press import chosen_physics
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.world import TactileWorld
@@ -62,8 +63,7 @@ class TaskBatch:
         task: Task,
         *,
         num_envs: int = 1,
-        physics: str | None = None,
-        pad: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
         action: str = "pose",
@@ -79,7 +79,7 @@ class TaskBatch:
         Args:
             task: what is played.
             num_envs: number of environments B.
-            physics, pad, device: as of ``TactileWorld``.
+            physics, device: as of ``TactileWorld``.
             tactile: what is observed of every sensor: settings, or modalities alone; "task" is as the task has it; None leaves touch out,
                 and nothing of it is computed.
             body_seen: whether the body's pose and velocity are observed; None is as the task has it.
@@ -102,7 +102,8 @@ class TaskBatch:
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the sensor needs no markers: the force alone is asked of the probe.
         asked = ObservationSettings(("wrench",)) if settings is None else settings
-        rigid = chosen_physics(physics, pad, loaded.physics) == "rigid"
+        config = scene_physics(checked_physics(physics), loaded)
+        rigid = not config.is_simulated
         shared = self.randomization  # what is drawn once for all environments
         if rigid:
             shared = replace(shared, youngs_modulus=0.0, friction=0.0)
@@ -114,7 +115,7 @@ class TaskBatch:
         if settings is not None:
             options = probe.world_options()
         options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
-        self.world = TactileWorld(loaded, physics=physics, pad=pad, device=device, **options)
+        self.world = TactileWorld(loaded, physics=config, device=device, **options)
         self._draws = VariationDraws(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
         )

@@ -14,18 +14,16 @@ from raytac.io.options import parse_resolution
 from raytac.markers import MARKER_MODELS, MarkerPerturbation
 from raytac.optics.base import INTEGRATORS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
-from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-    from raytac.physics.soft.mesh import PadMesh
+    from raytac.physics.base import PhysicsConfig
 
 __all__ = [
     "LARGEST_SIDE",
     "OPTICS",
     "check_markers",
     "check_optics",
-    "check_physics",
     "checked_outputs",
     "checked_resolution",
     "press_scene",
@@ -45,18 +43,6 @@ SHAPE_TOLERANCE = 0.02
 def sensor_outputs(optics: str) -> tuple[str, ...]:
     """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
     return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
-
-
-def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
-    """Raises ``InputError`` for an unknown name, or a pad to be cut where none is simulated."""
-    if physics is not None:
-        check_known("physics", physics, PHYSICS)
-    if isinstance(pad, str):
-        check_known("pad", pad, PADS)
-    elif pad is not None:
-        check_methods("pad", pad, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
-    if pad is not None and physics == "rigid":
-        raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
 
 
 def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, options: dict[str, Any] | None) -> None:
@@ -89,12 +75,12 @@ def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> 
     return tuple(name for name in OUTPUTS if name in outputs)
 
 
-def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: str | None) -> None:
+def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: PhysicsConfig | None) -> None:
     """Raises ``InputError`` for an unknown model, one that the physics cannot feed, or a perturbation of no markers."""
     if markers is not None:
         check_known("markers", markers, MARKER_MODELS)
-        if markers == "surface" and physics == "rigid":
-            rule = "tracks the surface of a simulated gel; physics='rigid' has none"
+        if markers == "surface" and physics is not None and not physics.is_simulated:
+            rule = f"tracks the surface of a simulated gel; physics={physics.label!r} has none"
             raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
     elif perturbation is not None:
         raise InputError("marker_perturbation", value=perturbation, rule="needs a marker model: markers=…")

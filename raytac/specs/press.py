@@ -15,20 +15,16 @@ __all__ = [
     "DYNAMICS",
     "MOVES",
     "PADS",
-    "PHYSICS",
     "POSE_SCHEMA",
     "SCENE_SCHEMA",
     "STAGE_SCHEMA",
     "ObjectSpec",
     "PressScene",
     "StageSpec",
-    "chosen_physics",
 ]
 
 MOVES = ("object", "case")
 """What a press can move; the other side stands still."""
-PHYSICS = ("rigid", "ipc")
-"""How a gel can deform: by geometry and Gaussians, or simulated."""
 PADS = ("coarse", "medium", "fine")
 """How finely a simulated pad can be cut."""
 DYNAMICS = ("kinematic", "affine", "soft")
@@ -36,7 +32,7 @@ DYNAMICS = ("kinematic", "affine", "soft")
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
-    "physics": Text(choices=PHYSICS, default=None),
+    "physics": Text(default=None),
     "pad": Text(choices=PADS, default=None),
 }
 """Keys at the top of a scene."""
@@ -59,11 +55,6 @@ STAGE_SCHEMA: Final[dict[str, Schema]] = {
     "release": {**_DURATION},
 }
 """Kind of stage to its keys in ``[[trajectory]]``."""
-
-
-def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
-    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
-    return physics or ("ipc" if pad is not None else scene or "rigid")
 
 
 @dataclass(frozen=True)
@@ -143,7 +134,7 @@ class PressScene:
     """Which side the trajectory moves, one of ``MOVES``. Targets are the object's against the pad either way."""
     source: Path | None = None
     physics: str | None = None
-    """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""
+    """Name of the physics that the scene is meant for (checked when it is pressed); None leaves it to whoever presses."""
     pad: str | None = None
     """One of ``PADS``; None leaves it to whoever presses."""
 

@@ -104,7 +104,7 @@ def test_press_writes_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", "markers", "--pad", "finest", "--out", str(tmp_path)]) == 2
+    assert main(["calibrate", "markers", "--level", "finest", "--out", str(tmp_path)]) == 2
     assert "did you mean 'fine'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -119,7 +119,7 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
     from raytac.specs import load_marker_motion
 
     out, begun = tmp_path / "fit", []
-    args = ["calibrate", "markers", "--pad", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
+    args = ["calibrate", "markers", "--level", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
     simulate = presses.simulate_press
 
     def interrupted(sensor, press, **options):
