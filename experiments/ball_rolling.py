@@ -136,7 +136,6 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
         record.ball.append(state.world_from_body["ball"][0, :3, 3])
         record.pad.append(state.world_from_pad[name][0])
         record.wrench.append(state.wrench[name][0])
-        assert frame.markers is not None
         record.markers.append(float(np.nanmax(np.linalg.norm(frame.markers.displacement[0], axis=-1))))
         if "min_gap" in state.report:
             record.resolved.append((float(state.report["min_gap"][0]), float(state.report["min_det"][0])))
@@ -161,7 +160,6 @@ def picture(frame: TactileFrame) -> np.ndarray:
     """The image, enlarged, with the markers' displacements over it, ``ARROW_SCALE`` times as long; (H, W, 3) uint8."""
     from PIL import Image, ImageDraw
 
-    assert frame.rgb is not None and frame.markers is not None
     height, width = frame.rgb.shape[1:3]
     factor = -(-LEAST_WIDTH // width)
     image = Image.fromarray(frame.rgb[0]).resize((factor * width, factor * height), Image.Resampling.BILINEAR)

@@ -106,7 +106,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
             f"soft.{level}.steps_per_s": 1.0 / float(np.median(timed)),
             f"soft.{level}.best_steps_per_s": 1.0 / min(timed),
             f"soft.{level}.imprint_error": float(surface.indentation.max()) / DEPTH - 1.0,
-            f"soft.{level}.force_n": -float(frame.force[0, 2]) if frame.force is not None else float("nan"),
+            f"soft.{level}.force_n": -float(frame.force[0, 2]),
             f"soft.{level}.contact_area_mm2": 1e6
             * float(surface.contact[0].sum())
             * surface.grid.pitch[0]

@@ -141,7 +141,7 @@ def measured(frame: TactileFrame) -> dict[str, Metric]:
         "bulge_mm": -1e3 * float(surface.indentation.min()),
         "contact_mm2": 1e6 * float(surface.contact[0].sum()) * surface.grid.pitch[0] * surface.grid.pitch[1],
     }
-    if frame.force is not None:
+    if "force" in frame.outputs:
         found["force_n"] = -float(frame.force[0, 2])
     return found
 
@@ -197,7 +197,6 @@ def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: Tac
         dents = [1e3 * frame.surface.indentation[0] for frame in (rigid, soft)]
         deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
         for axis, frame in zip(line[:2], (rigid, soft), strict=True):
-            assert frame.rgb is not None
             axis.imshow(frame.rgb[0], extent=(left, right, bottom, top))
         for axis, dent in zip(line[2:4], dents, strict=True):
             shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)

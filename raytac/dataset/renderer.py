@@ -128,7 +128,7 @@ class ShardRenderer:
         sensor = TactileSensor(spec, **plan.sensor_options(batch), device=self.job.device)
         rest = sensor.rest()  # before any press, whose placement of the pattern it would show
         shared = {"grid_x": sensor.grid.x, "grid_y": sensor.grid.y, "rest_height": rest.surface.height[0]}
-        if rest.rgb is not None:
+        if "rgb" in rest.outputs:
             shared["rest_rgb"] = rest.rgb[0]
         drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
         return _Built(sensor, drift, shared)
@@ -154,7 +154,6 @@ class ShardRenderer:
                 refused = np.flatnonzero([bool(reason) for reason in reasons])
                 own["offsets"][refused] = np.nan
                 frame = built.sensor.press(scene, **own)
-        assert frame.failed is not None
         for b in range(len(presses)):
             if frame.failed[b] and not reasons[b]:
                 reasons[b] = _UNSETTLED
@@ -198,9 +197,9 @@ class ShardRenderer:
         found |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
         if "contact" in self.plan.sweep.outputs:
             found["contact"] = surface.contact
-        if frame.rgb is not None:
+        if "rgb" in frame.outputs:
             found["rgb"] = self._drifted(built, frame.rgb, presses)
-        if frame.markers is not None:
+        if "markers" in frame.outputs:
             m = frame.markers
             found |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
             found |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
@@ -230,11 +229,11 @@ class ShardRenderer:
 def _figures(frame: TactileFrame, b: int) -> Row:
     """Figures of one press for the manifest."""
     found: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
-    if frame.wrench is not None:
+    if "wrench" in frame.outputs:
         names = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
         found |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
     for name in ("contact_area", "contact_cells"):
-        values = getattr(frame, name)
+        values = getattr(frame, name, None)
         if values is not None and np.isfinite(values[b]):
             found[name] = float(values[b])
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -29,10 +30,14 @@ __all__ = [
 ]
 
 
-def summary(record: Any) -> str:
-    """A dataclass on one line: arrays by type and shape instead of their values, and without the fields that are None or empty."""
+def summary(record: Any, names: Sequence[str] | None = None) -> str:
+    """A dataclass on one line: arrays by type and shape instead of their values, and without the fields that are None or empty.
+
+    ``names``: of the fields that are shown; None is all.
+    """
     shown = []
-    for name, value in ((f.name, getattr(record, f.name)) for f in fields(record)):
+    for name in [f.name for f in fields(record)] if names is None else names:
+        value = getattr(record, name)
         if isinstance(value, dict):
             value = {key: _brief(v) for key, v in value.items()}
             text = "{" + ", ".join(f"{key}: {v}" for key, v in value.items()) + "}" if value else ""

@@ -150,12 +150,11 @@ class TactileObserver:
         batch, rows = frame.surface.batch, np.asarray(chosen_envs(envs, self.num_envs), int)
         if batch != len(rows):
             raise InputError("frame", value=batch, rule=f"must have {len(rows)} environments, as this observer")
-        failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
         found = {
             name: self._rgb(frame, sensor, rows) if name == "rgb" else getattr(self, f"_{name}")(frame)
             for name in self.settings.modalities
         }
-        return self._finished(found, failed, rows)
+        return self._finished(found, frame.failed, rows)
 
     def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
         """As ``observe``, where nothing but the ``wrench`` is observed, from the world's own: no sensor need look at the pad.
@@ -193,7 +192,7 @@ class TactileObserver:
     # --- modalities ------------------------------------------------------------------------------------------------------------
 
     def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
-        images = self._cut(_given(frame.rgb, "rgb"))
+        images = self._cut(frame.rgb)
         if self._drift is not None:
             images = self._drift.apply(images, envs=rows.tolist())
         if not self.settings.difference:
@@ -211,10 +210,10 @@ class TactileObserver:
             raise InputError("sensor", value=None, rule="must be given for a difference: it renders the image at rest")
         if self._moves_dots:
             envs = rounded_envs(late.tolist(), self.num_envs)
-            images = self._cut(_given(sensor.rest(envs).rgb, "rgb"))[: len(late)]
+            images = self._cut(sensor.rest(envs).rgb)[: len(late)]
         else:
             if self._rest_rgb is None:
-                self._rest_rgb = self._cut(_given(sensor.rest().rgb, "rgb"))
+                self._rest_rgb = self._cut(sensor.rest().rgb)
             images = np.repeat(self._rest_rgb, len(late), axis=0)
         if self._drift is not None:
             images = self._drift.apply(images, noise=False, envs=late.tolist())
@@ -237,12 +236,12 @@ class TactileObserver:
         return images.astype(np.uint8, copy=False)
 
     def _markers(self, frame: TactileFrame) -> np.ndarray:
-        markers = _given(frame.markers, "markers")
+        markers = frame.markers
         moved = np.where(markers.visible[..., None], markers.displacement, 0.0)
         return self._scaled("markers", moved)
 
     def _marker_visible(self, frame: TactileFrame) -> np.ndarray:
-        return _given(frame.markers, "marker_visible").visible.astype(np.int8)
+        return frame.markers.visible.astype(np.int8)
 
     def _height(self, frame: TactileFrame) -> np.ndarray:
         return self._scaled("height", self._map(frame, frame.surface.height))
@@ -254,7 +253,7 @@ class TactileObserver:
         return self._map(frame, frame.surface.contact).astype(np.float32)
 
     def _wrench(self, frame: TactileFrame) -> np.ndarray:
-        return self._scaled("wrench", _given(frame.wrench, "wrench"))
+        return self._scaled("wrench", frame.wrench)
 
     def _map(self, frame: TactileFrame, values: np.ndarray) -> np.ndarray:
         if self._cells is None or self._cells.nodes != frame.surface.grid.shape:
@@ -294,9 +293,3 @@ class TactileObserver:
         else:
             last[rows] = np.concatenate([last[rows][:, 1:], now[:, None]], axis=1)
             last[rows[begun]] = now[begun][:, None]
-
-
-def _given(value: Any, name: str) -> Any:
-    if value is None:
-        raise InputError("frame", value=name, rule="does not hold this modality: make its sensor with sensor_options")
-    return value

@@ -14,7 +14,7 @@ import numpy as np
 from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
-from raytac.frame import TactileFrame
+from raytac.frame import IMAGES, TactileFrame
 from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
 from raytac.gel.traction import cell_areas
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
@@ -214,7 +214,7 @@ class TactileSensor:
         reading = pad.peak(self._followed(pad.run(progress=progress)))
         physics_ms = 1e3 * (time.perf_counter() - start)
         frame = self.update(reading)
-        return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
+        return frame.with_values(time_ms={"physics": physics_ms, **frame.time_ms})
 
     def load(
         self,
@@ -341,25 +341,14 @@ class TactileSensor:
         self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
     ) -> TactileFrame:
         """The frame with the images that are asked for; ``done``: when the surface was there."""
-        height = surface.height if "height" in self.outputs else None
-        if not self._optical_outputs:
-            return TactileFrame(surface, height=height, markers=markers, time_ms=time_ms, **fields)
-        images = self.optical_mode.render(surface)
-        time_ms["optics"] = 1e3 * (time.perf_counter() - done)
-        return TactileFrame(
-            surface=surface,
-            rgb=images.rgb,
-            layers=images.layers,
-            normals=images.normals,
-            position=images.position,
-            depth=images.depth,
-            height=height,
-            contact=images.contact,
-            uncovered=images.uncovered,
-            markers=markers,
-            time_ms=time_ms,
-            **fields,
-        )
+        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers, "label": self.label}
+        if self._optical_outputs:
+            images = self.optical_mode.render(surface)
+            fields |= {name: getattr(images, name, None) for name in IMAGES} | {
+                "label": self.label
+            }  # a mode is named once it is built
+            time_ms["optics"] = 1e3 * (time.perf_counter() - done)
+        return TactileFrame(surface, time_ms=time_ms, **fields)
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
         """Frame of untouched pads, what every difference image is taken from; markers keep their history.

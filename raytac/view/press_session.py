@@ -249,7 +249,7 @@ class PressSession:
         if self._is_drivable:
             facts["depth"] = f"{1e3 * float(state.depth[0]):.3f} mm"
         facts["deepest imprint"] = f"{1e3 * float(np.nanmax(surface.indentation[0])):.3f} mm"
-        if frame.contact_area is not None:
+        if "contact_area" in frame.outputs:
             facts["contact area"] = f"{1e6 * float(frame.contact_area[0]):.2f} mm²"
         return facts
 

@@ -92,11 +92,11 @@ def test_two_elastic_bodies_touch_by_hertzs_law(rigid, soft):
 def test_a_free_ball_rests_upright_on_the_dome():
     """Symmetric, without shear or torque, and as deep as a driven one that bears the same force."""
     states = [ball(SENSOR, StageSpec("indent", force=0.3), dynamics=dynamics) for dynamics in ("affine", "kinematic")]
-    (_pad, lying), (other, driven) = states
+    (_pad, lying), (_other, driven) = states
     height = lying.surface.height[0]
     assert max(np.abs(height - height[::-1]).max(), np.abs(height - height[:, ::-1]).max()) < 2e-6
     wrench = lying.wrench[0]
     assert wrench[2] == pytest.approx(-0.3, rel=0.01)
     assert np.abs(wrench[:2]).max() < 1e-3 * 0.3 and np.abs(wrench[3:]).max() < 1e-3 * 0.3 * RADIUS
-    deepest = other.surface(driven).indentation.max()
-    assert np.abs(height - other.surface(driven).height[0]).max() < 0.05 * deepest  # while it comes to rest, friction gives way
+    deepest = driven.surface.indentation.max()
+    assert np.abs(height - driven.surface.height[0]).max() < 0.05 * deepest  # while it comes to rest, friction gives way

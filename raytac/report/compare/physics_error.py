@@ -70,7 +70,7 @@ def physics_errors(
             sensor = TactileSensor(tracers.spec, physics=physics, **settings)
             frame = sensor.press(press)
             seconds.append(time.perf_counter() - start)
-        if frame.failed is not None and frame.failed[0]:
+        if frame.failed[0]:
             raise RaytacError(f"the press {press.name!r} did not settle on the {pad} pad")
         rigid, soft = surfaces[press.name], frame.surface
         touched = rigid.contact[0] | soft.contact[0]
