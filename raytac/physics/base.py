@@ -28,16 +28,21 @@ class PadReading:
         failed: environments whose physics broke down, (B,), bool; their arrays hold NaN.
         unconverged: steps of the solver since the start that did not meet its tolerance, (B,), int; None without a solver.
         has_forces: False if this is a bare surface, of which nothing else is known.
-        stage: index in the press scene's trajectory; −1 before the first stage, of a stage that is not the scene's, and in a world.
-        kind: kind of that stage, or ``start``; empty in a world.
-        fraction: completed part of the stage, in (0, 1].
-        scene: press scene that the reading belongs to; None if there is none.
         pad_from_object: pose of the pressed object, (B, 4, 4). This and the next two are NaN in a world.
         world_from_pad: pose of the case, (B, 4, 4); the identity unless the scene moves it (world and pad frame are one at first touch).
         depth: travel below first touch at zero shear and twist [m], (B,); negative when lifted.
         force_law_area: area of contact by the law that ties force to depth [m²], (B,); None without such a law.
         solved: what the physics itself knows beyond this, of a type of its own: ``SoftReading`` of a soft pad's press; else None.
     """
+
+    stage: int = -1
+    """Index in the press scene's trajectory; −1 before the first stage, of a stage that is not the scene's, and in a world."""
+    kind: str = ""
+    """Kind of that stage, or ``start``; empty in a world."""
+    fraction: float = 1.0
+    """Completed part of the stage, in (0, 1]."""
+    scene: PressScene | None = None
+    """Press scene that the reading belongs to; None in a world."""
 
     def __init__(
         self,
@@ -47,10 +52,6 @@ class PadReading:
         traction: OfSurface | None = None,
         *,
         unconverged: np.ndarray | None = None,
-        stage: int = -1,
-        kind: str = "",
-        fraction: float = 1.0,
-        scene: PressScene | None = None,
         pad_from_object: np.ndarray | None = None,
         world_from_pad: np.ndarray | None = None,
         depth: np.ndarray | None = None,
@@ -61,14 +62,12 @@ class PadReading:
 
         Args:
             surface: gel surface; ``wrench``, ``traction``: as the members of these names; None of both and of ``failed``: not known.
-            failed, unconverged, stage, kind, fraction, scene: see the class, as for the others.
-            pad_from_object, world_from_pad, depth, force_law_area, solved: likewise.
+            failed, unconverged, pad_from_object, world_from_pad, depth, force_law_area, solved: see the class.
         """
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
-        self.stage, self.kind, self.fraction, self.scene, self.solved = stage, kind, fraction, scene, solved
-        batch = len(self.failed)
+        self.solved, batch = solved, len(self.failed)
         self.pad_from_object = np.full((batch, 4, 4), np.nan) if pad_from_object is None else pad_from_object
         self.world_from_pad = np.full((batch, 4, 4), np.nan) if world_from_pad is None else world_from_pad
         self.depth = np.full(batch, np.nan) if depth is None else depth

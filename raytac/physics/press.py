@@ -267,8 +267,8 @@ class PressPad(ABC):
         """Move the object to ``fraction`` of the stage that was begun last."""
 
     @abstractmethod
-    def read(self, index: int, kind: str, fraction: float) -> PadReading:
-        """The pad as it is now; ``index``, ``kind`` and ``fraction`` of the stage as in ``PadReading``."""
+    def read(self) -> PadReading:
+        """The pad as it is now; stage and scene are added by the loop over the stages."""
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
         """Readings along the trajectory: one before it (lifted by ``CLEARANCE``), then ``steps_per_stage`` through each stage.
@@ -285,7 +285,7 @@ class PressPad(ABC):
         """
         check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self._start()
-        yield self.read(-1, "start", 1.0)
+        yield self._reading(-1, "start", 1.0)
         for index, stage in enumerate(self.scene.trajectory):
             yield from self._through(index, stage, steps_per_stage)
 
@@ -326,4 +326,9 @@ class PressPad(ABC):
         self.begin(index, stage, steps)
         for step in range(1, steps + 1):
             self.advance(stage, step / steps)
-            yield self.read(index, stage.kind, step / steps)
+            yield self._reading(index, stage.kind, step / steps)
+
+    def _reading(self, index: int, kind: str, fraction: float) -> PadReading:
+        reading = self.read()
+        reading.stage, reading.kind, reading.fraction, reading.scene = index, kind, fraction, self.scene
+        return reading

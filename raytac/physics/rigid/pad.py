@@ -80,9 +80,9 @@ class RigidPad(PressPad):
             if not e.failed:
                 self._advance(e, old, index, stage, b, fraction, steps)
 
-    def read(self, index: int, kind: str, fraction: float) -> PadReading:
+    def read(self) -> PadReading:
         """The present reading; an environment whose gel would lie below its bonded face fails."""
-        reading = self._present(index, kind, fraction)
+        reading = self._present()
         # The gel moves by no more than the greatest overlap: one that is less than the pad's thinnest place cannot take it there.
         thinnest = self.sensor.gelpad.thickness + float(self.grid.rest.min())
         if any(e.rig.depth > thinnest and not e.failed for e in self._environments):
@@ -90,7 +90,7 @@ class RigidPad(PressPad):
             if (pierced & ~reading.failed).any():
                 for b in np.flatnonzero(pierced).tolist():
                     self._environments[b].failed = True
-                reading = self._present(index, kind, fraction)
+                reading = self._present()
         return reading
 
     def surface_from_pose(self, pad_from_object: np.ndarray) -> GelSurface:
@@ -196,7 +196,7 @@ class RigidPad(PressPad):
         if abs(angle) > widest:
             e.stuck_twist = e.twist - np.sign(angle) * widest
 
-    def _present(self, index: int, kind: str, fraction: float) -> PadReading:
+    def _present(self) -> PadReading:
         batch, environments = self.num_envs, self._environments
         pose, case = np.tile(np.eye(4), (2, batch, 1, 1))
         depth, torque, area = np.zeros((3, batch))
@@ -221,10 +221,6 @@ class RigidPad(PressPad):
             lambda surface: _wrench(surface, force, torque),
             failed,
             lambda surface: foundation_traction(surface, force, torque),
-            stage=index,
-            kind=kind,
-            fraction=fraction,
-            scene=self.scene,
             pad_from_object=pose,
             world_from_pad=case,
             depth=depth,

@@ -127,7 +127,7 @@ class SoftPad(PressPad):
             return self._last.underside
         return super().object_height(surface)
 
-    def read(self, index: int, kind: str, fraction: float) -> PadReading:
+    def read(self) -> PadReading:
         batch, case, unconverged = self.num_envs, None, np.zeros(self.num_envs, int)
         if self._drive is None or self.solver is None:
             depth, poses = np.zeros(batch), np.tile(np.eye(4), (batch, 1, 1))
@@ -147,10 +147,6 @@ class SoftPad(PressPad):
             coat.failed.copy(),
             lambda _: self._traction_of(coat.forces),
             unconverged=unconverged,
-            stage=index,
-            kind=kind,
-            fraction=fraction,
-            scene=self.scene,
             pad_from_object=poses,
             world_from_pad=case,
             depth=depth,
