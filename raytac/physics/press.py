@@ -219,17 +219,7 @@ class PressPad(ABC):
     """
 
     def __init__(
-        self,
-        sensor: SensorSpec,
-        scene: PressScene,
-        *,
-        pitch: float,
-        num_envs: int = 1,
-        offsets: np.ndarray | None = None,
-        depths: np.ndarray | None = None,
-        rotations: np.ndarray | None = None,
-        shears: np.ndarray | None = None,
-        twists: np.ndarray | None = None,
+        self, sensor: SensorSpec, scene: PressScene, *, pitch: float, num_envs: int = 1, **own: np.ndarray | None
     ) -> None:
         """Check the scene, and build grid and object.
 
@@ -238,17 +228,15 @@ class PressPad(ABC):
             scene: object and trajectory.
             pitch: spacing of the grid that surfaces are given on [m].
             num_envs: number of environments B.
-            offsets, depths, rotations, shears, twists: targets of each environment, see ``PressTargets``; not finite: that environment
-                fails.
+            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of each environment, see ``PressTargets``; not finite:
+                that environment fails.
 
         Raises:
             InputError: arguments of the wrong shape, ``depths`` deeper than the pad.
             SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
         """
         self.sensor, self.scene, self.num_envs = sensor, scene, num_envs
-        self.targets = PressTargets(
-            scene, num_envs, offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists
-        )
+        self.targets = PressTargets(scene, num_envs, **own)
         self.grid = make_grid(sensor.gelpad, pitch)
         self.parts = scene_parts(scene)
         check_trajectory(scene, sensor.gelpad, self.parts, self.targets.depths)
