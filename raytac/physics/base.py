@@ -113,20 +113,19 @@ class PadReading:
 
     def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
         """The same of the environments named, one row each."""
-        rows, whole = np.asarray(envs), self.surface
+        rows, whole, wrench = np.asarray(envs), self.surface, self.wrench
         part, coat = copy(self), whole.coat
+        del part.surface, part.wrench  # cached of all environments
         part._surface = replace(
             whole,
             **{name: getattr(whole, name)[rows] for name in ("height", "contact", "contact_centre")},
             **{name: None if (v := getattr(whole, name)) is None else v[rows] for name in ("pad_from_object", "ink")},
             coat=None if coat is None else replace(coat, positions=coat.positions[rows]),
         )
-        part._wrench, part._traction = self.wrench[rows], lambda _: self.traction()[rows]
+        part._wrench, part._traction = wrench[rows], lambda _: self.traction()[rows]
         for name in ("failed", "unconverged", "pad_from_object", "world_from_pad", "depth", "force_law_area"):
             values = getattr(self, name)
             setattr(part, name, None if values is None else values[rows])
-        for name in ("surface", "wrench"):  # what was computed of all
-            del part.__dict__[name]
         return part
 
 

@@ -422,3 +422,13 @@ def test_a_stage_may_be_left_on_the_way_and_one_that_fails_leaves_the_object_whe
         list(pad.follow(StageSpec("indent", depth=0.05)))
     with pytest.raises(InputError, match="steps"):
         list(pad.follow(StageSpec("release"), 0))
+
+
+def test_a_reading_of_some_environments_is_theirs() -> None:
+    pad, states = press(scene_of("torus", indent(0.5e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [1e-3, 0.0]]))
+    whole, one = states[-1], states[-1].of([1])
+    for name in ("wrench", "pad_from_object", "depth", "failed", "force_law_area"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(whole, name)[1:])
+    np.testing.assert_array_equal(one.surface.height, whole.surface.height[1:])
+    np.testing.assert_array_equal(one.traction(), whole.traction()[1:])
+    assert one.stage == whole.stage == 0 and one.scene is pad.scene and whole.surface.batch == 2
