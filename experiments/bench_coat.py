@@ -107,24 +107,23 @@ def pressed(spec: SensorSpec, shape: str, mesh: PadMesh, *, as_truth: bool = Fal
         (stage,) = wanted.trajectory
         assert stage.depth is not None
         deeper = replace(wanted, trajectory=(stage, replace(stage, depth=stage.depth + _DEEPER)))
-        pad = SoftPad(spec, deeper, pitch=0.05e-3, pad=mesh)
+        pad = SoftPad(spec, deeper, pitch=0.05e-3, level=mesh)
         state = next(state for state in pad.run() if state.stage == 0)
-        assert pad.solver is not None and state.reading is not None
+        assert pad.solver is not None
 
         def on_line(values: np.ndarray) -> np.ndarray:
             return values[0].reshape(rows, columns, 3)[:, columns // 2]
 
         if as_truth:
-            line, load = on_line(state.reading.vertices), -on_line(state.reading.forces)[:, 2]
+            line, load = on_line(state.solved.vertices), -on_line(state.solved.forces)[:, 2]
             even = np.linspace(-2e-3, 2e-3, 801)
-            under = object_height(pad.parts, state.reading.poses[0], np.array([-1e-5, 0.0, 1e-5]), even)[0, :, 1]
+            under = object_height(pad.parts, state.pad_from_object, np.array([-1e-5, 0.0, 1e-5]), even)[0, :, 1]
             under = np.interp(line[:, 1], even, under, left=np.inf, right=np.inf)
             there = np.isfinite(under) & (load > 0.0)
             short = float((load[there] * (line[there, 2] - under[there])).sum() / load[there].sum())
             (state,) = pad.follow(replace(stage, depth=stage.depth + short))
-    assert state.reading is not None
-    line = on_line(state.reading.vertices)
-    shown = pad.surface(state).height[0][:, pad.grid.shape[1] // 2].astype(float)
+    line = on_line(state.solved.vertices)
+    shown = state.surface.height[0][:, pad.grid.shape[1] // 2].astype(float)
     return (line[:, 1], line[:, 2]), float(state.normal_force[0]), (pad.grid.y, shown)
 
 
@@ -138,10 +137,10 @@ def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, 
         truth = np.zeros(0)
         for level in ("truth", *levels):
             mesh = truth_mesh if level == "truth" else pad_mesh(spec.gelpad, level)
-            pad = SoftPad(spec, PressScene(BALL, target, stages), pitch=0.1e-3, pad=mesh)
+            pad = SoftPad(spec, PressScene(BALL, target, stages), pitch=0.1e-3, level=mesh)
             state = pad.peak(pad.run())
-            surface, reading = pad.surface(state), state.reading
-            assert reading is not None and surface.coat is not None
+            surface, reading = state.surface, state.solved
+            assert surface.coat is not None
             vertices, weights = bind_to_coat(mesh.coat, probes)
             solver, shown = (
                 (weights[..., None] * (at[0] - mesh.coat.rest)[vertices]).sum(axis=1)[:, :2]

@@ -60,7 +60,7 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
     rng = np.random.default_rng(0)
     found = []
     for state in pad.run(steps_per_stage=2):
-        surface = pad.surface(state)
+        surface = state.surface
         rows = np.arange(envs) % few
         positions = coat.rest[None] + 1e-4 * rng.standard_normal((envs, *coat.rest.shape))
         pose = np.asarray(surface.pad_from_object)[rows]

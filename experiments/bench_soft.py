@@ -28,7 +28,7 @@ import tyro
 from experiments.running import recorded, run
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric, parse_names
-from raytac.physics import PadLevel, SoftPad, pad_mesh
+from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
@@ -74,7 +74,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
     scene = ball(StageSpec("indent", depth=DEPTH))
     for level in [*levels, *(["refined"] if refined else [])]:
         pad = pad_mesh(spec.gelpad, REFINED) if level == "refined" else level
-        sensor = TactileSensor(spec, physics="ipc", pad=pad, device=device, seed=seed)
+        sensor = TactileSensor(spec, physics=Ipc(pad), device=device, seed=seed)
         metrics["device"] = sensor.device_used
         sensor.rest()
         loaded = sensor.load(scene)
@@ -100,7 +100,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
             f"soft.{level}.steps_per_s": 1.0 / float(np.median(timed)),
             f"soft.{level}.best_steps_per_s": 1.0 / min(timed),
             f"soft.{level}.imprint_error": float(surface.indentation.max()) / DEPTH - 1.0,
-            f"soft.{level}.force_n": -float(frame.force[0, 2]) if frame.force is not None else float("nan"),
+            f"soft.{level}.force_n": -float(frame.force[0, 2]),
             f"soft.{level}.contact_area_mm2": 1e6
             * float(surface.contact[0].sum())
             * surface.grid.pitch[0]

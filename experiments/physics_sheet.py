@@ -30,6 +30,7 @@ from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, parse_names
+from raytac.physics import Ipc
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, load_press
 
@@ -73,8 +74,7 @@ class Args(CommonOptions):
             sensors = {
                 physics: TactileSensor(
                     self.sensor,
-                    physics=physics,
-                    pad=self.pad if physics == "ipc" else None,
+                    physics=Ipc(self.pad) if physics == "ipc" else physics,
                     outputs=("rgb", "wrench"),
                     device=self.device,
                     seed=self.seed,
@@ -104,7 +104,7 @@ class Args(CommonOptions):
                 surfaces = {}
                 for level in PADS[PADS.index(self.against) :: -1]:
                     sensor = TactileSensor(
-                        self.sensor, physics="ipc", pad=level, outputs=("height", "wrench"), device=self.device, seed=self.seed
+                        self.sensor, physics=Ipc(level), outputs=("height", "wrench"), device=self.device, seed=self.seed
                     )
                     frame = sensor.press(load_press(name))
                     surfaces[level] = frame.surface
@@ -135,7 +135,7 @@ def measured(frame: TactileFrame) -> dict[str, Metric]:
         "bulge_mm": -1e3 * float(surface.indentation.min()),
         "contact_mm2": 1e6 * float(surface.contact[0].sum()) * surface.grid.pitch[0] * surface.grid.pitch[1],
     }
-    if frame.force is not None:
+    if "force" in frame.outputs:
         found["force_n"] = -float(frame.force[0, 2])
     return found
 
@@ -191,7 +191,6 @@ def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: Tac
         dents = [1e3 * frame.surface.indentation[0] for frame in (rigid, soft)]
         deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
         for axis, frame in zip(line[:2], (rigid, soft), strict=True):
-            assert frame.rgb is not None
             axis.imshow(frame.rgb[0], extent=(left, right, bottom, top))
         for axis, dent in zip(line[2:4], dents, strict=True):
             shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)

@@ -20,10 +20,10 @@ from experiments.running import run
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
-from raytac.physics import quiet_solver
+from raytac.physics import PHYSICS, quiet_solver
 from raytac.report import machine
 from raytac.sensor import OPTICS
-from raytac.specs import PHYSICS, SweepSpec, load_sweep
+from raytac.specs import SweepSpec, load_sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Args(CommonOptions):
     """Number of presses."""
     shard_size: int | None = None
     """Presses in one shard."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms."""
     optics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = None
     """How images are made."""

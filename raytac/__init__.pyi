@@ -23,6 +23,7 @@ from .errors import MeshError as MeshError
 from .errors import OverlapError as OverlapError
 from .errors import RaytacError as RaytacError
 from .errors import SpecError as SpecError
+from .frame import MissingOutputError as MissingOutputError
 from .frame import TactileFrame as TactileFrame
 from .gel.surface import GelSurface as GelSurface
 from .gel.surface import PadGrid as PadGrid

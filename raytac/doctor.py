@@ -216,7 +216,7 @@ PROBES = (
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
     Probe(
         "warp", _WARP, False, "pip install 'raytac[ipc]'",
-        _absent("physics ipc (the soft pad), raytac calibrate, and raytac compare with --pad or --markers need it", "warp"),
+        _absent("physics ipc (the soft pad), raytac calibrate, and raytac compare with --level or --markers need it", "warp"),
     ),
     Probe(
         "pytetwild", _TETWILD, False, "pip install 'raytac[ipc]'",

@@ -11,6 +11,7 @@ from raytac.checks import check_numbers
 from raytac.errors import InputError
 
 __all__ = [
+    "about_z",
     "batch_of",
     "between",
     "check_pose",
@@ -189,3 +190,9 @@ def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = No
     if not (np.isfinite(array).all() and off < _ORTHONORMAL and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
         raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
     return np.broadcast_to(array, (batch, *shape)).copy()
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Rotation by ``angle`` [rad] about z, (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -68,7 +68,7 @@ def test_wrong_input_is_one_line_and_writes_nothing(
 
 
 @pytest.mark.parametrize(
-    "args", [["press", "sphere", "--physics", "ipc"], ["press", "sphere", "--pad", "coarse"], ["calibrate", "markers"]]
+    "args", [["press", "sphere", "--physics", "ipc"], ["press", "sphere", "--level", "coarse"], ["calibrate", "markers"]]
 )
 def test_without_the_solver_one_line_says_what_to_install(
     args: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

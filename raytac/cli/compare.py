@@ -40,11 +40,11 @@ class CompareArgs(SolverOptions):
     """Timed frames a figure; fewer, at least three, for modes slower than 10 s together."""
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """Also press into the soft pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
     markers: bool = False
     """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the soft pad of the level
-    that --pad names, else medium; needs raytac[ipc] and a sensor with marker motion."""
+    that --level names, else medium; needs raytac[ipc] and a sensor with marker motion."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
 
@@ -78,7 +78,7 @@ class CompareArgs(SolverOptions):
             reference_spp=self.spp,
             frames=self.frames,
             batch=self.batch,
-            pad=self.pad,
+            pad=self.level,
             markers=self.markers,
         )
         return chosen.quickened() if self.quick else chosen

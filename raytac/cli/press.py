@@ -10,16 +10,16 @@ from typing import Annotated, Any
 import tyro
 
 from raytac.checks import check_known
-from raytac.cli.shared import ShadowOptions, SolverOptions
+from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKERS
 from raytac.optics import INTEGRATORS
+from raytac.physics import PHYSICS
 from raytac.report.press import run_press
 from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
-from raytac.specs import PADS, PHYSICS, press_of
-from raytac.specs.press import chosen_physics
+from raytac.specs import PADS, press_of
 
 __all__ = ["PressArgs"]
 
@@ -41,11 +41,11 @@ class PressArgs(ShadowOptions, SolverOptions):
     """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
     scene says if not given, else rigid."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
     mlp (a network, which a calibration must give)."""
@@ -73,13 +73,12 @@ class PressArgs(ShadowOptions, SolverOptions):
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
-        physics = chosen_physics(self.physics, self.pad, scene.physics)
-        if physics == "ipc":
-            self.prepare_solver("physics='ipc'")
+        physics = chosen_physics(self.physics, self.level, scene)
+        if physics.is_simulated:
+            self.prepare_solver(f"physics={PHYSICS.name_of(physics)!r}")
         sensor = TactileSensor(
             self.sensor,
             physics=physics,
-            pad=self.pad or scene.pad if physics == "ipc" else self.pad,
             optics=self.optics,
             outputs=computed,
             resolution=parse_resolution(self.resolution) if self.resolution is not None else None,
@@ -90,7 +89,7 @@ class PressArgs(ShadowOptions, SolverOptions):
             markers=self.markers,
             optics_options=self._optics_options(),
         )
-        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)
+        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, PHYSICS.name_of(physics))
         for path in run_press(sensor, scene, out, outputs=outputs, start=start, progress=True):
             print(path)
         return 0

@@ -15,11 +15,13 @@ from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import INNER, STRENGTHS
 from raytac.errors import InputError
 from raytac.io.options import CommonOptions
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import PHYSICS, scene_physics
 from raytac.physics.soft.availability import check_solver, quiet_solver
-from raytac.specs import SensorSpec, load_sensor, with_lights
+from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
-__all__ = ["CASTING", "FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "read_data"]
+__all__ = ["CASTING", "FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "chosen_physics", "read_data"]
 
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
@@ -94,6 +96,17 @@ class FitOptions(CommonOptions):
         for name in doubtful:
             print(f"the circle of press {name} is doubtful")
         return spec, presses, shots
+
+
+def chosen_physics(physics: str | None, level: str | None, scene: PressScene | TaskScene) -> PhysicsConfig:
+    """Physics that ``--physics`` and ``--level`` name: with a level alone ``ipc``, with neither as the scene says, else ``rigid``.
+
+    Raises:
+        InputError: an unknown name, or a level of a physics that has none. SpecError: an unknown name in the scene.
+    """
+    if physics is None and level is None:
+        return scene_physics(None, scene)
+    return scene_physics(PHYSICS.config(physics or "ipc", **({} if level is None else {"level": level})), scene)
 
 
 @dataclass(frozen=True, kw_only=True)

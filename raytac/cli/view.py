@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from raytac.checks import check_known, check_whole
-from raytac.cli.shared import ShadowOptions
+from raytac.cli.shared import ShadowOptions, chosen_physics
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
+from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.sensor import OPTICS, TactileSensor
 from raytac.sensor.options import sensor_spec
-from raytac.specs import PADS, PHYSICS, PressScene, TaskScene, load_scene
-from raytac.specs.press import chosen_physics
+from raytac.specs import PADS, PressScene, TaskScene, load_scene
 from raytac.specs.task import COUPLINGS
 
 if TYPE_CHECKING:
@@ -43,11 +43,11 @@ class ViewArgs(ShadowOptions):
     """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
     sensor: str | None = None
     """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated; needs raytac[ipc]); as the scene says if not given, else
     rigid."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
@@ -80,9 +80,9 @@ class ViewArgs(ShadowOptions):
         check_address(self.host, self.port, allowed)
         check_known("optics", self.optics, OPTICS)
         scene = load_scene(self.scene)
-        physics = chosen_physics(self.physics, self.pad, scene.physics)
-        if physics == "ipc":
-            check_solver("physics='ipc'")
+        physics = chosen_physics(self.physics, self.level, scene)
+        if physics.is_simulated:
+            check_solver(f"physics={PHYSICS.name_of(physics)!r}")
             if not self.verbose:
                 quiet_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
@@ -99,18 +99,16 @@ class ViewArgs(ShadowOptions):
                 print("raytac: viewer closed")
         return 0
 
-    def _press(self, scene: PressScene, physics: str) -> Session:
+    def _press(self, scene: PressScene, physics: PhysicsConfig) -> Session:
         from raytac.view.press_session import PressSession
 
         for name, value in (("coupling", self.coupling), ("steps", self.steps)):
             if value is not None:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
-        pad = self.pad or scene.pad if physics == "ipc" else self.pad
         spec = sensor_spec(self.sensor or "gelsight_mini")
         sensor = TactileSensor(
             spec,
             physics=physics,
-            pad=pad,
             outputs=_OUTPUTS,
             seed=self.seed,
             optics_options=self.chosen_shadows(self.optics),
@@ -118,7 +116,7 @@ class ViewArgs(ShadowOptions):
         )
         return PressSession(sensor, scene)
 
-    def _task(self, scene: TaskScene, physics: str) -> Session:
+    def _task(self, scene: TaskScene, physics: PhysicsConfig) -> Session:
         from raytac.view.world_session import WorldSession
         from raytac.world.world import TactileWorld
 
@@ -129,14 +127,13 @@ class ViewArgs(ShadowOptions):
         world = TactileWorld(
             scene,
             physics=physics,
-            pad=self.pad,
             coupling=self.coupling,
             outputs=_OUTPUTS,
             seed=self.seed,
             sensor_options={"optics_options": self.chosen_shadows(self.optics)},
             **self._settings(sensor_spec(scene.robot.sensor)),
         )
-        return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
+        return WorldSession(world, steps=self.steps or (4 if not physics.is_simulated and self.markers is None else 1))
 
     def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
         return {

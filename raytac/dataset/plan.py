@@ -19,6 +19,7 @@ from raytac.gel.surface import PadGrid, grid_pitch, make_grid
 from raytac.markers import MARKERS, MarkerPerturbation
 from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
+from raytac.physics.registry import scene_physics
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
 
@@ -92,7 +93,7 @@ class DatasetPlan:
                 asked for.
             SpecError: a range that no press into one of the sensors can follow; names the file and key.
         """
-        self.sweep = sweep
+        self.sweep, self.physics = sweep, scene_physics(None, sweep)
         for name in sweep.outputs:
             if name not in DATASET_OUTPUTS:
                 raise InputError("outputs", value=name, rule="must be known names", choices=DATASET_OUTPUTS)
@@ -169,8 +170,7 @@ class DatasetPlan:
         """Keyword arguments of the ``TactileSensor`` that gives what is kept, but for sensor and device."""
         sweep = self.sweep
         return {
-            "physics": sweep.physics,
-            "pad": sweep.pad,
+            "physics": self.physics,
             "optics": sweep.optics,
             "outputs": tuple(name for name in sweep.outputs if name != "contact"),
             "markers": None if sweep.markers is None else MARKERS.config(sweep.markers, perturbation=self.randomization.markers),
@@ -254,7 +254,7 @@ class DatasetPlan:
         dynamics, key = scene.object.dynamics, "object.dynamics"
         if dynamics == "affine":
             raise SpecError("a free body cannot be pressed to a depth", file=scene.source, key=key, value=dynamics)
-        if dynamics == "soft" and (self.sweep.physics != "ipc" or self.sweep.ranges.tilt != (0.0, 0.0)):
+        if dynamics == "soft" and (not self.physics.is_simulated or self.sweep.ranges.tilt != (0.0, 0.0)):
             rule = 'a soft object needs physics = "ipc" and tilt_deg = [0, 0]: it is held at its top'
             raise SpecError(rule, file=scene.source, key=key, value=dynamics)
 

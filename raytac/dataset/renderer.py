@@ -18,9 +18,7 @@ from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
 from raytac.physics import NarrowContactWarning
 from raytac.sensor import TactileSensor
-from raytac.sensor.pad import load_pad
 from raytac.specs import PressScene, SensorSpec
-from raytac.specs.press import PADS
 
 __all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
 
@@ -130,7 +128,7 @@ class ShardRenderer:
         sensor = TactileSensor(spec, **plan.sensor_options(batch), device=self.job.device)
         rest = sensor.rest()  # before any press, whose placement of the pattern it would show
         shared = {"grid_x": sensor.grid.x, "grid_y": sensor.grid.y, "rest_height": rest.surface.height[0]}
-        if rest.rgb is not None:
+        if "rgb" in rest.outputs:
             shared["rest_rgb"] = rest.rgb[0]
         drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
         return _Built(sensor, drift, shared)
@@ -159,7 +157,6 @@ class ShardRenderer:
                 refused = np.flatnonzero([bool(reason) for reason in reasons])
                 own["offsets"][refused] = np.nan
                 frame = built.sensor.press(scene, **own)
-        assert frame.failed is not None
         for b in range(len(presses)):
             if frame.failed[b] and not reasons[b]:
                 reasons[b] = _UNSETTLED
@@ -187,11 +184,8 @@ class ShardRenderer:
         """Why a press cannot be, found by trying it alone; empty if it can."""
         own = self._own(press, 1)
         del own["seeds"]
-        level, sweep = self.plan.sweep.pad or PADS[0], self.plan.sweep
         try:
-            pad = load_pad(
-                sensor.spec, scene, physics=sweep.physics, level=level, device=self.job.device, pitch=sensor.pitch, **own
-            )
+            pad = self.plan.physics.build(sensor.spec, scene, pitch=sensor.pitch, num_envs=1, device=self.job.device, **own)
             for _ in pad.run():
                 pass
         except (BackendError, AssetError):
@@ -208,9 +202,9 @@ class ShardRenderer:
         arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
         if "contact" in self.plan.sweep.outputs:
             arrays["contact"] = surface.contact
-        if frame.rgb is not None:
+        if "rgb" in frame.outputs:
             arrays["rgb"] = self._drifted(built, frame.rgb, presses)
-        if frame.markers is not None:
+        if "markers" in frame.outputs:
             m = frame.markers
             arrays |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
             arrays |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
@@ -240,11 +234,11 @@ class ShardRenderer:
 def _figures(frame: TactileFrame, b: int) -> Row:
     """Figures of one press for the manifest."""
     row: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
-    if frame.wrench is not None:
+    if "wrench" in frame.outputs:
         names = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
         row |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
     for name in ("contact_area", "contact_cells"):
-        values = getattr(frame, name)
+        values = getattr(frame, name, None)
         if values is not None and np.isfinite(values[b]):
             row[name] = float(values[b])
     return row

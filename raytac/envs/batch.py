@@ -16,8 +16,9 @@ from raytac.envs.task_rules import Task, TaskState
 from raytac.errors import InputError
 from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import checked_physics, scene_physics
 from raytac.se3 import inverse, pose_error, rotations
-from raytac.specs.press import chosen_physics
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
@@ -63,8 +64,7 @@ class TaskBatch:
         task: Task,
         *,
         num_envs: int = 1,
-        physics: str | None = None,
-        pad: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
         action: str = "pose",
@@ -80,7 +80,7 @@ class TaskBatch:
         Args:
             task: the task.
             num_envs: number of environments B.
-            physics, pad, device: as of ``TactileWorld``.
+            physics, device: as of ``TactileWorld``.
             tactile: observation of every sensor: settings, or modalities alone; "task" takes those of the task; with None no sensor is
                 read and nothing of it is computed.
             body_seen: observe the body's pose and velocity; None takes the task's default.
@@ -102,7 +102,8 @@ class TaskBatch:
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the probe gives the force alone, so that the sensor needs no markers.
         probed = ObservationSettings(("wrench",)) if settings is None else settings
-        rigid = chosen_physics(physics, pad, loaded.physics) == "rigid"
+        config = scene_physics(checked_physics(physics), loaded)
+        rigid = not config.is_simulated
         shared = self.randomization  # drawn once for all environments
         if rigid:
             shared = replace(shared, youngs_modulus=0.0, friction=0.0)
@@ -114,7 +115,7 @@ class TaskBatch:
         if settings is not None:
             options = probe.world_options()
         options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
-        self.world = TactileWorld(loaded, physics=physics, pad=pad, device=device, **options)
+        self.world = TactileWorld(loaded, physics=config, device=device, **options)
         self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
         )

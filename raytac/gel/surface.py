@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -29,10 +30,11 @@ __all__ = [
 ]
 
 
-def summary(record: Any) -> str:
-    """A dataclass on one line: arrays by type and shape, without empty fields."""
+def summary(record: Any, names: Sequence[str] | None = None) -> str:
+    """A dataclass on one line: arrays by type and shape, without empty fields; ``names``: fields that are shown, None for all."""
     shown = []
-    for name, value in ((f.name, getattr(record, f.name)) for f in fields(record)):
+    for name in [f.name for f in fields(record)] if names is None else names:
+        value = getattr(record, name)
         if isinstance(value, dict):
             value = {key: _brief(v) for key, v in value.items()}
             text = "{" + ", ".join(f"{key}: {v}" for key, v in value.items()) + "}" if value else ""

@@ -179,13 +179,13 @@ def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str 
     check_solver("a press on the soft pad")
     from raytac.physics.soft.pad import SoftPad
 
-    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=level, device=device)
+    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, level=level, device=device)
     loads, poses, coats = [], [], []
     names = {"indent": "normal"} | ({"shear": "combined", "twist": "combined"} if press.is_combined else {})
     for state in soft.run(steps_per_stage=1 if press.is_combined else _STEPS):
         if state.failed.any():
             raise RaytacError(f"the press {press} did not settle")
-        coat = soft.surface(state).coat
+        coat = state.surface.coat
         assert coat is not None
         loads.append(names.get(state.kind, state.kind))
         poses.append(np.asarray(state.pad_from_object)[0])

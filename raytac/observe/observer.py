@@ -164,9 +164,8 @@ class TactileObserver:
         batch, rows = frame.surface.batch, np.asarray(chosen_envs(envs, self.num_envs), int)
         if batch != len(rows):
             raise InputError("frame", value=batch, rule=f"must have {len(rows)} environments, as this observer")
-        failed = np.zeros(batch, bool) if frame.failed is None else frame.failed
         values = {name: self._values(name, frame, sensor, rows) for name in self.settings.modalities}
-        return self._finished(values, failed, rows)
+        return self._finished(values, frame.failed, rows)
 
     def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
         """As ``observe``, from wrenches of the world, where only the ``wrench`` is observed and no surface is needed.
@@ -208,10 +207,10 @@ class TactileObserver:
             case "rgb":
                 return self._rgb(frame, sensor, rows)
             case "markers":
-                markers = _given(frame.markers, name)
+                markers = frame.markers
                 return self._scaled(name, np.where(markers.visible[..., None], markers.displacement, 0.0))
             case "marker_visible":
-                return _given(frame.markers, name).visible.astype(np.int8)
+                return frame.markers.visible.astype(np.int8)
             case "contact":
                 return self._map(frame, frame.surface.contact).astype(np.float32)
             case "height":
@@ -219,11 +218,11 @@ class TactileObserver:
             case "indentation":
                 return self._scaled(name, self._map(frame, frame.surface.indentation))
             case "wrench":
-                return self._scaled(name, _given(frame.wrench, name))
+                return self._scaled(name, frame.wrench)
         raise AssertionError(name)  # the settings know the names
 
     def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
-        images = self._cut(_given(frame.rgb, "rgb"))
+        images = self._cut(frame.rgb)
         if self._drift is not None:
             images = self._drift.apply(images, envs=rows.tolist())
         if not self.settings.difference:
@@ -241,10 +240,10 @@ class TactileObserver:
             raise InputError("sensor", value=None, rule="must be given for a difference: it renders the image at rest")
         if self._moves_dots:
             envs = rounded_envs(stale.tolist(), self.num_envs)
-            images = self._cut(_given(sensor.rest(envs).rgb, "rgb"))[: len(stale)]
+            images = self._cut(sensor.rest(envs).rgb)[: len(stale)]
         else:
             if self._rest_rgb is None:
-                self._rest_rgb = self._cut(_given(sensor.rest().rgb, "rgb"))
+                self._rest_rgb = self._cut(sensor.rest().rgb)
             images = np.repeat(self._rest_rgb, len(stale), axis=0)
         if self._drift is not None:
             images = self._drift.apply(images, noise=False, envs=stale.tolist())
@@ -304,12 +303,6 @@ class TactileObserver:
         else:
             last[rows] = np.concatenate([last[rows][:, 1:], now[:, None]], axis=1)
             last[rows[is_first]] = now[is_first][:, None]
-
-
-def _given(value: Any, name: str) -> Any:
-    if value is None:
-        raise InputError("frame", value=name, rule="does not hold this modality: make its sensor with sensor_options")
-    return value
 
 
 class CellMeans:

@@ -1,6 +1,13 @@
-from .base import ContactState as ContactState
+from .base import Pad as Pad
 from .base import PadReading as PadReading
+from .base import PhysicsConfig as PhysicsConfig
+from .configs import Ipc as Ipc
+from .configs import Rigid as Rigid
 from .geoms import body_parts as body_parts
+from .press import CLEARANCE as CLEARANCE
+from .press import PressPad as PressPad
+from .registry import PHYSICS as PHYSICS
+from .registry import register as register
 from .rigid.pad import RigidPad as RigidPad
 from .soft.availability import quiet_solver as quiet_solver
 from .soft.bodies import ScenePad as ScenePad

@@ -15,17 +15,15 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import INTEGRATORS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
-from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-    from raytac.physics.soft.mesh import PadMesh
+    from raytac.physics.base import PhysicsConfig
 
 __all__ = [
     "LARGEST_SIDE",
     "OPTICS",
     "check_optics",
-    "check_physics",
     "checked_markers",
     "checked_outputs",
     "checked_resolution",
@@ -46,18 +44,6 @@ SHAPE_TOLERANCE = 0.02
 def sensor_outputs(optics: str) -> tuple[str, ...]:
     """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
     return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
-
-
-def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
-    """Raises ``InputError`` for an unknown name, or a pad to be cut where none is simulated."""
-    if physics is not None:
-        check_known("physics", physics, PHYSICS)
-    if isinstance(pad, str):
-        check_known("pad", pad, PADS)
-    elif pad is not None:
-        check_methods("pad", pad, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
-    if pad is not None and physics == "rigid":
-        raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
 
 
 def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, options: dict[str, Any] | None) -> None:
@@ -90,11 +76,11 @@ def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> 
     return tuple(name for name in OUTPUTS if name in outputs)
 
 
-def checked_markers(markers: str | MarkersConfig | None, physics: str | None) -> MarkersConfig | None:
+def checked_markers(markers: str | MarkersConfig | None, physics: PhysicsConfig | None) -> MarkersConfig | None:
     """Configuration of the marker model. Raises ``InputError`` for an unknown one, or one that needs what the physics does not have."""
     config = None if markers is None else markers_config(markers)
-    if config is not None and config.needs_coat and physics == "rigid":
-        rule = "tracks the surface of a soft pad; physics='rigid' has none"
+    if config is not None and config.needs_coat and physics is not None and not physics.is_simulated:
+        rule = f"tracks the surface of a soft pad; physics={physics.label!r} has none"
         raise InputError("markers", value=MARKERS.name_of(config), rule=rule, choices=models_without_coat())
     return config
 

@@ -4,7 +4,6 @@ from .marker_motion import PunchSpec as PunchSpec
 from .marker_motion import load_marker_motion as load_marker_motion
 from .mesh import load_mesh as load_mesh
 from .press import PADS as PADS
-from .press import PHYSICS as PHYSICS
 from .press import ObjectSpec as ObjectSpec
 from .press import PressScene as PressScene
 from .press import StageSpec as StageSpec

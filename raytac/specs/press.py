@@ -15,14 +15,12 @@ __all__ = [
     "DYNAMICS",
     "MOVES",
     "PADS",
-    "PHYSICS",
     "POSE_SCHEMA",
     "SCENE_SCHEMA",
     "STAGE_SCHEMA",
     "ObjectSpec",
     "PressScene",
     "StageSpec",
-    "chosen_physics",
 ]
 
 MOVES = ("object", "case")
@@ -36,7 +34,7 @@ DYNAMICS = ("kinematic", "affine", "soft")
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
-    "physics": Text(choices=PHYSICS, default=None),
+    "physics": Text(default=None),
     "pad": Text(choices=PADS, default=None),
 }
 """Keys at the top of a scene."""
@@ -62,14 +60,6 @@ STAGE_SCHEMA: Final[dict[str, Schema]] = {
     "release": {**_DURATION},
 }
 """Kind of stage to its keys in ``[[trajectory]]``."""
-
-
-def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
-    """``rigid`` or ``ipc``: the one asked for, ``ipc`` with a mesh level, that of the scene, ``rigid``.
-
-    The first of these that is given counts.
-    """
-    return physics or ("ipc" if pad is not None else scene or "rigid")
 
 
 @dataclass(frozen=True)
@@ -156,7 +146,7 @@ class PressScene:
     """Side that the trajectory moves, one of ``MOVES``. Targets are those of the object relative to the pad in both cases."""
     source: Path | None = None
     physics: str | None = None
-    """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""
+    """Name of the physics that the scene is meant for (checked when it is pressed); None leaves it to whoever presses."""
     pad: str | None = None
     """One of ``PADS``; None leaves it to whoever presses."""
 

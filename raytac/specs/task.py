@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.errors import SpecError
-from raytac.specs.press import PADS, PHYSICS
+from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec, Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
 from raytac.specs.toml import ANY, Number, Schema, Text, check_fields
@@ -54,7 +54,7 @@ _POSE: Final[Schema] = {
 }
 
 TASK_SCHEMA: Final[Schema] = {
-    "physics": Text(choices=PHYSICS, default=None),
+    "physics": Text(default=None),
     "pad": Text(choices=PADS, default=None),
     "coupling": Text(choices=COUPLINGS, default="two_way"),
     "timestep_s": Number(_STEP, default=0.002),
@@ -219,7 +219,7 @@ class TaskScene:
     robot: RobotSpec
     bodies: tuple[BodySpec, ...]
     physics: str | None = None
-    """One of ``raytac.specs.press.PHYSICS`` that the scene is meant for; None leaves it to the user."""
+    """Name of the physics that the scene is meant for (checked when a world is made); None leaves it to the user."""
     pad: str | None = None
     """One of ``raytac.specs.press.PADS``; None leaves it to the user."""
     timestep: float = 0.002

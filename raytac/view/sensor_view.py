@@ -62,25 +62,25 @@ def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env
     at, height = _places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
     x, y = np.meshgrid(grid.x, grid.y)
     values = {"indentation": (grid.rest - height).ravel()}
-    if frame.traction is not None:
+    if "traction" in frame.outputs:
         traction = frame.traction[env][at].reshape(-1, 3)
         values["pressure"], values["shear"] = -traction[:, 2], np.hypot(traction[:, 0], traction[:, 1])
     markers = None
-    if frame.markers is not None:
+    if "markers" in frame.outputs:
         markers = frame.markers.rest_px[env], frame.markers.displacement_px[env]
     return PadView(
         world_from_pad=world_from_pad,
         vertices=np.stack([x.ravel(), y.ravel(), height.ravel()], axis=1),
         values=values,
-        rgb=None if frame.rgb is None else frame.rgb[env],
+        rgb=frame.rgb[env] if "rgb" in frame.outputs else None,
         markers_px=markers,
-        wrench=None if frame.wrench is None else frame.wrench[env],
+        wrench=frame.wrench[env] if "wrench" in frame.outputs else None,
     )
 
 
 def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
     """Warning of a contact that the soft pad's cells cannot resolve; empty if they can."""
-    if frame.contact_cells is None or not frame.contact_cells[env] < LEAST_CELLS:
+    if "contact_cells" not in frame.outputs or not frame.contact_cells[env] < LEAST_CELLS:
         return ""
     cells = frame.contact_cells[env]
     return (

@@ -77,7 +77,7 @@ class WorldSession:
         self.solids = (*self._geoms(), *self._gels(), *self._soft_bodies())
         self.camera = self._camera()
         # Their number of segments is known with the first frame, which computes images.
-        simulated = self._sensors if world.physics == "ipc" else ()
+        simulated = self._sensors if world.physics.is_simulated else ()
         self.lines = tuple(Lines(f"{name}_coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH) for name in simulated)
         self._physics_ms = 0.0
         self._shot: Snapshot | None = None

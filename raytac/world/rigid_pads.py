@@ -88,7 +88,12 @@ class _Contact:
 class RigidPads:
     """All pads of a world, B environments; MuJoCo moves every body."""
 
-    def __init__(self, composed: ComposedScene, models: EnvironmentModels, num_envs: int) -> None:
+    soft = None
+    meshes: tuple[str, ...] = ()
+
+    def __init__(self, composed: ComposedScene, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
+        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here."""
+        num_envs = len(datas)
         self.composed, self.model, self._models = composed, composed.model, models
         self.pads = {
             mounted.name: _Pad(mounted, spec, composed.model)
@@ -218,7 +223,7 @@ class RigidPads:
         surface = without_pierced(self._shown[name][1].surface(height, poses), pad.spec.gelpad)
         failed = np.isnan(surface.height[:, 0, 0])
         wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
-        return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
+        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench))
 
     def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
         """Every pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4) of the states given."""

@@ -17,13 +17,15 @@ import mujoco
 import numpy as np
 
 import ipc
+from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import CoatTraction
 from raytac.physics.base import PadReading
+from raytac.physics.configs import Ipc
 from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
-from raytac.physics.soft.mesh import pad_mesh
+from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
 from raytac.robots.frames import body_poses, site_poses
@@ -31,6 +33,7 @@ from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
+from raytac.specs.press import PADS
 from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.compose import ComposedScene
 from raytac.world.coupling import Coupling, coupling_inputs
@@ -70,7 +73,7 @@ class SoftPads:
         models: EnvironmentModels,
         datas: Sequence[mujoco.MjData],
         *,
-        level: str,
+        physics: Ipc,
         coupling: str,
         device: str,
     ) -> None:
@@ -78,18 +81,19 @@ class SoftPads:
 
         Args:
             composed: the scene; ``models``, ``datas``: MuJoCo's of every environment.
-            level: how finely pads are cut, one of ``PADS``.
+            physics: gives the mesh.
             coupling: one of ``COUPLINGS``.
-            device: of the solver.
+            device: of the solver, ``auto``, ``cpu`` or ``cuda``.
 
         Raises:
+            BackendError: the solver is not installed, or the device does not work here.
             SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model, self._models = composed, composed.model, models
-        scene = composed.scene
+        scene, level = composed.scene, physics.level or PADS[0]
         pads = [
-            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level))
+            ScenePad(mounted.name, spec, level if isinstance(level, PadMesh) else pad_mesh(spec.gelpad, level))
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
@@ -110,7 +114,7 @@ class SoftPads:
             friction=_pair_friction(scene),
             ignored=[(b.name, b.held_by) for b in scene.bodies if b.held_by is not None],
             num_envs=len(datas),
-            device=device,
+            device=resolve_device(device, ray_tracing=False),
         )
         self._robot = RobotOverlap(composed)
         self._warned: set[tuple[str, str]] = set()
@@ -215,12 +219,12 @@ class SoftPads:
         failed = failed | (reading.failed & ~left_out)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
-        def traction() -> np.ndarray:
+        def traction(_: GelSurface) -> np.ndarray:
             if name not in self._traction:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        found = PadReading(reading.surface, wrench, failed, traction, self._unconverged.copy())
+        found = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
         return found if envs is None else found.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:

@@ -14,29 +14,27 @@ import mujoco
 import numpy as np
 
 from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_whole
-from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.impedance import JointImpedance
 from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import check_physics
-from raytac.specs.press import PADS, chosen_physics
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.environment_models import EnvironmentModels, Variation
-from raytac.world.rigid_pads import RigidPads
+from raytac.world.pads import WORLD_PADS, WorldPads
 from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
     from raytac.physics.soft.scene import SoftScene
-    from raytac.world.soft_pads import SoftPads
 
 __all__ = ["TactileWorld"]
 
@@ -59,7 +57,7 @@ class TactileWorld:
 
     Attributes:
         scene: the task scene.
-        physics: ``rigid`` or ``ipc``.
+        physics: configuration that is used.
         model, data: MuJoCo's model of the scene, and its state in every environment.
         models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
         arm: the joints that move the robot's site; None without joints.
@@ -70,8 +68,7 @@ class TactileWorld:
         self,
         scene: str | Path | TaskScene,
         *,
-        physics: str | None = None,
-        pad: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
         markers: str | MarkersConfig | None = None,
@@ -86,8 +83,7 @@ class TactileWorld:
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene.
-            physics: ``rigid`` or ``ipc``; None is as the scene says, else ``rigid``.
-            pad: how finely a simulated pad is cut, one of ``PADS``; None is as the scene says, else ``coarse``.
+            physics: name or configuration, as ``TactileSensor`` takes it; None is as the scene says, else ``rigid``.
             coupling: ``two_way`` or ``one_way``; None is as the scene says. The rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
@@ -99,13 +95,15 @@ class TactileWorld:
             SpecError: the scene breaks a rule.
             BackendError: the solver or a renderer is not installed.
         """
-        check_physics(physics, pad)
+        asked = checked_physics(physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         if coupling is not None:
             check_known("coupling", coupling, COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
-        self.physics = chosen_physics(physics, pad, self.scene.physics)
-        self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]
+        self.physics = scene_physics(asked, self.scene)
+        name = PHYSICS.name_of(self.physics)
+        if name not in WORLD_PADS.names:
+            raise InputError("physics", value=name, rule="has pads for presses only, none for worlds", choices=WORLD_PADS.names)
         self.coupling = coupling or self.scene.coupling
         self.num_envs, self.device, self.seed = num_envs, device, seed
         self._sensor_settings: dict[str, Any] = {
@@ -119,7 +117,7 @@ class TactileWorld:
             **(sensor_options or {}),
         }
         self._sensors: dict[str, TactileSensor] = {}
-        self.composed = compose(self.scene, self.physics)
+        self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
         self.model = self.composed.model
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.models = EnvironmentModels(self.composed, num_envs)
@@ -127,23 +125,12 @@ class TactileWorld:
         self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
         self._failed = np.zeros(num_envs, bool)
         self._start_over(range(num_envs))
-        self._pads = self._make_pads()
-        self._check_start()
-
-    def _make_pads(self) -> RigidPads | SoftPads:
-        if self.physics == "rigid":
-            return RigidPads(self.composed, self.models, self.num_envs)
-        check_solver("physics='ipc'")
-        from raytac.world.soft_pads import SoftPads
-
-        return SoftPads(
-            self.composed,
-            self.models,
-            self.data,
-            level=self.pad,
-            coupling=self.coupling,
-            device=resolve_device(self.device, ray_tracing=False),
+        if self.physics.is_simulated:
+            check_solver(f"physics={name!r}")
+        self._pads: WorldPads = WORLD_PADS.config_class(name)(
+            self.composed, self.models, self.data, physics=self.physics, coupling=self.coupling, device=device
         )
+        self._check_start()
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -156,7 +143,7 @@ class TactileWorld:
     @property
     def soft(self) -> SoftScene | None:
         """The contact solver's scene, with everything that it knows; None with the rigid pad."""
-        return None if isinstance(self._pads, RigidPads) else self._pads.soft
+        return self._pads.soft
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
@@ -199,7 +186,7 @@ class TactileWorld:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
             self._check_joints(joints, chosen)
         if variation is not None:
-            self.models.check(variation, len(chosen), rigid=self.physics == "rigid")
+            self.models.check(variation, len(chosen), rigid=not self.physics.is_simulated)
         if joints is None and not starts and variation is None and not self.models.differ(chosen):
             self._start_over(chosen)
             self._pads.reset(chosen, self.data)
@@ -334,12 +321,12 @@ class TactileWorld:
 
         Raises ``InputError`` for an unknown name, or a half-space, which is unbounded.
         """
-        if self.physics == "ipc" and name in self._pads.meshes:  # type: ignore[union-attr]
-            return self._pads.soft.mesh(name)  # type: ignore[union-attr]
+        if self._pads.soft is not None and name in self._pads.meshes:
+            return self._pads.soft.mesh(name)
         body = self.composed.bodies.get(name)
         if body is None or body.spec.kind == "plane":
             there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
-            there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
+            there += self._pads.meshes
             rule = "must be the name of a body or a soft pad, and no half-space"
             raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
         from raytac.shapes.triangulate import object_surface

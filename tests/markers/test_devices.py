@@ -46,9 +46,9 @@ def test_surface_markers_of_a_pad_simulated_on_cuda_equal_the_cpu() -> None:
     scene = PressScene("ball", target, (StageSpec("indent", depth=0.5e-3), StageSpec("shear", shear=(0.3e-3, 0.0))))
     moved = {}
     for device in ("cpu", "cuda"):
-        pad = SoftPad(sensor, scene, pitch=0.2e-3, pad="coarse", device=device)
+        pad = SoftPad(sensor, scene, pitch=0.2e-3, level="coarse", device=device)
         tracker = MarkerTracker(sensor, "surface", pad.grid)
-        frames = [tracker.update(pad.surface(state)) for state in pad.run(steps_per_stage=2)]
+        frames = [tracker.update(state.surface) for state in pad.run(steps_per_stage=2)]
         moved[device] = np.stack([frame.displacement[0] for frame in frames])
     length = np.linalg.norm(moved["cpu"], axis=-1)
     assert np.isfinite(moved["cuda"]).all() and length[-1].max() > 1e-4

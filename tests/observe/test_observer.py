@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -255,6 +253,6 @@ def test_what_a_sensor_or_frame_lacks_is_told() -> None:
     with pytest.raises(InputError, match="must have 2 environments"):
         TactileObserver(SENSOR, ObservationSettings(("wrench",)), num_envs=2).observe(frame())
     with pytest.raises(InputError, match="wrench"):
-        seen.observe(replace(frame(), wrench=None))
+        seen.observe(frame().with_values(wrench=None))
     with pytest.raises(InputError, match="exposure"):
         Randomization(exposure=1.5)

@@ -106,7 +106,7 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
     out, data = tmp_path / "out", tmp_path / "data"
     data.mkdir()
     data_set(data, count=6)
-    cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--pad", "coarse"], "'markers'")]
+    cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--level", "coarse"], "'markers'")]
     cases += [(["markers"], ["--model", "mlp"], "a data set"), (["markers"], ["--sides", "4,2,3"], "a data set")]
     for what, option, owner in cases:
         assert main(["calibrate", *what, *option, "--device", "cpu", "--out", str(out)]) == 2, option

@@ -63,7 +63,7 @@ def test_what_goes_through_the_gel_between_two_steps_fails_alone(shape: str, spe
             if not state.failed[0]:
                 assert state.world_from_body["body"][0, 2, 3] > -THICK
         frame = world.observe()["sensor"]
-        assert frame.failed is not None and frame.failed.tolist() == [True, False]
+        assert frame.failed.tolist() == [True, False]
         assert np.isnan(frame.surface.height[0]).all() and np.isfinite(frame.surface.height[1]).all()
         assert not world.reset().failed.any()
 
@@ -117,7 +117,7 @@ def test_gel_that_only_its_surface_shows_below_the_bonded_face_fails_its_environ
         mujoco.mj_forward(model, data)
     assert not world.failed.any()
     frame = world.observe()["sensor"]
-    assert frame.failed is not None and frame.failed.tolist() == [True, False] == world.failed.tolist()
+    assert frame.failed.tolist() == [True, False] == world.failed.tolist()
 
 
 def faces(count: int, rng: np.random.Generator) -> np.ndarray:

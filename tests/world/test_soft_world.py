@@ -49,7 +49,7 @@ def test_the_sensor_reads_the_simulated_pad(resting: TactileWorld) -> None:
     from raytac.gel.traction import cell_areas
 
     frame = resting.observe()["sensor"]
-    assert frame.traction is not None and frame.contact_cells is not None and frame.surface.coat is not None
+    assert frame.surface.coat is not None
     total = (frame.traction[0] * cell_areas(frame.surface.grid)[..., None]).sum(axis=(0, 1))
     np.testing.assert_allclose(total, resting.state().wrench["sensor"][0, :3], atol=2e-3)
     assert frame.surface.contact.any() and np.abs(frame.surface.contact_centre).max() < 1e-4
@@ -131,18 +131,16 @@ def test_an_environment_whose_last_step_did_not_converge_has_failed_and_earlier_
     state = world.step()  # the first of two steps
     frame = world.observe()["sensor"]
     assert len(calls) == 2 and not state.failed.any() and not state.report["converged"][0]
-    assert (
-        state.report["unconverged"].tolist() == [1, 0] and frame.unconverged is not None and frame.unconverged.tolist() == [1, 0]
-    )
+    assert state.report["unconverged"].tolist() == [1, 0] and frame.unconverged.tolist() == [1, 0]
     state = world.step()  # the last of two
     frame = world.observe(envs=[1, 0])["sensor"]
-    assert state.failed.tolist() == [True, False] and frame.failed is not None and frame.failed.tolist() == [False, True]
-    assert frame.unconverged is not None and frame.unconverged.tolist() == [0, 2] and np.isfinite(state.wrench["sensor"][1]).all()
+    assert state.failed.tolist() == [True, False] and frame.failed.tolist() == [False, True]
+    assert frame.unconverged.tolist() == [0, 2] and np.isfinite(state.wrench["sensor"][1]).all()
     state = world.step()
     assert state.failed.tolist() == [True, False] and state.report["newton"][0] == 0 < state.report["newton"][1]
     assert world.reset([0]).report["unconverged"].tolist() == [0, 0]
     state, frame = world.step(), world.observe()["sensor"]
-    assert not state.failed.any() and frame.unconverged is not None and frame.unconverged.tolist() == [0, 0]
+    assert not state.failed.any() and frame.unconverged.tolist() == [0, 0]
 
 
 def test_forces_that_are_not_finite_fail_their_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,22 +41,23 @@ def holds_force(scene: PressScene, stage: int) -> bool:
     return bool(indents) and indents[-1].force is not None
 
 
-def warn_if_narrow(cells: np.ndarray, pad: str, *, stacklevel: int) -> bool:
+def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool:
     """Warn of the narrowest of B contacts if it has fewer than ``LEAST_CELLS`` across; returns True if it has.
 
     Args:
         cells: from ``cells_across``, shape (B,).
-        pad: level of ``PADS``, or another word for a custom mesh.
+        level: level of ``PADS`` of the mesh, or something else for a custom mesh.
         stacklevel: as for ``warnings.warn``, seen from here.
     """
     least = float(np.nanmin(cells, initial=np.inf))
     if not least < LEAST_CELLS:
         return False
-    finer = PADS[PADS.index(pad) + 1 : PADS.index(pad) + 2] if pad in PADS else ()
-    remedy = f"choose pad={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as pad"
+    level = level if isinstance(level, str) else "own"
+    finer = PADS[PADS.index(level) + 1 : PADS.index(level) + 2] if level in PADS else ()
+    remedy = f"choose level={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as level"
     where = f" in environment {int(np.nanargmin(cells))}" if len(cells) > 1 else ""
     warnings.warn(
-        f"pad = {pad!r}: the contact{where} is {least:.1f} cells across; for a force or traction to be trusted it must be at least "
+        f"level = {level!r}: the contact{where} is {least:.1f} cells across; for a force or traction to be trusted it must be at least "
         f"{LEAST_CELLS:g}, three to its radius, and with fewer they are too large at a given depth: {remedy}, or press to a force",
         NarrowContactWarning,
         stacklevel=stacklevel + 1,

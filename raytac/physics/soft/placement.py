@@ -8,8 +8,9 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.physics.press import PressTargets, about_z
+from raytac.physics.press import PressTargets
 from raytac.physics.rigid.load_law import LoadLaw, first_touch_z, gap_at_touch
+from raytac.se3 import about_z
 from raytac.shapes.part import Part
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec

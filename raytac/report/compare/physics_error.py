@@ -12,6 +12,7 @@ import numpy as np
 from raytac.errors import RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
+from raytac.physics import Ipc, Rigid
 from raytac.report.image_error import mae, regions
 from raytac.report.tracers import Tracers
 from raytac.sensor import TactileSensor
@@ -67,12 +68,12 @@ def physics_errors(
     settings = {"outputs": ("height",), "resolution": size, "device": "cpu", "seed": tracers.seed}
     for scene in scenes:
         press, seconds = load_press(scene), []
-        for physics in ("rigid", "ipc"):
+        for physics in (Rigid(), Ipc(level=pad)):
             start = time.perf_counter()
-            sensor = TactileSensor(tracers.spec, physics=physics, pad=pad if physics == "ipc" else None, **settings)
+            sensor = TactileSensor(tracers.spec, physics=physics, **settings)
             frame = sensor.press(press, progress=True)
             seconds.append(time.perf_counter() - start)
-        if frame.failed is not None and frame.failed[0]:
+        if frame.failed[0]:
             raise RaytacError(f"the press {press.name!r} did not settle on the {pad} pad")
         rigid, soft = surfaces[press.name], frame.surface
         touched = rigid.contact[0] | soft.contact[0]
