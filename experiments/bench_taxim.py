@@ -27,6 +27,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, RaytacError
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.optics import Phong, RayTraced, Taxim
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -53,11 +54,10 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-    from raytac.optics import PhongMode, TaximMode
 
     if family == "phong":
-        return PhongMode(spec, resolution=size, device=device)
-    return TaximMode(spec, calibration=table, shadows=family == "taxim_shadow", resolution=size, device=device)
+        return Phong().build(spec, resolution=size, device=device)
+    return Taxim(calibration=table, shadows=family == "taxim_shadow").build(spec, resolution=size, device=device)
 
 
 def speed(
@@ -131,9 +131,8 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-    from raytac.optics import RayTracer
 
-    tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
+    tracer = RayTraced().build(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
+from raytac.optics import OPTICS
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
 from tests.conftest import Shader, make_surface
@@ -179,15 +179,8 @@ def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
     assert TactileSensor(sensor_spec, outputs=tuple(reversed(OUTPUTS))).outputs == OUTPUTS
 
 
-def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> None:
-    settings: tuple[dict[str, Any], ...] = ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadows": True}})
-    for setting in settings:
-        with pytest.raises(InputError, match="it has its own"):
-            TactileSensor(sensor_spec, optics=Shader(sensor_spec), **setting)
-
-
 @pytest.mark.parametrize(("optics", "known"), [("raytrace", "denoise"), ("taxim", "calibration"), ("phong", "lights")])
-def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(sensor_spec: SensorSpec, optics: str, known: str) -> None:
+def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(optics: str, known: str) -> None:
     for name in ("calibratoin", "resolution"):
-        with pytest.raises(InputError, match=f"optics_options.*{name}.*choose from: .*{known}"):
-            _ = TactileSensor(sensor_spec, optics=optics, device="cpu", optics_options={name: 1}).optical_mode
+        with pytest.raises(InputError, match=f"{name} = 1: is no option of optics='{optics}'.*choose from: .*{known}"):
+            OPTICS.config(optics, **{name: 1})

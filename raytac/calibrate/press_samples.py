@@ -9,7 +9,7 @@ import numpy as np
 from raytac.calibrate.imprint import KNOTS, press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.gel.surface import make_grid
-from raytac.optics.image.phong import PhongMode
+from raytac.optics.configs import Phong
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MOVED", "PressSamples", "press_samples"]
@@ -46,7 +46,7 @@ def press_samples(
     """Samples within ``reach`` radii of the ``circles`` (N, 3) [px] of ``shots``, whose imprints have the ``slopes`` of ``imprint``."""
     height, width = shots.background.shape[:2]
     background = np.zeros((height, width, 3), np.uint8)  # the front step needs none
-    front = PhongMode(sensor, background=background, resolution=(width, height), device=device)
+    front = Phong(background=background).build(sensor, resolution=(width, height), device=device)
     grid = make_grid(sensor.gelpad, GRID_PITCH)
     aspect = front.pitch[0] / front.pitch[1]
     distance = Photographs(shots.background, shots.presses, circles, shots.radius).distance(sensor)

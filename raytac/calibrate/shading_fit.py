@@ -8,16 +8,15 @@ sensor's own file, so that the sensor looks right without the photograph.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics.configs import RayTraced
 from raytac.optics.response import fit_log_gain
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 
 __all__ = ["DEGREE", "with_shading"]
@@ -36,12 +35,12 @@ def with_shading(
     *,
     degree: int = DEGREE,
     device: str = "auto",
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> SensorSpec:
     """The sensor with the colour shading that brings its image at rest to ``background`` (H, W, 3) [levels], seen by all of its camera.
 
-    Least squares of the logarithm of the quotient, weighted so that residuals are levels of the image to first order. ``options`` of the
-    ray tracer.
+    Least squares of the logarithm of the quotient, weighted so that residuals are levels of the image to first order. ``tracing``:
+    how rays are traced.
 
     Raises:
         InputError: more than half of a channel of ``background`` is not brighter than the sensor's black level, or no light reaches a
@@ -51,7 +50,7 @@ def with_shading(
     height, width = background.shape[:2]
     bare = sensor.response.unshaded
     plain = dataclasses.replace(sensor, response=bare)
-    tracer = RayTracer(plain, resolution=(width, height), outputs=("layers",), device=device, **(options or {}))
+    tracer = (tracing or RayTraced()).build(plain, resolution=(width, height), outputs=("layers",), device=device)
     rest = total(tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, GRID_PITCH))))[0] * tracer.response.scale
     if not (rest > 0).all():
         rule = "leave this many values of the image at rest dark, and no gain makes these bright"

@@ -9,10 +9,7 @@ import tyro
 
 from raytac.errors import InputError
 
-__all__ = ["CASTING", "ShadowOptions"]
-
-CASTING = ("raytrace", "taxim")
-"""Optical modes that can cast shadows."""
+__all__ = ["ShadowOptions"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,17 +19,12 @@ class ShadowOptions:
     no_shadows: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Cast none; as the sensor file says ([optics] shadows) if neither is given."""
 
-    def chosen_shadows(self, optics: str = CASTING[0]) -> dict[str, bool]:
+    def chosen_shadows(self) -> dict[str, bool]:
         """``{"shadows": …}`` for the optical mode; empty if the sensor decides.
 
         Raises:
-            InputError: both flags, or one for a mode that casts no shadows.
+            InputError: both flags.
         """
-        if not (self.shadows or self.no_shadows):
-            return {}
         if self.shadows and self.no_shadows:
             raise InputError("shadows, no_shadows", value=(True, True), rule="contradict each other: give one")
-        if optics not in CASTING:
-            name = "shadows" if self.shadows else "no_shadows"
-            raise InputError(name, value=True, rule=f"is for optics that cast shadows, not for {optics!r}", choices=CASTING)
-        return {"shadows": self.shadows}
+        return {"shadows": self.shadows} if self.shadows or self.no_shadows else {}

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from raytac.checks import check_known, check_whole
+from raytac.checks import check_whole
 from raytac.cli.shadow_options import ShadowOptions
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKER_MODELS
+from raytac.optics import OPTICS
 from raytac.physics.soft.availability import check_solver, hush_solver
-from raytac.sensor import OPTICS, TactileSensor
+from raytac.sensor import TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs import PADS, PHYSICS, PressScene, TaskScene, load_scene
 from raytac.specs.press import chosen_physics
@@ -48,7 +49,7 @@ class ViewArgs(ShadowOptions):
     rigid."""
     pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
+    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
     """How the sensor's markers move; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
@@ -78,7 +79,7 @@ class ViewArgs(ShadowOptions):
         check_viewer()
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
-        check_known("optics", self.optics, OPTICS)
+        OPTICS.config(self.optics, **self.chosen_shadows())
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.pad, scene.physics)
         if physics == "ipc":
@@ -113,7 +114,6 @@ class ViewArgs(ShadowOptions):
             pad=pad,
             outputs=_OUTPUTS,
             seed=self.seed,
-            optics_options=self.chosen_shadows(self.optics),
             **self._settings(spec),
         )
         return PressSession(sensor, scene)
@@ -133,14 +133,13 @@ class ViewArgs(ShadowOptions):
             coupling=self.coupling,
             outputs=_OUTPUTS,
             seed=self.seed,
-            sensor_options={"optics_options": self.chosen_shadows(self.optics)},
             **self._settings(sensor_spec(scene.robot.sensor)),
         )
         return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
 
     def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
         return {
-            "optics": self.optics,
+            "optics": OPTICS.config(self.optics, **self.chosen_shadows()),
             "markers": self.markers,
             "resolution": _fitting(sensor.camera.resolution) if self.resolution is None else parse_resolution(self.resolution),
             "device": self.device,

@@ -97,7 +97,6 @@ class TactileObserver:
             "markers": settings.marker_model if settings.needs_markers else None,
             "marker_perturbation": replace(disturbed) if settings.needs_markers else None,
             "optics": settings.optics,
-            "optics_options": dict(settings.optics_options),
             "resolution": self.layout.rendered,
             "num_envs": self.num_envs,
             "seed": self.seed,
@@ -106,8 +105,7 @@ class TactileObserver:
     def world_options(self) -> dict[str, Any]:
         """The same as keyword arguments of a ``TactileWorld``; the sensor's specification is the task scene's."""
         options = self.sensor_options()
-        further = {key: options.pop(key) for key in ("marker_perturbation", "optics_options")}
-        return {**options, "sensor_options": further}
+        return {**options, "sensor_options": {"marker_perturbation": options.pop("marker_perturbation")}}
 
     def make_sensor(self, **options: Any) -> TactileSensor:
         """A sensor that gives what is observed; ``options`` of ``TactileSensor`` go before those of the settings."""

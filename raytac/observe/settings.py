@@ -11,7 +11,9 @@ from raytac.checks import check_known, check_mapping, check_names, check_truth, 
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
 from raytac.markers import MARKER_MODELS
-from raytac.sensor.options import LARGEST_SIDE, OPTICS, checked_resolution
+from raytac.optics.base import OpticsConfig
+from raytac.optics.registry import chosen_optics
+from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
@@ -61,12 +63,10 @@ class ObservationSettings:
     """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a share in both cases."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
-    optics: str = "taxim"
-    """As of ``TactileSensor``."""
+    optics: str | OpticsConfig[Any] = "taxim"
+    """As of ``TactileSensor``: a name, or a configuration."""
     marker_model: str = "fots"
     """As ``markers`` of ``TactileSensor``."""
-    optics_options: Mapping[str, Any] = field(default_factory=dict)
-    """As of ``TactileSensor``."""
 
     def __post_init__(self) -> None:
         given = check_names("modalities", self.modalities, MODALITIES)
@@ -89,10 +89,9 @@ class ObservationSettings:
                 raise InputError("crop", value=sides, rule=rule)
         for name in ("difference", "normalise"):
             check_truth(name, getattr(self, name))
-        check_known("optics", self.optics, OPTICS)
+        chosen_optics(self.optics)
         check_known("marker_model", self.marker_model, MARKER_MODELS)
-        for name in ("scales", "optics_options"):
-            check_mapping(name, getattr(self, name))
+        check_mapping("scales", self.scales)
         if self.difference and "rgb" not in self.modalities:
             raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
         for name, scale in self.scales.items():

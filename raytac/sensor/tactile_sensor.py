@@ -18,13 +18,12 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
 from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
 from raytac.markers.pattern import MarkerPattern
-from raytac.optics.base import OPTICAL_OUTPUTS
-from raytac.optics.registry import Imaging
+from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics
+from raytac.optics.registry import chosen_optics
 from raytac.physics.base import PadReading
 from raytac.physics.soft.contact_width import holds_force, warn_if_narrow
 from raytac.sensor.options import (
     check_markers,
-    check_optics,
     check_physics,
     checked_outputs,
     checked_resolution,
@@ -37,7 +36,7 @@ from raytac.specs import PressScene, SensorSpec, validate_press
 from raytac.specs.press import PADS, chosen_physics
 
 if TYPE_CHECKING:
-    from raytac.optics.base import OpticalMode
+    from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.physics.base import ContactState
     from raytac.physics.rigid.pad import RigidPad
     from raytac.physics.soft.mesh import PadMesh
@@ -65,6 +64,8 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    optics: OpticsConfig[Any]
+    """How images are made."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     physics: str
@@ -76,18 +77,15 @@ class TactileSensor:
         *,
         physics: str | None = None,
         pad: str | PadMesh | None = None,
-        optics: str | OpticalMode = "raytrace",
+        optics: str | OpticsConfig[Any] | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
-        integrator: str = "fast",
-        spp: int | None = None,
         device: str = "auto",
         seed: int = 0,
         num_envs: int = 1,
         pitch: float | None = None,
         markers: str | None = None,
         marker_perturbation: MarkerPerturbation | None = None,
-        optics_options: dict[str, Any] | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
 
@@ -96,13 +94,11 @@ class TactileSensor:
             physics: how the gel deforms, one of ``PHYSICS``: ``rigid`` (by geometry and Gaussians) or ``ipc`` (simulated); None is as the
                 scene asks, else ``rigid``.
             pad: how finely a simulated pad is cut, one of ``PADS``, or a mesh of one's own; None is as the scene asks, else ``coarse``.
-            optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
-                outputs and device).
+            optics: how images are made: a name of ``raytac.optics.OPTICS``, a configuration such as ``Taxim(shadows=False)``, or an
+                optical mode that is built already (it keeps its own resolution, outputs and device).
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
             resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own. The field of view stays
                 the sensor's: another shape squeezes it, with a warning.
-            integrator: of the ray tracer, one of ``INTEGRATORS``.
-            spp: of the ray tracer; ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
@@ -110,8 +106,6 @@ class TactileSensor:
             markers: how the sensor's markers move, one of ``MARKER_MODELS``; frames then hold them, and images show the dots. None leaves
                 them out, and images show a plain coat.
             marker_perturbation: noise, losses and shifts of the markers; None is none.
-            optics_options: further keyword arguments of the optical mode, such as ``calibration`` of ``taxim``, or ``shadows``, which the
-                sensor else decides; their values are checked when it is built.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -122,16 +116,14 @@ class TactileSensor:
         self._settings: dict[str, Any] = settings
         """Arguments that make this sensor again."""
         check_physics(physics, pad)
-        check_optics(optics, integrator, spp, optics_options)
+        self.optics = chosen_optics(optics)
         resolve_device(device)
-        self.outputs = checked_outputs(outputs, optics)
+        self.outputs = checked_outputs(outputs, self.optics)
         check_markers(markers, marker_perturbation, physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
-        check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
         self.seed = check_seed("seed", seed)
         self.spec = sensor_spec(sensor)
-        self.integrator, self.spp = integrator, spp
         self._asked_physics, self._asked_pad = physics, pad
         self.physics = chosen_physics(physics, pad)
         self.resolution = size if size is not None else self.spec.camera.resolution
@@ -146,17 +138,8 @@ class TactileSensor:
         if markers is not None:
             MarkerPattern.of(self.spec, self.resolution)  # a pattern that cannot be seen is told now
         self._tracker: MarkerTracker | None = None
-        self._imaging = Imaging(
-            self.spec,
-            optics,
-            options=optics_options or {},
-            resolution=self.resolution,
-            outputs=self._optical_outputs,
-            device=device,
-            integrator=integrator,
-            spp=spp,
-            seed=self.seed,
-        )
+        self.optics.check(self.spec)
+        self._mode: OpticalMode | None = None
         self._pad: RigidPad | SoftPad | None = None
         self._is_narrow = False
         """Whether this press was warned of already."""
@@ -167,7 +150,7 @@ class TactileSensor:
         Raises:
             InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
         """
-        if not isinstance(self._settings["optics"], str):
+        if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
             raise InputError("optics", value=self._settings["optics"], rule=rule)
         if self._tracker is not None:
@@ -179,10 +162,10 @@ class TactileSensor:
     def label(self) -> str:
         """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
 
-        The optical mode names itself once it is built, which options such as a denoiser change.
+        The optical mode names itself once it is built: a table casts shadows only if it has some.
         """
         physics = "ipc-" + self.pad if self.physics == "ipc" else self.physics
-        return f"{physics}+{self._imaging.label}" if self._optical_outputs else physics
+        return f"{physics}+{(self._mode or self.optics).label}" if self._optical_outputs else physics
 
     @property
     def pad(self) -> str:
@@ -194,7 +177,7 @@ class TactileSensor:
     @property
     def sampling(self) -> dict[str, int | float | str]:
         """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports; empty without images or rays."""
-        return self._imaging.sampling if self._optical_outputs else {}
+        return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
@@ -439,7 +422,11 @@ class TactileSensor:
         """The renderer, built on first use.
 
         Raises:
-            InputError: an unknown name or a bad value in ``optics_options``.
-            BackendError: the renderer or the device does not work here.
+            RaytacError: as ``OpticsConfig.build``.
         """
-        return self._imaging.mode
+        mode = self._mode
+        if mode is None:
+            mode = self._mode = self.optics.build(
+                self.spec, resolution=self.resolution, outputs=self._optical_outputs, device=self.device, seed=self.seed
+            )
+        return mode

@@ -34,6 +34,7 @@ from raytac.world.state import BatchController, Control, Drive, WorldState
 from raytac.world.variation import EnvironmentModels, Variation
 
 if TYPE_CHECKING:
+    from raytac.optics.base import OpticsConfig
     from raytac.physics.soft.scene import SoftScene
     from raytac.world.soft_pads import SoftPads
 
@@ -74,7 +75,7 @@ class TactileWorld:
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
         markers: str | None = None,
-        optics: str = "raytrace",
+        optics: str | OpticsConfig[Any] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
         device: str = "auto",
@@ -91,7 +92,7 @@ class TactileWorld:
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
             seed: of every random number.
-            sensor_options: further keyword arguments of ``TactileSensor``, such as ``integrator``.
+            sensor_options: further keyword arguments of ``TactileSensor``, such as ``pitch``.
 
         Raises:
             InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses.

@@ -18,12 +18,11 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.fots import FotsMarkers
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
+from raytac.optics import Mlp, Phong, RayTraced, Taxim
 from raytac.optics.device_image import DeviceImage, ImageCut
 from raytac.optics.image.base import ImageMode
-from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.phong import PhongMode
 from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import PunchSpec
 from raytac.specs.sensor import LightsSpec, SensorSpec
 from tests.markers.pads import MOTION, coat_mesh, flat_sensor, pad_grid, pose, pressed, with_coat
@@ -50,18 +49,18 @@ def table_mode(
     assert table.shadow is not None
     table = replace(table, shadow=replace(table.shadow, depth_of=depth_of))
     table = replace(table, surround=-0.5 * table.gradients) if sheets == 2 else table
-    return TaximMode(SPEC, calibration=table, shadows=shadow, resolution=RESOLUTION, device=device)
+    return Taxim(calibration=table, shadows=shadow).build(SPEC, resolution=RESOLUTION, device=device)
 
 
 def phong(device: str) -> PhongMode:
-    return PhongMode(SPEC, background=np.full((*RESOLUTION[::-1], 3), 120, np.uint8), resolution=RESOLUTION, device=device)
+    return Phong(background=np.full((*RESOLUTION[::-1], 3), 120, np.uint8)).build(SPEC, resolution=RESOLUTION, device=device)
 
 
 UPSTREAM = {"slopes_of": "height", "depth_of": "origin", "sheets": 1}
 MODES: dict[str, Callable[[str], Any]] = {
-    "fast": lambda device: RayTracer(ONE_LED, resolution=RESOLUTION, device=device),
-    "fast-direct": lambda device: RayTracer(
-        ONE_LED, resolution=RESOLUTION, device=device, bounce=False, outputs=("rgb", "layers", "normals", "depth")
+    "fast": lambda device: RayTraced().build(ONE_LED, resolution=RESOLUTION, device=device),
+    "fast-direct": lambda device: RayTraced(bounce=False).build(
+        ONE_LED, resolution=RESOLUTION, device=device, outputs=("rgb", "layers", "normals", "depth")
     ),
     "taxim": lambda device: table_mode(device, shadow=False),
     "taxim-upstream": lambda device: table_mode(device, shadow=False, **UPSTREAM),
@@ -69,7 +68,7 @@ MODES: dict[str, Callable[[str], Any]] = {
     "shadow-upstream": lambda device: table_mode(device, shadow=True, **UPSTREAM),
     "shadow-origin": lambda device: table_mode(device, shadow=True, depth_of="origin"),
     "phong": phong,
-    "mlp": lambda device: MlpMode(SPEC, calibration=network(), resolution=RESOLUTION, device=device),
+    "mlp": lambda device: Mlp(weights=network()).build(SPEC, resolution=RESOLUTION, device=device),
 }
 EACH_MODE = pytest.mark.parametrize("mode", MODES)
 

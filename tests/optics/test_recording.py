@@ -13,7 +13,6 @@ from raytac.optics.runtime import no_collection
 CHILD = """
 import gc
 import numpy as np
-from raytac.optics.trace.fast_tracer import RayTracer
 from tests.optics.scenes import RESOLUTION, at_rest, grid_of, like_a_mini
 
 spec = like_a_mini()
