@@ -103,7 +103,7 @@ class DeviceMode(ABC):
 
     def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
         """Fields of ``DeviceFrame``, from heights (B·Ny·Nx) [m]."""
-        raise InputError("optics", value=self.label, rule="has noise, and does not stay on the device; take a mode that has none")
+        raise NotImplementedError
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment's image takes [byte], before Dr.Jit's rounding."""

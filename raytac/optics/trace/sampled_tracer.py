@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from raytac.checks import check_seed, check_whole
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.base import OpticsImages, casts_shadows
 from raytac.optics.configs import RayTraced
+from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.ink import checked_ink
 from raytac.optics.trace.denoise import make_denoiser
 from raytac.optics.trace.fast_tracer import FastTracer, with_exposure
@@ -52,6 +54,15 @@ class SampledTracer(Tracer):
         if "rgb" in self.outputs:
             images["rgb"] = self.response.encode_numpy(total(layers))
         return self._images(surface, heights, failed, images)
+
+    def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> NoReturn:
+        """Refuse: what is summed up over samples is an image on the host.
+
+        Raises:
+            InputError: always.
+        """
+        rule = "must be taxim, phong or raytrace with the integrator fast to stay on the device"
+        raise InputError("optics", value=self.label, rule=rule)
 
     def _build(self, grid: PadGrid) -> None:
         # Only what the outputs need: normals and depth take camera rays on the height field alone.
