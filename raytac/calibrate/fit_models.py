@@ -23,7 +23,9 @@ from raytac.device import DEVICES
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.optics.base import OpticalMode
-from raytac.optics.configs import Mlp, Phong, RayTraced, Taxim
+from raytac.optics.image.config import Mlp, Phong
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
 from raytac.specs import SensorSpec
 

@@ -9,7 +9,7 @@ import numpy as np
 from raytac.calibrate.imprint import KNOTS, press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.gel.surface import make_grid
-from raytac.optics.configs import Phong
+from raytac.optics.image.config import Phong
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MOVED", "PressSamples", "press_samples"]

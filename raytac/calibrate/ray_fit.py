@@ -22,7 +22,7 @@ from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.optics.base import casts_shadows
-from raytac.optics.configs import RayTraced
+from raytac.optics.trace.config import RayTraced
 from raytac.specs import SensorSpec
 
 __all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]

@@ -14,8 +14,8 @@ import numpy as np
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.optics.configs import RayTraced
 from raytac.optics.response import fit_log_gain
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 

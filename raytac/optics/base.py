@@ -8,10 +8,20 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["OPTICAL_OUTPUTS", "BuiltOptics", "OpticalMode", "OpticsConfig", "OpticsImages", "Variant", "casts_shadows"]
+__all__ = [
+    "OPTICAL_OUTPUTS",
+    "BuiltOptics",
+    "OpticalMode",
+    "OpticsConfig",
+    "OpticsImages",
+    "Variant",
+    "casts_shadows",
+    "check_shadows",
+]
 
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""
@@ -168,3 +178,9 @@ class BuiltOptics(OpticsConfig[OpticalMode]):
 def casts_shadows(sensor: SensorSpec, shadows: bool | None) -> bool:
     """``shadows``; if None, as the sensor says."""
     return sensor.optics.shadows if shadows is None else shadows
+
+
+def check_shadows(shadows: bool | None) -> None:
+    """Raise InputError unless ``shadows`` is True, False or None."""
+    if shadows is not None and not isinstance(shadows, bool):
+        raise InputError("shadows", value=shadows, rule="must be True, False or None", choices=(True, False, None))

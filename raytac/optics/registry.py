@@ -13,10 +13,10 @@ __all__ = ["OPTICS", "chosen_optics", "register"]
 OPTICS: Registry[OpticsConfig[Any]] = Registry(
     "optics",
     {
-        "raytrace": "raytac.optics.configs:RayTraced",
-        "taxim": "raytac.optics.configs:Taxim",
-        "phong": "raytac.optics.configs:Phong",
-        "mlp": "raytac.optics.configs:Mlp",
+        "raytrace": "raytac.optics.trace.config:RayTraced",
+        "taxim": "raytac.optics.taxim.config:Taxim",
+        "phong": "raytac.optics.image.config:Phong",
+        "mlp": "raytac.optics.image.config:Mlp",
     },
 )
 register = OPTICS.register

@@ -23,7 +23,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.optics.configs import RayTraced
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 

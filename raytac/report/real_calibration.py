@@ -19,11 +19,11 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.optics.configs import RayTraced
 from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.mlp_weights import save_mlp
 from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
 from raytac.report.real import press_scores, summary
 from raytac.specs import SensorSpec

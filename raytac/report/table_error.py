@@ -10,7 +10,8 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
-from raytac.optics.configs import RayTraced, Taxim
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import contact_box, mae, psnr, rmse
 from raytac.specs.sensor import SensorSpec
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.gel.surface import GelSurface
-from raytac.optics.configs import RayTraced
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import regions
 from raytac.specs.sensor import SensorSpec
 

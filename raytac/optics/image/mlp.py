@@ -10,9 +10,9 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.optics.configs import Mlp
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.image.config import Mlp
 from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
 from raytac.optics.taxim.mode import resized
 from raytac.specs.sensor import SensorSpec

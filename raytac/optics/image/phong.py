@@ -20,9 +20,10 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.configs import Phong, RayTraced
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.image.config import Phong
+from raytac.optics.trace.config import RayTraced
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["PhongMode"]

@@ -16,12 +16,13 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.optics.base import casts_shadows
-from raytac.optics.configs import RayTraced, Taxim
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.response import SATURATED, saturated_share
+from raytac.optics.taxim.config import Taxim
 from raytac.optics.taxim.shadow import ShadowArrays, ShadowCaster
 from raytac.optics.taxim.table import PolyTable
+from raytac.optics.trace.config import RayTraced
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["TableArrays", "TableShader", "TaximMode"]

@@ -10,11 +10,11 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
 from raytac.optics.base import casts_shadows
-from raytac.optics.configs import RayTraced
 from raytac.optics.device_mode import Float, FrameInputs, UInt8
 from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, see
 from raytac.optics.ink import ink_at, inked_albedo
 from raytac.optics.response import mid_grey_exposure
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.direct import direct_light
 from raytac.optics.trace.interreflection import BounceField, CaseLight
 from raytac.optics.trace.led import Lamp

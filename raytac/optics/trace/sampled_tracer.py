@@ -11,9 +11,9 @@ from raytac.checks import check_seed, check_whole
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.base import OpticsImages, casts_shadows
-from raytac.optics.configs import RayTraced
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.ink import checked_ink
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.denoise import make_denoiser
 from raytac.optics.trace.fast_tracer import FastTracer, with_exposure
 from raytac.optics.trace.reference import ReferenceIntegrator, StockPathIntegrator

@@ -11,10 +11,10 @@ import numpy as np
 from raytac.checks import check_seed, is_number
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.configs import RayTraced
 from raytac.optics.device_mode import DeviceMode
 from raytac.optics.ink import checked_ink
 from raytac.optics.response import SATURATED, Response, mid_grey_exposure, saturated_share
+from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.scene import UNIT
 from raytac.specs.sensor import AUTO, SensorSpec

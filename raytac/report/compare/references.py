@@ -15,7 +15,7 @@ from raytac.io.arrays import npz_bytes
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import versions
 from raytac.io.seal import read_sealed, write_sealed
-from raytac.optics.configs import RayTraced
+from raytac.optics.trace.config import RayTraced
 from raytac.report.tracers import Tracers, path_trace
 
 __all__ = ["References"]

@@ -10,8 +10,8 @@ import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
-from raytac.optics.configs import RayTraced
 from raytac.optics.image.base import see_heights
+from raytac.optics.trace.config import RayTraced
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Calibration", "Views"]
