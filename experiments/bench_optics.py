@@ -29,6 +29,7 @@ from tqdm import tqdm
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.optics import RayTraced
 from raytac.report import (
     References,
     Tracers,
@@ -124,7 +125,7 @@ class Bench:
 
     def tracer(self, size: tuple[int, int] | None = None, **options: Any) -> Any:
         """Ray tracer of this size and device, as ``Tracers.get`` says."""
-        return self.tracers.get(size or self.size, **options)
+        return self.tracers.get(size or self.size, RayTraced(**options))
 
 
 # ------------------------------------------------------------------------------------------------------------ building blocks
@@ -170,7 +171,7 @@ def speed(bench: Bench) -> dict[str, Metric]:
             inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
 
             def on_device(heights: Any, tracer: Any = tracer) -> None:
-                dr.eval(tracer.render_device(heights)["rgb"])
+                dr.eval(tracer.render_device(heights).rgb)
                 dr.sync_thread()
 
             host = timed(tracer.render, inputs, bench.frames)

@@ -54,7 +54,6 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-
     if family == "phong":
         return Phong().build(spec, resolution=size, device=device)
     return Taxim(calibration=table, shadows=family == "taxim_shadow").build(spec, resolution=size, device=device)
@@ -105,7 +104,8 @@ def device_call(mode: Any) -> Callable[[Any], None]:
     import drjit as dr
 
     def call(arrays: tuple[Any, Any]) -> None:
-        dr.eval(mode.render_device(*arrays))
+        frame = mode.render_device(*arrays)
+        dr.eval(frame.rgb, frame.flags)
         dr.sync_thread()
 
     return call
@@ -131,7 +131,6 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-
     tracer = RayTraced().build(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
