@@ -92,10 +92,8 @@ class OpticsConfig(Generic[Mode]):
 
     @property
     def label(self) -> str:
-        """Name for headers and reports before the mode is built."""
-        from raytac.optics.registry import OPTICS
-
-        return OPTICS.name_of(self)
+        """Name for headers and reports before the mode is built: that of the class in lower case, unless it says otherwise."""
+        return type(self).__name__.lower()
 
     def build(
         self,

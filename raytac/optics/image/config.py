@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,9 +14,7 @@ from raytac.optics.base import OpticsConfig, Variant
 from raytac.specs.sensor import Vec3
 
 if TYPE_CHECKING:
-    from raytac.optics.image.mlp import MlpMode
     from raytac.optics.image.mlp_weights import MlpWeights
-    from raytac.optics.image.phong import PhongMode
 
 __all__ = ["PHONG_LIGHTS", "Mlp", "Phong", "PhongLight"]
 
@@ -53,7 +52,7 @@ PHONG_LIGHTS: dict[str, tuple[PhongLight, ...]] = {
 
 
 @dataclass(frozen=True)
-class Phong(OpticsConfig["PhongMode"]):
+class Phong(OpticsConfig[Any]):
     """Phong shading of the height image, the baseline of papers on tactile images."""
 
     lights: str | tuple[PhongLight, ...] = "gelsight2017"
@@ -78,10 +77,8 @@ class Phong(OpticsConfig["PhongMode"]):
         """The lights themselves."""
         return PHONG_LIGHTS[self.lights] if isinstance(self.lights, str) else tuple(self.lights)
 
-    def maker(self) -> type[PhongMode]:
-        from raytac.optics.image.phong import PhongMode
-
-        return PhongMode
+    def maker(self) -> Any:
+        return import_module("raytac.optics.image.phong").PhongMode
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:
@@ -90,7 +87,7 @@ class Phong(OpticsConfig["PhongMode"]):
 
 
 @dataclass(frozen=True)
-class Mlp(OpticsConfig["MlpMode"]):
+class Mlp(OpticsConfig[Any]):
     """A small network from slope and place to colour, fitted to presses of a real sensor; there is none by default."""
 
     weights: str | Path | MlpWeights | None = None
@@ -101,10 +98,8 @@ class Mlp(OpticsConfig["MlpMode"]):
             rule = "must name a network, as `raytac calibrate DATASET --model mlp` writes it: optics=Mlp(weights=…)"
             raise InputError("weights", value=None, rule=rule)
 
-    def maker(self) -> type[MlpMode]:
-        from raytac.optics.image.mlp import MlpMode
-
-        return MlpMode
+    def maker(self) -> Any:
+        return import_module("raytac.optics.image.mlp").MlpMode
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:

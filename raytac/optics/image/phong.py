@@ -24,6 +24,7 @@ from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.image.config import Phong
 from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["PhongMode"]
@@ -69,7 +70,7 @@ class PhongMode(ImageMode):
     def _build(self, grid: PadGrid) -> PhongArrays:
         image = self._background
         if image is None:
-            tracer = RayTraced().build(self.sensor, resolution=self.camera.resolution, device=self.device)
+            tracer = ray_tracer(self.sensor, RayTraced(), resolution=self.camera.resolution, device=self.device)
             image = tracer.render(GelSurface.at_rest(grid)).rgb
             assert image is not None
         dimmed = AMBIENT * image.reshape(-1, 3).astype(np.float32)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from raytac.errors import InputError
 from raytac.optics.base import OpticsConfig, Variant, check_shadows
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.image.base import ImageMode
     from raytac.optics.taxim.table import PolyTable
 
 __all__ = ["Taxim"]
 
 
 @dataclass(frozen=True)
-class Taxim(OpticsConfig["ImageMode"]):
+class Taxim(OpticsConfig[Any]):
     """A Taxim table: colour by a polynomial for each slope, shadows from a table; baked from the ray tracer unless one is given."""
 
     calibration: str | Path | PolyTable | None = None
@@ -45,10 +45,8 @@ class Taxim(OpticsConfig["ImageMode"]):
 
             baked_table(spec, device=device)
 
-    def maker(self) -> type[ImageMode]:
-        from raytac.optics.taxim.mode import TaximMode
-
-        return TaximMode
+    def maker(self) -> Any:
+        return import_module("raytac.optics.taxim.mode").TaximMode
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:

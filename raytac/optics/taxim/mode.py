@@ -23,6 +23,7 @@ from raytac.optics.taxim.config import Taxim
 from raytac.optics.taxim.shadow import ShadowArrays, ShadowCaster
 from raytac.optics.taxim.table import PolyTable
 from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["TableArrays", "TableShader", "TaximMode"]
@@ -151,7 +152,7 @@ class TaximMode(ImageMode):
 
     def _build(self, grid: PadGrid) -> TableArrays:
         if self._is_own and saturated_share(self.table.background.round().clip(0, 255)) > SATURATED:
-            RayTraced().build(self.sensor, device=self.device).prepare(grid)  # which warns of it
+            ray_tracer(self.sensor, RayTraced(), device=self.device).prepare(grid)  # which warns of it
         return self._shader.inputs
 
     def _levels(self, seen: ImageHeights, arrays: TableArrays) -> tuple[list[Float], UInt8]:

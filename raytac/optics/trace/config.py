@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from importlib import import_module
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from raytac.checks import check_known, check_truth, check_whole, is_whole
 from raytac.errors import InputError
 from raytac.optics.base import OPTICAL_OUTPUTS, OpticsConfig, Variant, check_shadows
-
-if TYPE_CHECKING:
-    from raytac.optics.trace.tracer import Tracer
 
 __all__ = ["INTEGRATORS", "RayTraced"]
 
@@ -23,7 +20,7 @@ INTEGRATORS = ("fast", "reference", "path")
 
 
 @dataclass(frozen=True)
-class RayTraced(OpticsConfig["Tracer"]):
+class RayTraced(OpticsConfig[Any]):
     """Ray tracing with Mitsuba 3 and Dr.Jit: the deterministic ``fast``, or path tracing."""
 
     integrator: Literal["fast", "reference", "path"] = "fast"
@@ -84,10 +81,8 @@ class RayTraced(OpticsConfig["Tracer"]):
     def label(self) -> str:
         return f"raytrace-{self.integrator}" + ("-denoised" if self.denoise else "")
 
-    def maker(self) -> Callable[..., Tracer]:
-        from raytac.optics.trace.sampled_tracer import ray_tracer
-
-        return ray_tracer
+    def maker(self) -> Any:
+        return import_module("raytac.optics.trace.sampled_tracer").ray_tracer
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:

@@ -103,7 +103,9 @@ class SampledTracer(Tracer):
         return self.response.encode_numpy(self._rest_light(rest))
 
 
-def ray_tracer(sensor: SensorSpec, config: RayTraced, *, outputs: tuple[str, ...], device: str, **settings: Any) -> Tracer:
+def ray_tracer(
+    sensor: SensorSpec, config: RayTraced, *, outputs: tuple[str, ...] = ("rgb",), device: str = "auto", **settings: Any
+) -> Tracer:
     """The tracer of a configuration, for a sensor whose exposure is ``AUTO`` with the number that it stands for."""
     if config.sampled and not casts_shadows(sensor, config.shadows):
         name = config.integrator

@@ -12,6 +12,7 @@ import numpy as np
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
 from raytac.optics.image.base import see_heights
 from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Calibration", "Views"]
@@ -48,11 +49,14 @@ class Calibration:
     ) -> None:
         """``flat_field`` as of ``RayTraced``, the rest and errors as of its ``build``."""
         self.sensor = sensor
-        self.tracer = RayTraced(flat_field=flat_field).build(sensor, resolution=resolution, device=device, seed=seed)
+        self.tracer = ray_tracer(sensor, RayTraced(flat_field=flat_field), resolution=resolution, device=device, seed=seed)
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
         self._direct = [
-            RayTraced(flat_field=flat_field, bounce=False, shadows=shadows).build(
-                self.tracer.sensor, resolution=resolution, device=device
+            ray_tracer(
+                self.tracer.sensor,
+                RayTraced(flat_field=flat_field, bounce=False, shadows=shadows),
+                resolution=resolution,
+                device=device,
             )
             for shadows in (True, False)
         ]
