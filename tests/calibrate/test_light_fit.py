@@ -276,7 +276,7 @@ def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
     expected = (higher.light.pressed - flat.light.pressed) / 0.5
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(flat.by_led[HEIGHT].pressed, expected, atol=1e-6, err_msg="no height below the least is rendered")
-    none = extra_light(problem, state, grid, "cpu", {"bounce": False, "shadows": False})
+    none = extra_light(problem, state, grid, "cpu", RayTraced(bounce=False, shadows=False))
     assert not none.by_led, "without shadows the rest changes slowly"
 
 
