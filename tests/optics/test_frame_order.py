@@ -20,7 +20,6 @@ from raytac.markers.fots import FotsMarkers
 from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
 from raytac.optics import Mlp, Phong, RayTraced, Taxim
 from raytac.optics.device_image import DeviceImage, ImageCut
-from raytac.optics.image.base import ImageMode
 from raytac.optics.image.phong import PhongMode
 from raytac.optics.taxim.mode import TaximMode
 from raytac.specs import PunchSpec
@@ -185,7 +184,7 @@ def test_device_memory_of_any_alignment(mode: str, device: str, fresh: Callable)
             if device == "cuda":
                 torch.cuda.synchronize()
             heights, touched = (array(kind, part) for kind, part in zip((one.mi.Float, one.mi.UInt8), memory, strict=True))
-            found = one.render_device(heights, touched)[0] if isinstance(one, ImageMode) else one.render_device(heights)["rgb"]
+            found = one.render_device(heights, touched).rgb
             np.testing.assert_array_equal(np.array(found), expected["rgb"].ravel(), err_msg=f"{offset} bytes")
 
 
@@ -199,7 +198,7 @@ def test_heights_that_are_one_number(mode: str, device: str) -> None:
     def image(literal: bool, height: float) -> np.ndarray:
         make = dr.full if literal else dr.opaque
         pad = make(one.mi.Float, height, GRID.rest.size), make(one.mi.UInt8, 0, GRID.rest.size)
-        found = one.render_device(*pad)[0] if isinstance(one, ImageMode) else one.render_device(pad[0])["rgb"]
+        found = one.render_device(*pad).rgb
         return np.array(found)
 
     first, second = (image(False, height) for height in (0.0, -1e-4))
