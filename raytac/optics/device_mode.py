@@ -125,7 +125,8 @@ class DeviceMode(ABC):
             return
         check_view(self.camera, grid)
         self.layout = CoatLayout.from_grid(grid)
-        self._rest = self._upload(grid.rest)  # a copy: see ``no_collection``
+        # A copy: an array on NumPy memory that a surface shares would be one input twice for a recording.
+        self._rest = self.mi.Float(grid.rest.astype(np.float32).ravel())
         self._inputs = FrameInputs(self._rest, self._build(grid))
         self._grid = grid
 
