@@ -18,6 +18,7 @@ from experiments.running import recorded, run
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.io import CommonOptions, Metric, parse_resolution
+from raytac.optics import Taxim
 from raytac.world import TactileWorld
 
 
@@ -97,7 +98,8 @@ MARKERS = {"rigid": "fots", "ipc": "surface"}
 
 
 def make_world(args: Args, physics: str) -> TactileWorld:
-    optics = OPTICS[physics] if args.optics is None else args.optics
+    name = OPTICS[physics] if args.optics is None else args.optics
+    optics = Taxim(shadows=False) if name == "taxim" else name
     return TactileWorld(
         args.scene,
         physics=physics,
@@ -107,7 +109,7 @@ def make_world(args: Args, physics: str) -> TactileWorld:
         resolution=parse_resolution(args.resolution),
         device=args.device,
         seed=args.seed,
-        sensor_options={"pitch": PITCH, **({"optics_options": {"shadows": False}} if optics == "taxim" else {})},
+        pitch=PITCH,
     )
 
 

@@ -28,6 +28,7 @@ from experiments.running import recorded, run
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, Progress, parse_names
+from raytac.optics import RayTraced
 from raytac.report import (
     References,
     Tracers,
@@ -123,7 +124,7 @@ class Bench:
 
     def tracer(self, size: tuple[int, int] | None = None, **options: Any) -> Any:
         """Ray tracer of this size and device, as ``Tracers.get`` says."""
-        return self.tracers.get(size or self.size, **options)
+        return self.tracers.get(size or self.size, RayTraced(**options))
 
 
 # ------------------------------------------------------------------------------------------------------------ building blocks
@@ -169,7 +170,7 @@ def speed(bench: Bench) -> dict[str, Metric]:
             inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
 
             def on_device(heights: Any, tracer: Any = tracer) -> None:
-                dr.eval(tracer.render_device(heights)["rgb"])
+                dr.eval(tracer.render_device(heights).rgb)
                 dr.sync_thread()
 
             host = timed(tracer.render, inputs, bench.frames)

@@ -25,6 +25,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, Progress, parse_names
+from raytac.optics import Phong, RayTraced, Taxim
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -51,11 +52,9 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-    from raytac.optics import PhongMode, TaximMode
-
     if family == "phong":
-        return PhongMode(spec, resolution=size, device=device)
-    return TaximMode(spec, calibration=table, shadows=family == "taxim_shadow", resolution=size, device=device)
+        return Phong().build(spec, resolution=size, device=device)
+    return Taxim(calibration=table, shadows=family == "taxim_shadow").build(spec, resolution=size, device=device)
 
 
 def speed(
@@ -103,7 +102,8 @@ def device_call(mode: Any) -> Callable[[Any], None]:
     import drjit as dr
 
     def call(arrays: tuple[Any, Any]) -> None:
-        dr.eval(mode.render_device(*arrays))
+        frame = mode.render_device(*arrays)
+        dr.eval(frame.rgb, frame.flags)
         dr.sync_thread()
 
     return call
@@ -129,9 +129,7 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-    from raytac.optics import RayTracer
-
-    tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
+    tracer = RayTraced().build(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 

@@ -70,7 +70,9 @@ def main(args: Args) -> None:
         real = unseen.presses[args.shown]
         metrics["contact_mae"] = float(np.abs(images - unseen.presses)[unseen.distance(sensor) < 1.0].mean())
         coin = TactileSensor("gelsight_mini", outputs=("rgb", "height"), device=args.device, seed=args.seed).press("coin")
-        np.savez_compressed(folder / "images.npz", photograph=real, ray_tracer=images[args.shown], circle=unseen.circles[args.shown])
+        np.savez_compressed(
+            folder / "images.npz", photograph=real, ray_tracer=images[args.shown], circle=unseen.circles[args.shown]
+        )
         draw(coin, real, images[args.shown], unseen.circles[args.shown], sensor.camera.pixel_pitch[0], folder / "real_mini.png")
 
 

@@ -38,7 +38,9 @@ def imitate(learner: Learner) -> None:
         observation = env.step(np.clip(action + 0.1 * rng.standard_normal(action.shape), -1.0, 1.0))[0]
         model.num_timesteps += env.num_envs
         if (step + 1) % recipe.n_steps == 0:
-            regress(learner, {name: np.concatenate([row[name] for row in seen]) for name in seen[0]}, np.concatenate(actions), rng)
+            regress(
+                learner, {name: np.concatenate([row[name] for row in seen]) for name in seen[0]}, np.concatenate(actions), rng
+            )
 
 
 def regress(learner: Learner, seen: Mapping[str, np.ndarray], actions: np.ndarray, rng: np.random.Generator) -> None:

@@ -25,8 +25,8 @@ from experiments.running import recorded, run
 from raytac.errors import BackendError, InputError
 from raytac.io import CommonOptions, Metric
 from raytac.observe import MODALITIES, ObservationSettings
+from raytac.optics import OPTICS
 from raytac.report import machine
-from raytac.sensor import OPTICS
 
 if TYPE_CHECKING:
     from experiments.ppo_learner import Evaluation, Recipe
@@ -71,8 +71,7 @@ def main(args: Args) -> dict[str, Metric]:
     if args.episodes < 0 or args.num_envs < 1:
         name, least = ("episodes", 0) if args.episodes < 0 else ("num_envs", 1)
         raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
-    if args.optics not in OPTICS:
-        raise InputError("optics", value=args.optics, rule="must be a known optical model", choices=OPTICS)
+    OPTICS.config_class(args.optics)
     if args.mp4 and shutil.which("ffmpeg") is None:
         raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
     recipe = _recipe(args)

@@ -20,9 +20,9 @@ from experiments.running import run
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
+from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, quiet_solver
 from raytac.report import machine
-from raytac.sensor import OPTICS
 from raytac.specs import SweepSpec, load_sweep
 
 
@@ -40,7 +40,7 @@ class Args(CommonOptions):
     """Presses in one shard."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms."""
-    optics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = None
+    optics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = None
     """How images are made."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels."""

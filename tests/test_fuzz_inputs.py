@@ -30,6 +30,7 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.metrics import read_metrics
 from raytac.markers import ContactSettings, MarkerPerturbation, Superposition
 from raytac.observe import ObservationSettings, Randomization, TactileObserver
+from raytac.optics import Phong, RayTraced, Taxim
 from raytac.optics.image.mlp_weights import load_mlp
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.folder import load_calibration, save_calibration
@@ -310,10 +311,11 @@ def updated(**changes: Any) -> object:
 CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     TactileSensor: {
         "sensor": MINI, "physics": "rigid", "pad": None, "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
-        "integrator": "fast",
-        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
-        "optics_options": None,
+        "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
     },
+    RayTraced: dict(vars(RayTraced())),
+    Taxim: dict(vars(Taxim())),
+    Phong: dict(vars(Phong())),
     press: {"offsets": None, "depths": None, "rotations": None, "shears": None, "twists": None, "seeds": None},
     pressed_pad: {name: getattr(MINI.gelpad, name) for name in vars(MINI.gelpad)},
     pressed_object: {name: getattr(BALL.object, name) for name in vars(BALL.object)},

@@ -6,13 +6,13 @@ import pickle
 import subprocess
 import sys
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS, MissingOutputError, TactileFrame
+from raytac.optics import OPTICS
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
 from tests.conftest import Shader, make_surface
@@ -26,11 +26,9 @@ from tests.conftest import Shader, make_surface
         ({"outputs": ("rgb", "deph")}, r"outputs = 'deph'.*did you mean 'depth'.*rgb, layers"),
         ({"outputs": 3}, "sequence of names"),
         ({"outputs": "rgb,depth"}, "outputs = 'rgb,depth'.*layers"),
-        ({"integrator": "quick"}, "fast, reference"),
         ({"device": "gpu"}, "auto, cpu, cuda"),
         ({"num_envs": 0}, "num_envs = 0"),
-        ({"spp": 0}, "spp = 0"),
-        ({"spp": 1.5}, "spp = 1.5"),
+        ({"optics": "mlp"}, "weights = None: must name a network"),
         ({"resolution": (0, 240)}, "resolution = 0"),
         ({"resolution": (320, 9000)}, "resolution = 9000.*8192"),
         ({"resolution": (320,)}, r"\(width, height\)"),
@@ -201,16 +199,8 @@ def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
     assert TactileSensor(sensor_spec, outputs=tuple(reversed(OUTPUTS))).outputs == OUTPUTS
 
 
-def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> None:
-    settings: tuple[dict[str, Any], ...] = ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadows": True}})
-    for setting in settings:
-        with pytest.raises(InputError, match="it has its own"):
-            TactileSensor(sensor_spec, optics=Shader(sensor_spec), **setting)
-
-
 @pytest.mark.parametrize(("optics", "known"), [("raytrace", "denoise"), ("taxim", "calibration"), ("phong", "lights")])
-@pytest.mark.renderer
-def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(sensor_spec: SensorSpec, optics: str, known: str) -> None:
+def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(optics: str, known: str) -> None:
     for name in ("calibratoin", "resolution"):
-        with pytest.raises(InputError, match=f"optics_options.*{name}.*choose from: .*{known}"):
-            _ = TactileSensor(sensor_spec, optics=optics, device="cpu", optics_options={name: 1}).optical_mode
+        with pytest.raises(InputError, match=f"{name} = 1: is no option of optics='{optics}'.*choose from: .*{known}"):
+            OPTICS.config(optics, **{name: 1})

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,10 +20,10 @@ from raytac.device import DEVICES
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.optics.base import OpticalMode
-from raytac.optics.image.mlp import MlpMode
-from raytac.optics.image.phong import PhongMode
-from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.image.config import Mlp, Phong
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.tracer import Tracer
 from raytac.specs import SensorSpec
 
 __all__ = ["ALONE", "MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
@@ -50,13 +49,13 @@ class Models:
     """Name of the strength of priors (``STRENGTHS``)."""
     modes: dict[str, OpticalMode]
     device: str
-    options: Mapping[str, Any]
-    """Further options of the ray tracer."""
+    tracing: RayTraced
+    """How rays are traced."""
 
     def circles(self, shots: Photographs) -> np.ndarray:
         """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
         own = dataclasses.replace(shots, background=self.rest)
-        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
+        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, tracing=self.tracing)
 
 
 def check_fit(
@@ -88,11 +87,11 @@ def check_fit(
     check_whole("rounds", rounds, 0)
 
 
-def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
+def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, tracing: RayTraced) -> Tracer:
     """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
     height, width = background.shape[:2]
     field = background.astype(np.uint8)
-    return RayTracer(sensor, resolution=(width, height), device=device, flat_field=field, **options)
+    return dataclasses.replace(tracing, flat_field=field).build(sensor, resolution=(width, height), device=device)
 
 
 def fit_models(
@@ -108,7 +107,7 @@ def fit_models(
     settle: bool = True,
     prior: str | None = None,
     shadow_table: str = SHADOW_TABLES[0],
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
     """Fit ``modes`` to the presses of ``shots``.
@@ -121,7 +120,7 @@ def fit_models(
 
     Raises as ``check_fit`` and ``fit_lights``.
     """
-    options = {} if options is None else options
+    tracing = RayTraced() if tracing is None else tracing
     settings = FitSettings() if settings is None else settings
     check_fit(
         modes=modes,
@@ -137,7 +136,7 @@ def fit_models(
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
     settings = dataclasses.replace(settings, **STRENGTHS[prior])
     fitted = fit_lights(
-        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
+        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, tracing=tracing, tick=tick
     )
     state, background, built = fitted.state, shots.background, {}
 
@@ -149,20 +148,20 @@ def fit_models(
         samples = press_samples(sensor, shots, state.circles, state.slopes, device=device)
     for name in modes:
         if name == "raytrace":
-            built[name] = raytrace_mode(fitted.sensor, background, device, options)
+            built[name] = raytrace_mode(fitted.sensor, background, device, tracing)
         elif name == ALONE:
-            shaded = with_shading(fitted.sensor, background, device=device, options=options)
-            built[name] = RayTracer(shaded, resolution=(background.shape[1], background.shape[0]), device=device, **options)
+            shaded = with_shading(fitted.sensor, background, device=device, tracing=tracing)
+            built[name] = tracing.build(shaded, resolution=(background.shape[1], background.shape[0]), device=device)
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
                 table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
-            built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
+            built[name] = Taxim(table, shadows=table.shadow is not None).build(sensor, device=device)
         elif name == "mlp":
-            built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
+            built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
         else:
-            built[name] = PhongMode(sensor, background=background.astype(np.uint8), device=device)
-    return Models(fitted, background, prior, built, device, options)
+            built[name] = Phong(background=background.astype(np.uint8)).build(sensor, device=device)
+    return Models(fitted, background, prior, built, device, tracing)
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:

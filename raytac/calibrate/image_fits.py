@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,15 +17,16 @@ from raytac.calibrate.imprint import KNOTS, press_surface
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics.image.config import Phong
 from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
-from raytac.optics.image.phong import PhongMode
 from raytac.optics.response import fit_log_gain
 from raytac.optics.taxim.bake.bake import PLAIN, bake_shadow
 from raytac.optics.taxim.bake.fit import BinSums
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.views import Calibration
 from raytac.optics.taxim.table import PolyTable, slope_bins
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 
 __all__ = [
@@ -120,7 +120,7 @@ def press_samples(
     """
     height, width = shots.background.shape[:2]
     background = np.zeros((height, width, 3), np.uint8)  # the front step needs none
-    front = PhongMode(sensor, background=background, resolution=(width, height), device=device)
+    front = Phong(background=background).build(sensor, resolution=(width, height), device=device)
     grid = make_grid(sensor.gelpad, pitch)
     aspect = front.pitch[0] / front.pitch[1]
     distance = Photographs(shots.background, shots.presses, circles, shots.radius).distance(sensor)
@@ -272,12 +272,12 @@ def with_shading(
     *,
     device: str = "auto",
     settings: ShadingSettings = ShadingSettings(),
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> SensorSpec:
     """The sensor with the colour shading that brings its image at rest to ``background`` (H, W, 3) [levels].
 
     ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels of
-    the image to first order. ``options`` are those of the ray tracer.
+    the image to first order. ``tracing``: how rays are traced.
 
     Raises:
         InputError: more than half of a channel of ``background`` is not brighter than the sensor's black level, or no light reaches a
@@ -287,7 +287,7 @@ def with_shading(
     height, width = background.shape[:2]
     bare = sensor.response.unshaded
     plain = dataclasses.replace(sensor, response=bare)
-    tracer = RayTracer(plain, resolution=(width, height), outputs=("layers",), device=device, **(options or {}))
+    tracer = (tracing or RayTraced()).build(plain, resolution=(width, height), outputs=("layers",), device=device)
     rest = total(tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, settings.pitch))))[0] * tracer.response.scale
     if not (rest > 0).all():
         rule = "leave this many values of the image at rest dark, and no gain makes these bright"

@@ -9,9 +9,8 @@ depend.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,8 @@ from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, 
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.base import casts_shadows
+from raytac.optics.trace.config import RayTraced
 from raytac.specs import SensorSpec
 
 __all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]
@@ -70,16 +70,14 @@ def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, s
     return brightened(DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed), begin)
 
 
-def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any]) -> Light:
-    """Light of every LED at power 1 that the ray tracer adds to direct light, at ``problem``'s pixels.
-
-    ``options`` are further ones of the ray tracer.
-    """
+def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
+    """Light of every LED at power 1 that the ray tracer adds to direct light, at ``problem``'s pixels."""
     sensor, p = problem.sensor, state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
     height, width = problem.shape
-    tracer = RayTracer(lit, resolution=(width, height), outputs=("layers",), layers="led", device=device, **options)
+    by_led = dataclasses.replace(tracing, layers="led")
+    tracer = by_led.build(lit, resolution=(width, height), outputs=("layers",), device=device)
     # A light file gives power by channel, and the coat's albedo with it: at power 1 a layer shows full scales.
     scale = sensor.response.gain * np.array(sensor.response.white_balance)
 
@@ -99,7 +97,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, opti
 
 
 def extra_light(
-    problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any], *, slopes: bool = True
+    problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
     """The defect with its slopes by the LEDs' places and heights, where shadows are cast (``slopes``: and wanted).
 
@@ -107,8 +105,8 @@ def extra_light(
     inter-reflection, which changes slowly.
     """
     lights: dict[int, Light] = {}
-    if slopes and options.get("shadows", problem.sensor.optics.shadows):
-        direct = {**options, "bounce": False}
+    if slopes and casts_shadows(problem.sensor, tracing.shadows):
+        direct = dataclasses.replace(tracing, bounce=False)
         for k, step in STEPS.items():
             ends = [state.p.leds.copy(), state.p.leds.copy()]
             for leds, offset in zip(ends, (-step, step), strict=True):
@@ -119,7 +117,7 @@ def extra_light(
             states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
             below, above = (defect(problem, moved, grid, device, direct) for moved in states)
             lights[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
-    return ExtraLight(defect(problem, state, grid, device, options), state.p.leds.copy(), lights)
+    return ExtraLight(defect(problem, state, grid, device, tracing), state.p.leds.copy(), lights)
 
 
 def fit_lights(
@@ -132,15 +130,15 @@ def fit_lights(
     starts: int = 3,
     device: str = "auto",
     seed: int = 0,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Fitted:
     """Fit ``sensor``'s LEDs, glow, response, imprint and the circles of ``shots``.
 
     ``start``: where the fit begins; None is the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles.
     ``rounds`` of defect correction follow the fit of direct light; 0 leaves it at that. Direct light is fitted from ``starts`` places, the
-    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``options`` of the ray tracer, such as
-    ``bounce``. ``tick`` is called with the stage and the cost after every step.
+    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``tracing``: how rays are
+    traced. ``tick`` is called with the stage and the cost after every step.
 
     Raises:
         InputError: refraction, LEDs of no colour, or fewer values than parameters.
@@ -170,12 +168,12 @@ def fit_lights(
     grid, passed = make_grid(sensor.gelpad, GRID_PITCH), []
     # A round's cost is known when the next one has rendered its result: the light that it was solved with is of first order only.
     for k in range(rounds):
-        extra = extra_light(problem, state, grid, device, options or {})
+        extra = extra_light(problem, state, grid, device, tracing or RayTraced())
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
         passed.append((problem.cost(state, problem.residuals(state)), state))
         state = problem.solve(state, LATER, report(f"all light, round {k + 1} of {rounds}"))
     if rounds:
-        extra = extra_light(problem, state, grid, device, options or {}, slopes=False)
+        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=False)
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
     passed.append((problem.cost(state, problem.residuals(state)), state))
     _, state = min(passed, key=lambda pair: pair[0])
@@ -197,7 +195,7 @@ def refine_circles(
     rounds: int = 1,
     device: str = "auto",
     seed: int = 0,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> np.ndarray:
     """Circles (N, 3) [px] of presses that the lights were not fitted to.
 
@@ -208,7 +206,7 @@ def refine_circles(
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)
     own, grid = problem.solve(own, 8), make_grid(sensor.gelpad, GRID_PITCH)
     for _ in range(rounds):
-        extra = extra_light(problem, own, grid, device, options or {}, slopes=False)
+        extra = extra_light(problem, own, grid, device, tracing or RayTraced(), slopes=False)
         problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, extra=extra, seed=seed)
         # The prior is the label, not where direct light put the circle: DirectFit takes it from the photographs.
         own = problem.solve(own, 8)

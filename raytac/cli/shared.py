@@ -21,7 +21,7 @@ from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
-__all__ = ["CASTING", "FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "chosen_physics", "read_data"]
+__all__ = ["FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "chosen_physics", "read_data"]
 
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
@@ -127,10 +127,6 @@ class SolverOptions(CommonOptions):
             quiet_solver()
 
 
-CASTING = ("raytrace", "taxim")
-"""Optical modes that can cast shadows."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShadowOptions:
     """Options of a command that renders: shadows, whatever the sensor file says."""
@@ -140,17 +136,12 @@ class ShadowOptions:
     no_shadows: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Cast none; as the sensor file says ([optics] shadows) if neither is given."""
 
-    def chosen_shadows(self, optics: str = CASTING[0]) -> dict[str, bool]:
+    def chosen_shadows(self) -> dict[str, bool]:
         """``{"shadows": …}`` for the optical mode; empty if the sensor decides.
 
         Raises:
-            InputError: both flags, or one for a mode that casts no shadows.
+            InputError: both flags.
         """
-        if not (self.shadows or self.no_shadows):
-            return {}
         if self.shadows and self.no_shadows:
             raise InputError("shadows, no_shadows", value=(True, True), rule="contradict each other: give one")
-        if optics not in CASTING:
-            name = "shadows" if self.shadows else "no_shadows"
-            raise InputError(name, value=True, rule=f"is for optics that cast shadows, not for {optics!r}", choices=CASTING)
-        return {"shadows": self.shadows}
+        return {"shadows": self.shadows} if self.shadows or self.no_shadows else {}

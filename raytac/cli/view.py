@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from raytac.checks import check_known, check_whole
+from raytac.checks import check_whole
 from raytac.cli.shared import ShadowOptions, chosen_physics
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
+from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.physics.soft.availability import check_solver, quiet_solver
-from raytac.sensor import OPTICS, TactileSensor
+from raytac.sensor import TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs import PADS, PressScene, TaskScene, load_scene
 from raytac.specs.task import COUPLINGS
@@ -48,7 +49,7 @@ class ViewArgs(ShadowOptions):
     rigid."""
     level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
+    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
     """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
@@ -78,7 +79,7 @@ class ViewArgs(ShadowOptions):
         check_viewer()
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
-        check_known("optics", self.optics, OPTICS)
+        OPTICS.config(self.optics, **self.chosen_shadows())
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.level, scene)
         if physics.is_simulated:
@@ -111,7 +112,6 @@ class ViewArgs(ShadowOptions):
             physics=physics,
             outputs=_OUTPUTS,
             seed=self.seed,
-            optics_options=self.chosen_shadows(self.optics),
             **self._settings(spec),
         )
         return PressSession(sensor, scene)
@@ -130,14 +130,13 @@ class ViewArgs(ShadowOptions):
             coupling=self.coupling,
             outputs=_OUTPUTS,
             seed=self.seed,
-            sensor_options={"optics_options": self.chosen_shadows(self.optics)},
             **self._settings(sensor_spec(scene.robot.sensor)),
         )
         return WorldSession(world, steps=self.steps or (4 if not physics.is_simulated and self.markers is None else 1))
 
     def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
         return {
-            "optics": self.optics,
+            "optics": OPTICS.config(self.optics, **self.chosen_shadows()),
             "markers": self.markers,
             "resolution": _fitting(sensor.camera.resolution) if self.resolution is None else parse_resolution(self.resolution),
             "device": self.device,

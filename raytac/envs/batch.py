@@ -111,10 +111,10 @@ class TaskBatch:
         loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
         if not rigid:
             loaded = randomised_bodies(loaded, self.randomization, seed)
-        options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
+        options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed}
         if settings is not None:
-            options = probe.world_options()
-        options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
+            options = probe.sensor_options()
+        options["pitch"] = _pitch(probe) if pitch is None else pitch
         self.world = TactileWorld(loaded, physics=config, device=device, **options)
         self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed

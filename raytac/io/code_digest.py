@@ -31,13 +31,10 @@ def module_sources(roots: Iterable[str]) -> dict[str, Path]:
         name = waiting.pop()
         if name in sources:
             continue
-        try:
-            spec = importlib.util.find_spec(name)
-        except ModuleNotFoundError:
-            spec = None
-        if spec is None or spec.origin is None:
+        source = _source(name)
+        if source is None:
             continue
-        sources[name] = Path(spec.origin)
+        sources[name] = source
         for node in ast.walk(ast.parse(sources[name].read_bytes())):
             imported: list[str] = []
             if isinstance(node, ast.Import):
@@ -46,6 +43,18 @@ def module_sources(roots: Iterable[str]) -> dict[str, Path]:
                 imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             waiting += [name for name in imported if (name + ".").startswith(tuple(package + "." for package in WITHIN))]
     return sources
+
+
+def _source(name: str) -> Path | None:
+    """File of a module, of the running script too; None if there is none."""
+    if name == "__main__":
+        script = getattr(sys.modules[name], "__file__", None)
+        return None if script is None else Path(script)
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        return None
+    return None if spec is None or spec.origin is None else Path(spec.origin)
 
 
 def code_digest(*roots: str) -> str:

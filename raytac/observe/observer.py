@@ -32,7 +32,7 @@ class TactileObserver:
     .. code-block:: python
 
         observer = TactileObserver("gelsight_mini_9x11", ObservationSettings(("rgb", "markers"), resolution=(32, 32)), num_envs=4)
-        sensor = observer.make_sensor()          # or TactileWorld(..., **observer.world_options())
+        sensor = observer.make_sensor()          # or TactileWorld(..., **observer.sensor_options())
         frame = sensor.press("sphere")
         observer.observe(frame, sensor)["rgb"]   # (4, 32, 32, 3) uint8
 
@@ -111,17 +111,10 @@ class TactileObserver:
             "outputs": settings.outputs,
             "markers": self.markers,
             "optics": settings.optics,
-            "optics_options": dict(settings.optics_options),
             "resolution": self.layout.rendered,
             "num_envs": self.num_envs,
             "seed": self.seed,
         }
-
-    def world_options(self) -> dict[str, Any]:
-        """Keyword arguments of a ``TactileWorld`` with the outputs observed; the sensor is the task scene's."""
-        options = self.sensor_options()
-        further = {key: options.pop(key) for key in ("optics_options",)}
-        return {**options, "sensor_options": further}
 
     def make_sensor(self, **options: Any) -> TactileSensor:
         """Make a sensor with the outputs observed; ``options`` of ``TactileSensor`` override those of the settings."""

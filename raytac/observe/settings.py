@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from raytac.checks import check_known, check_mapping, check_names, check_truth, check_whole, is_number, is_whole
+from raytac.checks import check_mapping, check_names, check_truth, check_whole, is_number, is_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
 from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import markers_config
-from raytac.sensor.options import LARGEST_SIDE, OPTICS, checked_resolution
+from raytac.optics.base import OpticsConfig
+from raytac.optics.registry import chosen_optics
+from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
@@ -62,11 +64,9 @@ class ObservationSettings:
     """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a ratio in both cases."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
-    optics: str = "taxim"
-    """As of ``TactileSensor``."""
+    optics: str | OpticsConfig[Any] = "taxim"
+    """As of ``TactileSensor``: a name, or a configuration."""
     markers: str | MarkersConfig = "fots"
-    """As of ``TactileSensor``."""
-    optics_options: Mapping[str, Any] = field(default_factory=dict)
     """As of ``TactileSensor``."""
 
     def __post_init__(self) -> None:
@@ -90,10 +90,9 @@ class ObservationSettings:
                 raise InputError("crop", value=sides, rule=rule)
         for name in ("difference", "normalise"):
             check_truth(name, getattr(self, name))
-        check_known("optics", self.optics, OPTICS)
+        chosen_optics(self.optics)
         markers_config(self.markers)
-        for name in ("scales", "optics_options"):
-            check_mapping(name, getattr(self, name))
+        check_mapping("scales", self.scales)
         if self.difference and "rgb" not in self.modalities:
             raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
         for name, scale in self.scales.items():

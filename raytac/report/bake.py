@@ -16,6 +16,8 @@ import numpy as np
 from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import contact_box, mae, psnr, rmse
 from raytac.report.measure import machine
 from raytac.report.press import press_peaks
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from raytac.optics.taxim.bake.fit import BinFit
     from raytac.optics.taxim.bake.settings import BakeSettings
     from raytac.optics.taxim.table import PolyTable
-    from raytac.optics.trace.fast_tracer import RayTracer
+    from raytac.optics.trace.tracer import Tracer
 
 __all__ = [
     "BOX_MARGIN",
@@ -259,23 +261,20 @@ def table_errors(
     sensor: SensorSpec,
     surfaces: Mapping[str, GelSurface],
     table: PolyTable,
-    tracer: RayTracer,
+    tracer: Tracer,
 ) -> dict[str, dict[str, SceneError]]:
     """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against the images of ``tracer`` by scene.
 
     ``surfaces`` (B = 1 each) share one grid, that of the first image of ``tracer`` if it has rendered already.
     """
-    from raytac.optics.taxim.mode import TaximMode
-    from raytac.optics.trace.fast_tracer import RayTracer
-
     setting: dict[str, Any] = {"resolution": tracer.camera.resolution, "device": tracer.device}
-    seen = RayTracer(sensor, outputs=("depth",), **setting)
+    seen = RayTraced().build(sensor, outputs=("depth",), **setting)
     traced = {name: (tracer.render(surface).rgb, seen.render(surface).contact) for name, surface in surfaces.items()}
     errors: dict[str, dict[str, SceneError]] = {}
     for family, shadow in (("taxim", False), ("taxim_shadow", True)):
         if shadow and table.shadow is None:
             continue
-        mode = TaximMode(sensor, calibration=table, shadows=shadow, **setting)
+        mode = Taxim(table, shadows=shadow).build(sensor, **setting)
         errors[family] = {}
         for name, surface in surfaces.items():
             image, (truth, contact) = mode.render(surface), traced[name]

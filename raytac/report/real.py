@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.progress import Progress
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
@@ -49,8 +50,8 @@ class Ablation:
     sensor: Callable[[SensorSpec], SensorSpec] = lambda sensor: sensor
     fixed: tuple[str, ...] = ()
     """Blocks of parameters that stay at their start."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the ray tracer."""
+    bounce: bool = True
+    """Inter-reflection."""
     prior: str | None = None
     """Name of another strength of priors than that of the comparison."""
     settle: bool = True
@@ -80,7 +81,7 @@ def _flat(sensor: SensorSpec) -> SensorSpec:
 
 ABLATIONS: dict[str, Ablation] = {
     # The case's glow is rendered with the bounce, so it goes too: to be held against no_glow.
-    "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), options={"bounce": False}),
+    "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), bounce=False),
     "other_shadows": Ablation(other_shadows=True),
     "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4)), fixed=("height",)),
     "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
@@ -170,7 +171,7 @@ def compare_real(
             for name in ablations:
                 one = ABLATIONS[name]
                 changed = one.sensor(sensor)
-                options = {"shadows": settings.shadows != one.other_shadows, **one.options}
+                tracing = RayTraced(shadows=settings.shadows != one.other_shadows, bounce=one.bounce)
                 models = _fitted(
                     changed,
                     shots.take(train),
@@ -179,7 +180,7 @@ def compare_real(
                     modes=("raytrace",),
                     one=one,
                     prior=one.prior or priors["press"][0],
-                    options=options,
+                    tracing=tracing,
                 )
                 seen, _ = _tested(models, changed, shots.take(test))
                 for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
@@ -228,7 +229,7 @@ def _fitted(
     modes: tuple[str, ...] = MODES,
     one: Ablation | None = None,
     prior: str | None = None,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> Models:
     one = Ablation() if one is None else one
     return fit_models(
@@ -242,7 +243,7 @@ def _fitted(
         rounds=settings.rounds,
         settle=one.settle,
         prior=settings.prior if prior is None else prior,
-        options={"shadows": settings.shadows} if options is None else options,
+        tracing=RayTraced(shadows=settings.shadows) if tracing is None else tracing,
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
     )
 

@@ -22,7 +22,8 @@ from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.mlp_weights import save_mlp
 from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.tracer import Tracer
 from raytac.report.real import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
@@ -97,7 +98,7 @@ def run_calibrate_optics(
                 rounds=rounds,
                 prior=prior,
                 shadow_table=shadow_table,
-                options={"shadows": shadows},
+                tracing=RayTraced(shadows=shadows),
                 tick=tick,
             )
         mode, fitted = models.modes[model], models.fitted
@@ -142,7 +143,7 @@ def run_calibrate_optics(
             )
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
             alone = models.modes[ALONE]
-            assert isinstance(alone, RayTracer)
+            assert isinstance(alone, Tracer)
             written = dataclasses.replace(alone.sensor, optics=OpticsSpec(shadows=shadows))
             for name, text in sensor_files(written).items():
                 (folder / name).write_text(text, "utf-8")

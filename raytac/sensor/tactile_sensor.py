@@ -21,13 +21,12 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
-from raytac.optics.base import OPTICAL_OUTPUTS
-from raytac.optics.registry import Imaging
+from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics
+from raytac.optics.registry import chosen_optics
 from raytac.physics.base import Pad, PadReading, PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
 from raytac.sensor.options import (
-    check_optics,
     checked_markers,
     checked_outputs,
     checked_resolution,
@@ -38,7 +37,7 @@ from raytac.sensor.options import (
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 
 if TYPE_CHECKING:
-    from raytac.optics.base import OpticalMode
+    from raytac.optics.base import OpticalMode, OpticsConfig
 
 __all__ = ["TactileSensor"]
 
@@ -62,6 +61,8 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    optics: OpticsConfig[Any]
+    """How images are made."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     markers: MarkersConfig | None
@@ -74,17 +75,14 @@ class TactileSensor:
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
         physics: str | PhysicsConfig | None = None,
-        optics: str | OpticalMode = "raytrace",
+        optics: str | OpticsConfig[Any] | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
-        integrator: str = "fast",
-        spp: int | None = None,
         device: str = "auto",
         seed: int = 0,
         num_envs: int = 1,
         pitch: float | None = None,
         markers: str | MarkersConfig | None = None,
-        optics_options: dict[str, Any] | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
 
@@ -92,21 +90,17 @@ class TactileSensor:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
             physics: how the gel deforms, a name of ``raytac.physics.PHYSICS`` or a configuration such as ``Rigid()`` or
                 ``Ipc(level="medium")``; None is as each scene says, else ``rigid``.
-            optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
-                outputs and device).
+            optics: how images are made: a name of ``raytac.optics.OPTICS``, a configuration such as ``Taxim(shadows=False)``, or an
+                optical mode that is built already (it keeps its own resolution, outputs and device).
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
             resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own. The field of view stays
                 the sensor's: another shape squeezes it, with a warning.
-            integrator: of the ray tracer, one of ``INTEGRATORS``.
-            spp: of the ray tracer; ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
             markers: marker model, a name of ``raytac.markers.MARKERS`` or a configuration such as ``Fots(perturbation=…)``; frames then
                 hold markers, and images show the dots. None leaves them out, and images show a plain coat.
-            optics_options: further keyword arguments of the optical mode, such as ``calibration`` of ``taxim``, or ``shadows``, which the
-                sensor else decides; their values are checked when it is built.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -117,16 +111,14 @@ class TactileSensor:
         self._settings: dict[str, Any] = settings
         """Arguments that make this sensor again."""
         self.physics = checked_physics(physics)
-        check_optics(optics, integrator, spp, optics_options)
+        self.optics = chosen_optics(optics)
         resolve_device(device)
-        self.outputs = checked_outputs(outputs, optics)
+        self.outputs = checked_outputs(outputs, self.optics)
         self.markers = checked_markers(markers, self.physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
-        check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
         self.seed = check_seed("seed", seed)
         self.spec = sensor_spec(sensor)
-        self.integrator, self.spp = integrator, spp
         self._used = self.physics or PHYSICS.config("rigid")
         """Physics of the press that was loaded last."""
         self.resolution = size if size is not None else self.spec.camera.resolution
@@ -139,17 +131,8 @@ class TactileSensor:
         if self.markers is not None:
             MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
-        self._imaging = Imaging(
-            self.spec,
-            optics,
-            options=optics_options or {},
-            resolution=self.resolution,
-            outputs=self._optical_outputs,
-            device=device,
-            integrator=integrator,
-            spp=spp,
-            seed=self.seed,
-        )
+        self.optics.check(self.spec)
+        self._mode: OpticalMode | None = None
         self._pad: Pad | None = None
         self._is_narrow = False
         """Whether this press was warned of already."""
@@ -160,7 +143,7 @@ class TactileSensor:
         Raises:
             InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
         """
-        if not isinstance(self._settings["optics"], str):
+        if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
             raise InputError("optics", value=self._settings["optics"], rule=rule)
         if self._tracker is not None:
@@ -172,14 +155,14 @@ class TactileSensor:
     def label(self) -> str:
         """Physics of the press that was loaded last and optics, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
 
-        The optical mode names itself once it is built, which options such as a denoiser change.
+        The optical mode names itself once it is built: a table casts shadows only if it has some.
         """
-        return f"{self._used.label}+{self._imaging.label}" if self._optical_outputs else self._used.label
+        return f"{self._used.label}+{(self._mode or self.optics).label}" if self._optical_outputs else self._used.label
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
         """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports; empty without images or rays."""
-        return self._imaging.sampling if self._optical_outputs else {}
+        return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
@@ -428,7 +411,11 @@ class TactileSensor:
         """The renderer, built on first use.
 
         Raises:
-            InputError: an unknown name or a bad value in ``optics_options``.
-            BackendError: the renderer or the device does not work here.
+            RaytacError: as ``OpticsConfig.build``.
         """
-        return self._imaging.mode
+        mode = self._mode
+        if mode is None:
+            mode = self._mode = self.optics.build(
+                self.spec, resolution=self.resolution, outputs=self._optical_outputs, device=self.device, seed=self.seed
+            )
+        return mode

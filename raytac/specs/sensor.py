@@ -206,7 +206,7 @@ class ResponseSpec:
 
     exposure: float | Literal["auto"]
     """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
-    (``raytac.optics.exposure``), which whoever renders finds."""
+    (``raytac.optics.response``), which whoever renders finds."""
     white_balance: Vec3
     """Gain of each channel after the exposure."""
     gamma: float

@@ -261,7 +261,9 @@ class SoftPads:
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
         driven = {}
         for body in self._driven:
-            driven[body.spec.name] = np.where(failed[:, None, None], self._last_driven[body.spec.name], body_poses(datas, body.index))
+            driven[body.spec.name] = np.where(
+                failed[:, None, None], self._last_driven[body.spec.name], body_poses(datas, body.index)
+            )
         return cases, driven
 
     def _follow(
@@ -326,9 +328,7 @@ class SoftPads:
             depth[b] = max(depth[b], one.depth)
             if (one.body, one.geom) not in self._warned:
                 self._warned.add((one.body, one.geom))
-                rule = (
-                    "bodies of the solver touch gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
-                )
+                rule = "bodies of the solver touch gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
                 where = f" in environment {b} at {datas[b].time:.3f} s"
                 warnings.warn(
                     f"{one.body!r} is {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}: {rule}",

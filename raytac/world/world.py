@@ -34,6 +34,7 @@ from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
+    from raytac.optics.base import OpticsConfig
     from raytac.physics.soft.scene import SoftScene
 
 __all__ = ["TactileWorld"]
@@ -72,12 +73,12 @@ class TactileWorld:
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
         markers: str | MarkersConfig | None = None,
-        optics: str = "raytrace",
+        optics: str | OpticsConfig[Any] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
         device: str = "auto",
         seed: int = 0,
-        sensor_options: dict[str, Any] | None = None,
+        pitch: float | None = None,
     ) -> None:
         """Compose the scene and put it at its start; sensors are made on first use.
 
@@ -88,7 +89,7 @@ class TactileWorld:
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
             seed: of every random number.
-            sensor_options: further keyword arguments of ``TactileSensor``, such as ``integrator``.
+            pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
 
         Raises:
             InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses.
@@ -114,7 +115,7 @@ class TactileWorld:
             "device": device,
             "num_envs": num_envs,
             "physics": self.physics,
-            **(sensor_options or {}),
+            "pitch": pitch,
         }
         self._sensors: dict[str, TactileSensor] = {}
         self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")

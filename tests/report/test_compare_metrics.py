@@ -18,6 +18,7 @@ def row(mode: str, rmse: float | None, ms: float, scene: str = "sphere", **more:
     family, _, spp = mode.partition(".spp")
     figures: dict[str, Value] = {"scene": scene, "resolution": "32x24", "mode": mode, "family": family, "label": mode}
     figures |= {"spp": int(spp) if spp else None, "device": "cpu", "ms": ms, "batch": 8, "batch_ms_per_frame": None}
+    figures |= {"words": family, "short": family, "unbiased": family in ("reference", "path")}
     figures |= {"first_image_s": None, "memory_mib": None, "memory_mib_per_env": None, "at_noise": False}
     figures |= {f"{region}_{metric}": None for region in REGIONS for metric in METRICS}
     if rmse is not None:

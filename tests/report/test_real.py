@@ -22,7 +22,7 @@ from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import write_png
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings, noise_floor, press_scores, summary, table_text
 from raytac.report.real_calibration import run_calibrate_optics
@@ -121,7 +121,7 @@ def of_itself(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarra
     data, grid = tmp_path_factory.mktemp("data"), make_grid(SENSOR.gelpad, 0.12e-3)
     places = [(x, y) for y in (70, 120, 170) for x in (80, 160, 240)]
     circles = np.array([(x, y, 26.0 + k % 3 * 3) for k, (x, y) in enumerate(places)])
-    tracer = RayTracer(SENSOR, device="cpu", shadows=False)
+    tracer = RayTraced(shadows=False).build(SENSOR, device="cpu")
     photographs = {"background": tracer.render(GelSurface.at_rest(grid)).rgb}
     for k in range(len(circles)):
         surface = press_surface(SENSOR, grid, circles[k : k + 1], np.array([3.155e-3]), RIGID_PAD)
@@ -160,12 +160,12 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     # Fitted without cast shadows, and so rendered, though the sensor that the fit began from casts them.
     assert SENSOR.optics.shadows and not written.optics.shadows
     images = [
-        np.array(TactileSensor(written, device="cpu", optics_options=options).press("pins").rgb, int)
-        for options in ({}, {"shadows": False}, {"shadows": True})
+        np.array(TactileSensor(written, device="cpu", optics=RayTraced(shadows=shadows)).press("pins").rgb, int)
+        for shadows in (None, False, True)
     ]
     np.testing.assert_array_equal(images[0], images[1])
     assert (np.abs(images[0] - images[2]) > 8).mean() > 0.01
-    rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
+    rest = RayTraced().build(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
     assert rest is not None
     off = np.abs(rest[0].astype(int) - background)
     assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())

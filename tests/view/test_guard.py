@@ -301,8 +301,12 @@ def test_a_request_that_is_no_http_says_nothing(caplog, capfd):
 
 def test_the_messages_are_visers_own():
     """Fails if viser's browser tells more of its camera, or says it in another form."""
-    assert set(server_module._Camera.__struct_fields__) == {field.name for field in dataclasses.fields(_messages.ViewerCameraMessage)}
-    assert set(server_module._Update.__struct_fields__) == {field.name for field in dataclasses.fields(_messages.GuiUpdateMessage)}
+    assert set(server_module._Camera.__struct_fields__) == {
+        field.name for field in dataclasses.fields(_messages.ViewerCameraMessage)
+    }
+    assert set(server_module._Update.__struct_fields__) == {
+        field.name for field in dataclasses.fields(_messages.GuiUpdateMessage)
+    }
     for raw in (camera(), encoded(type="GuiUpdateMessage", uuid="a", updates={"value": True})):
         again = server_module.checked_message(raw, lambda uuid: None)
         assert _messages.Message.deserialize(again) == _messages.Message.deserialize(raw)

@@ -28,8 +28,6 @@ __all__ = [
 ]
 
 
-UNBIASED = ("reference", "path")
-"""Families whose error falls as 1/√spp, so that it may be extrapolated."""
 KEYS = {"mae": "mae_levels", "rmse": "rmse_levels", "psnr": "psnr_db", "ssim": "ssim", "flip": "flip"}
 
 
@@ -57,6 +55,11 @@ class Summary:
     mode: str
     family: str
     label: str
+    words: str
+    """The family for a reader."""
+    short: str
+    """Label of its point in a figure."""
+    unbiased: bool
     spp: int | None
     device: str
     scenes: int
@@ -105,6 +108,9 @@ def _summary(rows: list[Row]) -> Summary:
         mode=str(first["mode"]),
         family=str(first["family"]),
         label=str(first["label"]),
+        words=str(first["words"]),
+        short=str(first["short"]),
+        unbiased=first["unbiased"] is True,
         spp=None if first["spp"] is None else int(first["spp"]),
         device=str(first["device"]),
         scenes=len(rows),
@@ -142,10 +148,11 @@ def equal_errors(rows: Sequence[Row]) -> list[EqualError]:
     A denoised image is biased, so that its error need not fall on: beyond the last measured point nothing is said of it.
     """
     costs = []
+    families = dict.fromkeys(str(row.figures["family"]) for row in rows if row.figures["spp"] is not None)
     for resolution in resolutions(rows):
         for fast in select(rows, resolution=resolution, mode="fast"):
             scene, target, ms = fast.figures["scene"], float(fast.figures["frame_rmse"] or 0), float(fast.figures["ms"] or 0)
-            for family in ("reference", "reference_denoised", "path"):
+            for family in families:
                 sampled = select(rows, resolution=resolution, scene=scene, family=family)
                 sampled.sort(key=lambda row: int(row.figures["spp"] or 0))
                 if sampled and target > 0:
@@ -157,7 +164,7 @@ def _equal_error(resolution: str, scene: str, family: str, target: float, ms: fl
     spp = [int(row.figures["spp"] or 0) for row in sampled]
     errors, times = known(sampled, "frame_rmse"), known(sampled, "ms")
     reached = target >= errors[-1]
-    if not reached and family not in UNBIASED:
+    if not reached and not sampled[0].figures["unbiased"]:
         return EqualError(resolution, scene, family, target, None, None, "not reached")
     wanted = spp_for_error(spp, errors, target)
     how = "interpolated" if reached else "extrapolated as 1/√spp"

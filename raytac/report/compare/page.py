@@ -9,7 +9,6 @@ from typing import Any
 from raytac.io.folder import result_folder
 from raytac.io.metrics import write_metrics
 from raytac.report.compare.metrics import compare_metrics, equal_errors, resolutions, select, summaries
-from raytac.report.compare.modes import FAMILIES
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
 
@@ -100,7 +99,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
         noise=noise,
         reference_spp=f"{settings.reference_spp:,}",
         equal=equal_errors(rows),
-        families=FAMILIES,
+        families={row.figures["family"]: row.figures["words"] for row in comparison.rows},
         left_out=comparison.left_out,
         physics=comparison.physics,
         markers=comparison.markers,

@@ -212,9 +212,10 @@ class _Run:
 
     def _digest(self, mode: Mode) -> str:
         """Digest of the code behind a mode's row; reading sources takes a while, so each is read once."""
-        if mode.code not in self._digests:
-            self._digests[mode.code] = code_digest(*mode.code, *CODE)
-        return self._digests[mode.code]
+        code = mode.code()
+        if code not in self._digests:
+            self._digests[code] = code_digest(*code, *CODE)
+        return self._digests[code]
 
     def _measure(self, mode: Mode, built: OpticalMode, scene: _Scene, size: str, sensor: str, first_image_s: float | None) -> Row:
         image = _rgb(built, scene.surface)[0]
@@ -224,6 +225,9 @@ class _Run:
             "mode": mode.name,
             "family": mode.family,
             "label": mode.label,
+            "words": mode.words or mode.family,
+            "short": mode.short or mode.family,
+            "unbiased": mode.unbiased,
             "spp": mode.spp,
             "sensor": sensor,
             "device": built.device,

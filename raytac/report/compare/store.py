@@ -18,6 +18,7 @@ from raytac.io.code_digest import code_digest
 from raytac.io.images import png_bytes, read_png
 from raytac.io.metrics import versions
 from raytac.io.seal import read_sealed, write_sealed
+from raytac.optics.trace.config import RayTraced
 from raytac.report.tracers import Tracers, path_trace
 
 __all__ = ["References", "Row", "RowStore", "row_key"]
@@ -114,7 +115,7 @@ class References:
         if kept is not None:
             return kept
         tracer, seed, half = (
-            self.tracers.get(self.size, integrator="reference", progress=True),
+            self.tracers.get(self.size, RayTraced("reference", progress=True)),
             2 * self.tracers.seed,
             self.spp // 2,
         )

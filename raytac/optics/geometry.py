@@ -1,4 +1,4 @@
-"""The coat surface on the device: packed nodes, bilinear look-up, camera hits and shadow rays on a height field.
+"""Geometry below all optical modes: the coat as a height field on the device, camera rays on it, normals, depth, shadow rays.
 
 The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
 a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
@@ -7,15 +7,18 @@ a few cells. Rebuilding a bounding volume hierarchy each frame costs more than a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from raytac.gel.surface import PadGrid
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.camera import Pinhole
 
-__all__ = ["CoatField", "CoatLayout"]
+__all__ = ["CoatField", "CoatLayout", "PixelSample", "check_view", "see", "seen_images"]
 
 TILE = 0.5e-3
 """Edge of a tile of the bounds map [m]. The bounds on z hold two edges around a place: a camera ray of slope t may be that over t above
@@ -243,3 +246,64 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
             if max(abs(sx), abs(sy)) <= 1:
                 deep3 = dr.maximum(deep3, dr.gather(mi.Float, deep2, i))
     return lo3, hi3, deep3
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """What one camera ray of every pixel meets: environment index, point, normal and direction to the camera (pad frame)."""
+
+    env: Any
+    p: Any
+    n: Any
+    wo: Any
+    exit: Any = None
+    """Radiance that leaves the slab per radiance at p, T / n²; None without a slab."""
+
+
+def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[float, float] = (0.5, 0.5)) -> PixelSample:
+    """Trace one ray through every pixel of ``envs`` images, at ``jitter`` inside the pixel."""
+    width, height = camera.resolution
+    i = dr.arange(mi.UInt32, envs * width * height)
+    env = i // (width * height)
+    pixel = i - env * (width * height)
+    u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
+    origin, (tx, ty) = camera.ray(u, v)
+    p = field.camera_hit(env, origin, tx, ty)
+    n = field.normal(env, p.x, p.y)
+    exit = None
+    if camera.slab is not None:
+        ax, ay = camera.slope(u, v)
+        exit = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
+    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), exit)
+
+
+def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
+    """Contact, and what ``outputs`` name of normals with positions and of camera depth, by the fields of ``OpticsImages``.
+
+    ``p`` and ``n``: points and normals that the pixels of all environments see, on the device.
+    """
+    width, height = camera.resolution
+    shape, grid = (surface.batch, height, width), surface.grid
+    points = np.array(p).T.reshape(*shape, 3)
+    ix = np.clip(np.rint((points[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)
+    iy = np.clip(np.rint((points[..., 1] - grid.y[0]) / grid.pitch[1]).astype(int), 0, len(grid.y) - 1)
+    images = {"contact": surface.contact[np.arange(shape[0])[:, None, None], iy, ix]}
+    if "normals" in outputs:
+        images["normals"] = np.ascontiguousarray(np.array(n).T.reshape(*shape, 3))
+        images["position"] = np.ascontiguousarray(points)
+    if "depth" in outputs:
+        images["depth"] = (points[..., 2] - camera.position[2]).astype(np.float32)
+    return images
+
+
+def check_view(camera: Pinhole, grid: PadGrid) -> None:
+    """Raise InputError if the camera sees beyond the pad's edge on the plane z = 0."""
+    # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
+    width, height = camera.resolution
+    cx, cy = camera.principal
+    views = camera.ray(np.array([0.0, width]), cy), camera.ray(cx, np.array([0.0, height]))
+    for k, (axis, nodes, (origin, slope)) in enumerate(zip("xy", (grid.x, grid.y), views, strict=True)):
+        seen = origin[k] - slope[k] * origin[2]
+        if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
+            rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
+            raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)
