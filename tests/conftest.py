@@ -30,12 +30,12 @@ BALL_DEPTH = 1e-3
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    marks.block(config.getoption("markexpr"))
+    marks.block(str(config.getoption("markexpr")))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out files all of whose tests are deselected: importing them would import what they need."""
-    expression = config.getoption("markexpr")
+    expression = str(config.getoption("markexpr"))
     return True if any(marks.is_deselected(mark, expression) for mark in marks.marks_of(collection_path)) else None
 
 

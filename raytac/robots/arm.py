@@ -1,8 +1,5 @@
 """An arm in a compiled MuJoCo model: the joints that move one site, by index, and what control needs to know of them."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

@@ -1,8 +1,5 @@
 """Sensors without an arm: two pads that face each other on a driven frame, and one sensor that stands still."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

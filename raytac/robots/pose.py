@@ -1,8 +1,5 @@
 """Poses as 4 × 4 matrices, checked, and what MuJoCo's data say about a site."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -9,9 +9,6 @@ C. W. Wampler, "Manipulator inverse kinematic solutions based on vector formulat
 Man Cybern. 16(1), 1986; the second term leans a redundant arm to q₀ without moving the site (A. Liégeois, IEEE Trans. SMC 7(12), 1977).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -1,8 +1,5 @@
 """From a task scene to one MuJoCo model: robot with its sensors, bodies, and where everything starts."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -18,9 +18,6 @@ All environments go in lock-step: in every step of MuJoCo the contacts of all of
 the other, since its own share of the time is small (docs/rl.md, Speed).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence

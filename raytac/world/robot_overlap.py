@@ -1,8 +1,5 @@
 """Bodies of the contact solver that lie inside a case or a link: the solver has neither, so nothing stops them, and someone must say so."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

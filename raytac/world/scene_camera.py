@@ -1,8 +1,5 @@
 """Pictures of a world by MuJoCo's own renderer: the robot and the bodies, not what a sensor's camera sees."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -4,9 +4,6 @@ Every ``soft_timestep`` MuJoCo goes ahead with what the pads did to the robot, t
 where MuJoCo has them, what belongs to the solver moves by itself and is mirrored in MuJoCo as mocap bodies.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import warnings

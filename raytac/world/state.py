@@ -1,8 +1,5 @@
 """What a world is like after a step, and how it is steered."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from abc import ABC, abstractmethod

@@ -4,9 +4,6 @@ MuJoCo keeps such numbers in its model, of which a world has one for all environ
 the scene's with these numbers changed; what MuJoCo derives from them (inverse weights) is computed anew.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

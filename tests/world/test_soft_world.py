@@ -1,8 +1,5 @@
 """Worlds with simulated pads: who owns what, forces, reset, and what is refused."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import replace
