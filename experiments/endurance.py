@@ -11,9 +11,6 @@ That the bond holds is true by construction: bonded vertices are no unknowns, so
 them. What the bond bears is computed another way than what touches the gel, so that both agree at rest is a check.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import json

@@ -1,8 +1,5 @@
 """From the geoms of a MuJoCo model to the parts that the height-field code senses, so that any MuJoCo object can be pressed in."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

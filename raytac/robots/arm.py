@@ -1,8 +1,5 @@
 """Arm in a compiled MuJoCo model: indices, limits and motors of the joints that move one site."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

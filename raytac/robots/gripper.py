@@ -1,8 +1,5 @@
 """Grippers: the servo that opens two fingers, and a frame without an arm that carries two sensors."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Iterable

@@ -21,9 +21,6 @@ Man Cybern. 16(1), 1986; the second term moves a redundant arm towards q₀ with
 1977).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

@@ -3,9 +3,6 @@
 Both add C(q, q̇) q̇ + g(q), which compensates gravity. Read the state after ``mj_forward`` or ``mj_step1``.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

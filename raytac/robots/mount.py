@@ -1,8 +1,5 @@
 """Mount a tactile sensor on a body or a site of any MJCF robot."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

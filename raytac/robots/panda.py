@@ -3,9 +3,6 @@
 Kinematics, limits and inertias with their sources: docs/robots.md and the comments of ``scenes/robots/panda.xml``.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

@@ -1,8 +1,5 @@
 """Composition of a task scene to one MuJoCo model: the robot with its sensors, bodies, and the start of all of them."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -24,9 +24,6 @@ interval by a rigid body of its mass and velocity, on which w₀, gravity and th
 so stiffness times mass ratio sets no limit to h. ``xfrc_applied`` carries w₀ + c.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

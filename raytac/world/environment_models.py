@@ -4,9 +4,6 @@ MuJoCo keeps such numbers in its model, of which a world has one for all environ
 scene's model with these numbers changed; quantities that MuJoCo derives from them (inverse weights) are computed again.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -18,9 +18,6 @@ All environments step together: in every step of MuJoCo their contacts are compu
 since its share of the time is small (docs/rl.md, Speed).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,5 @@
 """Pictures of a world by MuJoCo's renderer: the robot and the bodies, not the image of a sensor."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -4,9 +4,6 @@ Every ``soft_timestep`` MuJoCo steps first, with the forces of the pads on the r
 driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap bodies.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import warnings

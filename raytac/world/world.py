@@ -1,8 +1,5 @@
 """``TactileWorld``: a task scene, stepped by MuJoCo with its pads, and read by tactile sensors."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,5 @@
 """State of a world after a step, and the controllers that drive it."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from abc import ABC, abstractmethod

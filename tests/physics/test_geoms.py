@@ -1,8 +1,5 @@
 """Geoms of a MuJoCo model as parts: every type against a closed form or against the mesh of the same shape."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

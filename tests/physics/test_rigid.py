@@ -257,7 +257,7 @@ def test_turn_shear_and_twist_by_environment_are_those_of_scenes_of_their_own() 
     _pad, states = press(scene, num_envs=3, rotations=turns, shears=shears, twists=twists)
     for b in range(3):
         turned = np.empty(4)
-        mujoco.mju_mulQuat(turned, turns[b], own)  # pyright: ignore[reportAttributeAccessIssue]
+        mujoco.mju_mulQuat(turned, turns[b], own)
         alone_stages = indent(0.6e-3), StageSpec("shear", shear=tuple(shears[b])), StageSpec("twist", twist=twists[b])
         w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
         _alone, single = press(scene_of("torus", *alone_stages, quaternion=(w, x, y, z)))

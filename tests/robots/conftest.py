@@ -1,8 +1,5 @@
 """The Franka Panda by its published tables, computed without MuJoCo."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import math

@@ -1,8 +1,5 @@
 """Inverse kinematics and impedance control of the Panda."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

@@ -1,8 +1,5 @@
 """The floating gripper: its mass lies where its joints are, wherever it stands."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

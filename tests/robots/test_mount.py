@@ -1,8 +1,5 @@
 """A sensor on any MJCF robot: where its pad frame comes to lie, what it weighs, and what is refused."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

@@ -1,8 +1,5 @@
 """The Panda against its published tables, and against what a real one reported."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from pathlib import Path

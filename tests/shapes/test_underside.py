@@ -1,8 +1,5 @@
 """Undersides of shapes: closed forms, MuJoCo's ray caster as an independent judge, and meshes."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

@@ -1,8 +1,5 @@
 """Small MuJoCo models coupled to a soft scene, without the rest of a task scene."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping

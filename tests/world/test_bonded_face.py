@@ -1,8 +1,5 @@
 """Bodies that go through a rigid pad: their environment fails, whatever they are and however fast, and nobody else's does."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,8 +1,5 @@
 """Two-way coupling: stable for light links on stiff contacts, passive, without a part in what is settled in."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

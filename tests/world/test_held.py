@@ -1,8 +1,5 @@
 """Links that move soft bodies which are held elsewhere: no drag beyond what the body is, no energy, and how far the bound holds."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 import mujoco

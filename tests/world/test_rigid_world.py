@@ -1,8 +1,5 @@
 """Worlds with the rigid pad: composition, the gel's contact against the press and the load law, rolling, reset, and what is refused."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

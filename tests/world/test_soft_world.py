@@ -1,8 +1,5 @@
 """Worlds with soft pads: owners of bodies, forces, resets and errors."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,8 +1,5 @@
 """Environments that start elsewhere: joints and bodies of those that are named, in both physics."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from dataclasses import replace

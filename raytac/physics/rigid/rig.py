@@ -1,8 +1,5 @@
 """The press rig in MuJoCo: object and case, one of them driven, with a compliant contact between them."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Callable
