@@ -54,7 +54,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world/test_held.py",
         "world/test_soft_world.py",
     ),
-    "script": ("dataset/test_ray_engine.py", "envs/test_sb3.py", "experiments", "test_packaging.py"),
+    "script": ("dataset/test_ray_cluster.py", "envs/test_sb3.py", "experiments", "test_packaging.py"),
 }
 PACKAGES = {"renderer": ("mitsuba", "drjit"), "solver": ("warp",)}
 

@@ -310,7 +310,7 @@ def updated(**changes: Any) -> object:
 
 CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     TactileSensor: {
-        "sensor": MINI, "physics": "rigid", "pad": None, "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
+        "sensor": MINI, "physics": "rigid", "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
         "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
     },
     RayTraced: dict(vars(RayTraced())),

@@ -33,8 +33,7 @@ def pressed() -> GelSurface:
 @pytest.fixture(scope="module")
 def converged(tracer: Build, pressed: GelSurface) -> dict[str, np.ndarray]:
     mode = tracer(like_a_mini(), integrator="reference")
-    mode.spp, mode.seed = 1024, 0
-    return mode.render_layers(pressed)
+    return mode.render_layers(pressed, spp=1024, seed=0)
 
 
 @needs_oidn
@@ -43,9 +42,7 @@ def test_denoising_lowers_the_error(spp: int, tracer: Build, pressed: GelSurface
     """Of the image and of each layer: what the filter blurs must be less than the noise that it takes away."""
     plain = tracer(like_a_mini(), integrator="reference")
     mode = tracer(like_a_mini(), integrator="reference", denoise=True, outputs=("rgb", "layers"))
-    plain.spp = mode.spp = spp
-    plain.seed = mode.seed = 5
-    noisy, images = plain.render_layers(pressed), mode.render(pressed)
+    noisy, images = plain.render_layers(pressed, spp=spp, seed=5), mode.render(pressed, spp=spp, seed=5)
     clean = images.layers
     assert clean is not None and mode.label == "raytrace-reference-denoised"
 
@@ -63,13 +60,11 @@ def test_denoising_lowers_the_error(spp: int, tracer: Build, pressed: GelSurface
 def test_denoised_layers_sum_to_the_image(tracer: Build, pressed: GelSurface) -> None:
     """Each layer is filtered alone, so their sum must be near the filtered sum, and is what the camera turns into the image."""
     mode = tracer(like_a_mini(), integrator="reference", denoise=True, outputs=("rgb", "layers"))
-    mode.spp, mode.seed = 16, 5
-    images = mode.render(pressed)
+    images = mode.render(pressed, spp=16, seed=5)
     assert images.layers is not None and images.rgb is not None
     assert np.abs(mode.response.encode_numpy(total(images.layers)).astype(int) - images.rgb).max() <= 1
     plain = tracer(like_a_mini(), integrator="reference")
-    plain.spp, plain.seed = 16, 5
-    noisy_sum = total(plain.render_layers(pressed))
+    noisy_sum = total(plain.render_layers(pressed, spp=16, seed=5))
     of_sum = make_denoiser(mode.mi, "cpu", RESOLUTION)(noisy_sum[0])
     assert errors(total(images.layers)[0], of_sum)[0] < 0.02
     assert abs(total(images.layers).mean() / noisy_sum.mean() - 1.0) < 0.01  # it moves light, it makes none

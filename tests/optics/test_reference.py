@@ -38,8 +38,7 @@ def layers(
 ) -> np.ndarray:
     """(G, H, W, 3) in double precision, from one scene for all numbers of samples and seeds."""
     mode = tracer(spec, integrator=integrator, resolution=TINY, max_depth=max_depth)
-    mode.spp, mode.seed = spp, seed
-    return np.stack([layer[0] for layer in mode.render_layers(pressed).values()]).astype(float)
+    return np.stack([layer[0] for layer in mode.render_layers(pressed, spp=spp, seed=seed).values()]).astype(float)
 
 
 def image(tracer: Build, spec: SensorSpec, pressed: GelSurface, spp: int, seed: int = 0, max_depth: int = -1) -> np.ndarray:

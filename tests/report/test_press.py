@@ -101,9 +101,8 @@ def test_an_interrupted_press_leaves_nothing(
 def test_a_failed_environment_writes_nothing(sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path) -> None:
     class Failing(TactileSensor):
         def press(self, scene: PressScene, **options):  # type: ignore[override]
-            from dataclasses import replace
 
-            return replace(super().press(scene, **options), failed=np.array([True]))
+            return super().press(scene, **options).with_values(failed=np.array([True]))
 
     sensor = Failing(sensor_spec, optics=Shader(sensor_spec, SIZE), resolution=SIZE, pitch=0.5e-3)
     with pytest.raises(RaytacError, match=r"'sphere' did not settle"):

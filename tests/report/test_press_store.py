@@ -74,7 +74,7 @@ def test_the_code_is_that_of_solver_physics_and_presses(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(Path, "read_bytes", edited)
     assert press_code() != before  # a line more in the solver
-    assert {"soft/pad.py", "rigid/pad.py", "correction/standoff.py"} <= seen
+    assert {"soft/pad.py", "rigid/pad.py", "soft/coat_surface.py"} <= seen
     assert {"friction.py", "calibration_presses.py"} <= {name.partition("/")[2] for name in seen}
 
 

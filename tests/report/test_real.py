@@ -259,9 +259,9 @@ def test_a_calibration_by_unknown_names_writes_nothing(name: str, tmp_path: Path
     assert said in str(told.value) and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "said"), [("pad", "coarse, medium, fine"), ("device", "auto, cpu, cuda")])
+@pytest.mark.parametrize(("name", "said"), [("level", "coarse, medium, fine"), ("device", "auto, cpu, cuda")])
 def test_a_calibration_of_markers_by_unknown_names_writes_nothing(name: str, said: str, tmp_path: Path) -> None:
-    how: dict[str, Any] = {"pad": "coarse", "device": "cpu"} | {name: "none"}
+    how: dict[str, Any] = {"level": "coarse", "device": "cpu"} | {name: "none"}
     with pytest.raises(InputError, match=name) as told:
         run_calibrate_markers(SENSOR, tmp_path / "out", quick=True, seed=0, start=0.0, **how)
     assert said in str(told.value) and not list(tmp_path.iterdir())
