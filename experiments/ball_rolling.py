@@ -18,6 +18,7 @@ from experiments.running import recorded, run
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.io import CommonOptions, Metric, parse_resolution
+from raytac.optics import Taxim
 from raytac.world import TactileWorld
 
 
@@ -97,7 +98,8 @@ MARKERS = {"rigid": "fots", "ipc": "surface"}
 
 
 def make_world(args: Args, physics: str) -> TactileWorld:
-    optics = OPTICS[physics] if args.optics is None else args.optics
+    name = OPTICS[physics] if args.optics is None else args.optics
+    optics = Taxim(shadows=False) if name == "taxim" else name
     return TactileWorld(
         args.scene,
         physics=physics,
@@ -107,7 +109,7 @@ def make_world(args: Args, physics: str) -> TactileWorld:
         resolution=parse_resolution(args.resolution),
         device=args.device,
         seed=args.seed,
-        sensor_options={"pitch": PITCH, **({"optics_options": {"shadows": False}} if optics == "taxim" else {})},
+        pitch=PITCH,
     )
 
 
@@ -116,7 +118,7 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
     (name,) = world.sensor_names
     state = world.reset()
     goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
-    controller = RollingController(world, 0, goals, STROKES[world.physics])
+    controller = RollingController(world, 0, goals, STROKES[world.physics.label.partition("-")[0]])
     record = Record([], [], [], [], [], [], [], [], [], [], [])
     frame = world.observe()[name]  # kernels are compiled here
     next_picture = 0.0
@@ -136,7 +138,6 @@ def roll(world: TactileWorld, args: Args) -> tuple[RollingController, Record]:
         record.ball.append(state.world_from_body["ball"][0, :3, 3])
         record.pad.append(state.world_from_pad[name][0])
         record.wrench.append(state.wrench[name][0])
-        assert frame.markers is not None
         record.markers.append(float(np.nanmax(np.linalg.norm(frame.markers.displacement[0], axis=-1))))
         if "min_gap" in state.report:
             record.resolved.append((float(state.report["min_gap"][0]), float(state.report["min_det"][0])))
@@ -161,7 +162,6 @@ def picture(frame: TactileFrame) -> np.ndarray:
     """The image, enlarged, with the markers' displacements over it, ``ARROW_SCALE`` times as long; (H, W, 3) uint8."""
     from PIL import Image, ImageDraw
 
-    assert frame.rgb is not None and frame.markers is not None
     height, width = frame.rgb.shape[1:3]
     factor = -(-LEAST_WIDTH // width)
     image = Image.fromarray(frame.rgb[0]).resize((factor * width, factor * height), Image.Resampling.BILINEAR)
@@ -217,7 +217,7 @@ def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
     above.plot(*(1e3 * (pad[:, :2, 3] - start)).T, color="0.75", lw=0.8, label="pad's middle")
     above.plot(*(1e3 * (ball[:, :2] - start)).T, color="C0", label="ball")
     above.plot(*np.array(args.goals_mm).T, "x", color="C3", ms=9, label="goals")
-    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics} pad, from above")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{world.physics.label} pad, from above")
     above.legend(loc="best", fontsize="small")
     rows = (
         ("force on\nthe pad [N]", (wrench[:, :3], ("x", "y", "z"))),
@@ -276,7 +276,7 @@ def strip(record: Record, world: TactileWorld, path: Path, count: int = 8) -> No
         )
         place.set_xlabel("x [mm]" if n + columns >= len(chosen) else "")
         place.set_ylabel("y [mm]" if n % columns == 0 else "")
-    figure.suptitle(f"{world.physics} pad: tactile image, displacements of the markers × {ARROW_SCALE:g}", fontsize=11)
+    figure.suptitle(f"{world.physics.label} pad: tactile image, displacements of the markers × {ARROW_SCALE:g}", fontsize=11)
     figure.savefig(path, dpi=110)
 
 

@@ -17,24 +17,22 @@ Keys: ``DEVICE.SCENE.EDGES[xENVS].lists_ms``, ``.bvh_ms``, ``.bvh_speedup``, ``.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import tyro
 import warp as wp
 from bench_ipc_scenes import D_HAT, GAP, MATERIAL, RADIUS, SIZE, THICKNESS, ball_surface, peg_world
 from numpy.typing import NDArray
 
 import ipc
-from ipc.collision import Collision
-from ipc.layout import Layout, build_layout, rotation_matrix
+from experiments.running import recorded, run
+from ipc.bodies import Layout, build_layout, rotation_matrix
+from ipc.contact import Collision
 from ipc.meshes import surface_of
 from raytac.errors import InputError, RaytacError
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, parse_names
 
 WAYS = ("lists", "bvh")
 SUNK = 0.5e-3
@@ -168,8 +166,7 @@ def search(scene: Scene, way: str, envs: int, device: wp.Device, seconds: float)
     return whole, median_time(once, clock, seconds), found
 
 
-def main(args: Args) -> int:
-    begin = time.perf_counter()
+def main(args: Args) -> None:
     names = parse_names(args.scenes, "scenes", tuple(SCENES))
     counts = parse_names(args.envs, "envs")
     if not all(count.isdecimal() and int(count) > 0 for count in counts):
@@ -180,44 +177,37 @@ def main(args: Args) -> int:
     wp.init()
     device = wp.get_device({"auto": "cuda" if wp.is_cuda_available() else "cpu"}.get(args.device, args.device))
     kind = "cuda" if device.is_cuda else "cpu"
-    metrics: dict[str, Metric] = {}
-    print(f"{'scene':24} {'body pairs':>10} {'vertices':>8} {'pairs':>8} {'lists':>10} {'bvh':>10} {'lists/bvh':>9}")
-    for name in names:
-        for scene in SCENES[name]():
-            layout = scene[0]
-            edges = len(layout.edges)
-            for envs in map(int, counts):
-                if edges > args.most or (envs > 1 and edges > 3000):
-                    continue
-                key = f"{kind}.{name}.{edges}" + (f"x{envs}" if envs > 1 else "")
-                (by_lists, one_lists, pairs), (by_bvh, one_bvh, same) = (
-                    search(scene, way, envs, device, args.seconds) for way in WAYS
-                )
-                if pairs != same:
-                    raise RaytacError(f"{key}: lists found {pairs} pairs, hierarchies {same}")
-                metrics |= {
-                    f"{key}.lists_ms": 1e3 * by_lists,
-                    f"{key}.bvh_ms": 1e3 * by_bvh,
-                    f"{key}.bvh_speedup": by_lists / by_bvh,
-                    f"{key}.pairs": sum(pairs),
-                    f"{key}.body_pairs": len(layout.pairs),
-                }
-                if envs > 1:
-                    metrics |= {f"{key}.one_lists_ms": 1e3 * one_lists, f"{key}.one_bvh_ms": 1e3 * one_bvh}
-                print(
-                    f"{key:24} {len(layout.pairs):10d} {len(layout.vert_body):8d} {sum(pairs):8d} "
-                    f"{1e3 * by_lists:7.3f} ms {1e3 * by_bvh:7.3f} ms {by_lists / by_bvh:9.2f}"
-                    + (f"   of one: {1e3 * one_lists:7.3f} ms {1e3 * one_bvh:7.3f} ms" if envs > 1 else ""),
-                    flush=True,
-                )
-    common = {"experiment": "bench_broad", "device": str(device), "seed": args.seed, **versions((*VERSIONED, "warp-lang"))}
-    with result_folder(args.out or Path("runs/bench_broad"), ("metrics.json",)) as folder:
-        write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})
-    return 0
+    with recorded(args, "bench_broad", device=str(device), owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+        print(f"{'scene':24} {'body pairs':>10} {'vertices':>8} {'pairs':>8} {'lists':>10} {'bvh':>10} {'lists/bvh':>9}")
+        for name in names:
+            for scene in SCENES[name]():
+                layout = scene[0]
+                edges = len(layout.edges)
+                for envs in map(int, counts):
+                    if edges > args.most or (envs > 1 and edges > 3000):
+                        continue
+                    key = f"{kind}.{name}.{edges}" + (f"x{envs}" if envs > 1 else "")
+                    (by_lists, one_lists, pairs), (by_bvh, one_bvh, same) = (
+                        search(scene, way, envs, device, args.seconds) for way in WAYS
+                    )
+                    if pairs != same:
+                        raise RaytacError(f"{key}: lists found {pairs} pairs, hierarchies {same}")
+                    metrics |= {
+                        f"{key}.lists_ms": 1e3 * by_lists,
+                        f"{key}.bvh_ms": 1e3 * by_bvh,
+                        f"{key}.bvh_speedup": by_lists / by_bvh,
+                        f"{key}.pairs": sum(pairs),
+                        f"{key}.body_pairs": len(layout.pairs),
+                    }
+                    if envs > 1:
+                        metrics |= {f"{key}.one_lists_ms": 1e3 * one_lists, f"{key}.one_bvh_ms": 1e3 * one_bvh}
+                    print(
+                        f"{key:24} {len(layout.pairs):10d} {len(layout.vert_body):8d} {sum(pairs):8d} "
+                        f"{1e3 * by_lists:7.3f} ms {1e3 * by_bvh:7.3f} ms {by_lists / by_bvh:9.2f}"
+                        + (f"   of one: {1e3 * one_lists:7.3f} ms {1e3 * one_bvh:7.3f} ms" if envs > 1 else ""),
+                        flush=True,
+                    )
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args)))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

@@ -20,20 +20,18 @@ there was to see; ``force_n`` of each, and ``truth_force_n``.
 
 from __future__ import annotations
 
-import sys
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 import ipc
-from raytac.errors import InputError, RaytacError
+from experiments.running import recorded, run
+from raytac.errors import InputError
 from raytac.gel import CoatMesh
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
-from raytac.markers import bind
+from raytac.io import CommonOptions, Metric, parse_names
+from raytac.markers import bind_to_coat
 from raytac.physics import PadLevel, PadMesh, SoftPad, pad_mesh
 from raytac.shapes import object_height
 from raytac.specs import PADS, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
@@ -67,15 +65,14 @@ class Args(CommonOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
-    def run(self) -> int:
-        start = time.perf_counter()
+    def run(self) -> None:
         levels, shapes = parse_names(self.levels, "levels"), parse_names(self.shapes, "shapes")
         for value, name, choices in [(v, "levels", PADS) for v in levels] + [(v, "shapes", (*SHAPES, BALL)) for v in shapes]:
             if value not in choices:
                 raise InputError(name, value=value, rule="must be known", choices=tuple(choices))
         spec = load_sensor(self.sensor)
-        metrics: dict[str, Metric] = {"command": "bench_coat", "cell_um": self.cell_um, "seed": self.seed, "device": "cpu"}
-        with result_folder(self.out or Path("runs") / "bench_coat", ("metrics.json",)) as folder:
+        with recorded(self, "bench_coat", device="cpu", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+            metrics["cell_um"] = self.cell_um
             if BALL in shapes:
                 metrics |= marked(spec, levels, 4e-6 * self.cell_um)
             for shape in (shape for shape in shapes if shape != BALL):
@@ -89,12 +86,9 @@ class Args(CommonOptions):
                             at = SHAPES[shape] + np.linspace(low, high, 200)
                             off = np.interp(at, *section) - np.interp(at, *truth)
                             metrics[f"{shape}.{level}.{kind}{name}_um"] = 1e6 * float(np.sqrt((off**2).mean()))
-            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
-            write_metrics(folder / "metrics.json", metrics)
         for key, value in metrics.items():
             if not key.startswith("versions"):
                 print(f"{key} = {value:.5g}" if isinstance(value, float) else f"{key} = {value}")
-        return 0
 
 
 Section = tuple[np.ndarray, np.ndarray]
@@ -113,24 +107,23 @@ def pressed(spec: SensorSpec, shape: str, mesh: PadMesh, *, as_truth: bool = Fal
         (stage,) = wanted.trajectory
         assert stage.depth is not None
         deeper = replace(wanted, trajectory=(stage, replace(stage, depth=stage.depth + _DEEPER)))
-        pad = SoftPad(spec, deeper, pitch=0.05e-3, pad=mesh)
+        pad = SoftPad(spec, deeper, pitch=0.05e-3, level=mesh)
         state = next(state for state in pad.run() if state.stage == 0)
-        assert pad.solver is not None and state.reading is not None
+        assert pad.solver is not None
 
         def on_line(values: np.ndarray) -> np.ndarray:
             return values[0].reshape(rows, columns, 3)[:, columns // 2]
 
         if as_truth:
-            line, load = on_line(state.reading.vertices), -on_line(state.reading.forces)[:, 2]
+            line, load = on_line(state.solved.vertices), -on_line(state.solved.forces)[:, 2]
             even = np.linspace(-2e-3, 2e-3, 801)
-            under = object_height(pad.parts, state.reading.poses[0], np.array([-1e-5, 0.0, 1e-5]), even)[0, :, 1]
+            under = object_height(pad.parts, state.pad_from_object, np.array([-1e-5, 0.0, 1e-5]), even)[0, :, 1]
             under = np.interp(line[:, 1], even, under, left=np.inf, right=np.inf)
             there = np.isfinite(under) & (load > 0.0)
             short = float((load[there] * (line[there, 2] - under[there])).sum() / load[there].sum())
             (state,) = pad.follow(replace(stage, depth=stage.depth + short))
-    assert state.reading is not None
-    line = on_line(state.reading.vertices)
-    shown = pad.surface(state).height[0][:, pad.grid.shape[1] // 2].astype(float)
+    line = on_line(state.solved.vertices)
+    shown = state.surface.height[0][:, pad.grid.shape[1] // 2].astype(float)
     return (line[:, 1], line[:, 2]), float(state.normal_force[0]), (pad.grid.y, shown)
 
 
@@ -144,11 +137,11 @@ def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, 
         truth = np.zeros(0)
         for level in ("truth", *levels):
             mesh = truth_mesh if level == "truth" else pad_mesh(spec.gelpad, level)
-            pad = SoftPad(spec, PressScene(BALL, target, stages), pitch=0.1e-3, pad=mesh)
+            pad = SoftPad(spec, PressScene(BALL, target, stages), pitch=0.1e-3, level=mesh)
             state = pad.peak(pad.run())
-            surface, reading = pad.surface(state), state.reading
-            assert reading is not None and surface.coat is not None
-            vertices, weights = bind(mesh.coat, probes)
+            surface, reading = state.surface, state.solved
+            assert surface.coat is not None
+            vertices, weights = bind_to_coat(mesh.coat, probes)
             solver, shown = (
                 (weights[..., None] * (at[0] - mesh.coat.rest)[vertices]).sum(axis=1)[:, :2]
                 for at in (reading.vertices, surface.coat.positions)
@@ -215,13 +208,5 @@ def steps(first: float, length: float, growth: float) -> np.ndarray:
     return np.asarray(at) * (length / at[-1])
 
 
-def main() -> int:
-    try:
-        return tyro.cli(Args).run()
-    except (InputError, RaytacError) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(Args.run, Args)

@@ -11,23 +11,20 @@ are the coat's vertices of a medium pad: what physics costs comes on top. Median
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import tyro
 
-from raytac.errors import InputError, RaytacError
+from experiments.running import recorded, run
+from raytac.errors import InputError
 from raytac.gel import DeformedCoat, GelSurface
-from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
-from raytac.markers import MARKER_MODELS, PUBLISHED, MarkerTracker
+from raytac.io import CommonOptions
+from raytac.markers import MARKERS, MarkerTracker
 from raytac.physics import RigidPad, pad_mesh
 from raytac.report import machine
 from raytac.specs import MarkerMotionSpec, ObjectSpec, PressScene, PunchSpec, SensorSpec, StageSpec, load_sensor
 
-MODELS = (*MARKER_MODELS, PUBLISHED)
 NAMES = {"surface": "surface_markers"}
 """Model to the first word of its keys, where that differs."""
 
@@ -40,7 +37,7 @@ class Args(CommonOptions):
     """Sensor with markers."""
     envs: str = "1,64"
     """Numbers of environments, joined by commas."""
-    models: str = ",".join(MODELS)
+    models: str = ",".join(MARKERS.names)
     """Models, joined by commas."""
     frames: int = 200
     """Frames of one environment that are timed, after a tenth as many to warm up; batches time fewer."""
@@ -63,7 +60,7 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
     rng = np.random.default_rng(0)
     found = []
     for state in pad.run(steps_per_stage=2):
-        surface = pad.surface(state)
+        surface = state.surface
         rows = np.arange(envs) % few
         positions = coat.rest[None] + 1e-4 * rng.standard_normal((envs, *coat.rest.shape))
         pose = np.asarray(surface.pad_from_object)[rows]
@@ -83,9 +80,6 @@ def pressed(sensor: SensorSpec, envs: int) -> list[GelSurface]:
 def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Args) -> tuple[list[float], str]:
     """Times of frames per environment [ms], after warming up, and the device."""
     envs = surfaces[0].batch
-    if model == PUBLISHED:
-        assert sensor.marker_motion is not None
-        model, sensor = "fots", replace(sensor, marker_motion=replace(sensor.marker_motion, punch=None))
     tracker = MarkerTracker(sensor, model, surfaces[0].grid, num_envs=envs, device=args.device)
     count = max(10, args.frames // envs)
     times = []
@@ -100,51 +94,36 @@ def measure(model: str, sensor: SensorSpec, surfaces: list[GelSurface], args: Ar
     return times[-count:], tracker.model.device
 
 
-def main(args: Args) -> int:
-    begin = time.perf_counter()
+def main(args: Args) -> None:
     texts, models = args.envs.split(","), args.models.split(",")
     if not all(text.strip().isdecimal() and int(text) for text in texts):
         raise InputError("envs", value=args.envs, rule="must be whole numbers >= 1, joined by commas")
     for model in models:
-        if model not in MODELS:
-            raise InputError("models", value=model, rule="must be known marker models, joined by commas", choices=MODELS)
+        if model not in MARKERS.names:
+            raise InputError("models", value=model, rule="must be known marker models, joined by commas", choices=MARKERS.names)
     if args.frames < 1:
         raise InputError("frames", value=args.frames, rule="must be at least 1")
     sensor = load_sensor(args.sensor)
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
         motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
         sensor = replace(sensor, marker_motion=motion)
-    metrics: dict[str, Metric] = {}
-    for envs in map(int, texts):
-        surfaces = pressed(sensor, envs)
-        for model in models:
-            times, device = measure(model, sensor, surfaces, args)
-            key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
-            metrics |= {
-                f"{key}.ms_per_frame": float(np.median(times)),
-                f"{key}.ms_per_frame_least": float(np.min(times)),
-                f"{key}.device": device,
-            }
-            print(
-                f"{model:14} {envs:5d} environments  {np.median(times):8.3f} ms a frame  (least {np.min(times):.3f})  on {device}"
-            )
-    common = {
-        "experiment": "bench_markers",
-        "sensor": sensor.name,
-        "markers": sensor.markers.rows * sensor.markers.columns,
-        "device": args.device,
-        "seed": args.seed,
-        "cores": os.cpu_count() or 1,
-        **versions((*VERSIONED, "warp-lang")),
-        **machine(),
-    }
-    with result_folder(args.out or Path("runs/bench_markers"), ("metrics.json",)) as folder:
-        write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})
-    return 0
+    with recorded(args, "bench_markers", device=args.device, owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+        count = sensor.markers.rows * sensor.markers.columns
+        metrics |= {"sensor": sensor.name, "markers": count, "cores": os.cpu_count() or 1, **machine()}
+        for envs in map(int, texts):
+            surfaces = pressed(sensor, envs)
+            for model in models:
+                times, device = measure(model, sensor, surfaces, args)
+                key = NAMES.get(model, model) + (f".x{envs}" if envs > 1 else "")
+                metrics |= {
+                    f"{key}.ms_per_frame": float(np.median(times)),
+                    f"{key}.ms_per_frame_least": float(np.min(times)),
+                    f"{key}.device": device,
+                }
+                print(
+                    f"{model:14} {envs:5d} environments  {np.median(times):8.3f} ms a frame  (least {np.min(times):.3f})  on {device}"
+                )
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args)))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from tqdm import tqdm
 
+from experiments.running import recorded, run
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, Progress, parse_names
+from raytac.optics import RayTraced
 from raytac.report import (
     References,
     Tracers,
@@ -61,7 +61,7 @@ name, device, scene, updates, resolution = sys.argv[1:]
 sensor = raytac.TactileSensor(name, outputs=("rgb",), device=device, resolution=tuple(map(int, resolution.split("x"))))
 frame = sensor.press(scene)
 done = time.perf_counter()
-assert frame.rgb is not None and frame.rgb.max() > 0
+assert frame.rgb.max() > 0
 result = {"import_s": imported - start, "first_image_s": done - start}
 def resident_mb():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
@@ -124,7 +124,7 @@ class Bench:
 
     def tracer(self, size: tuple[int, int] | None = None, **options: Any) -> Any:
         """Ray tracer of this size and device, as ``Tracers.get`` says."""
-        return self.tracers.get(size or self.size, **options)
+        return self.tracers.get(size or self.size, RayTraced(**options))
 
 
 # ------------------------------------------------------------------------------------------------------------ building blocks
@@ -166,11 +166,11 @@ def speed(bench: Bench) -> dict[str, Metric]:
                 1
             ]
         tracer = bench.tracer(None if (width, height) == bench.size else (width, height))
-        for batch in tqdm(batches, desc=f"speed {name}", leave=False, disable=None):
+        for batch in Progress(batches, desc=f"speed {name}", leave=False):
             inputs = moving(list(surfaces.values()), batch, 6 if batch < 64 else 3)
 
             def on_device(heights: Any, tracer: Any = tracer) -> None:
-                dr.eval(tracer.render_device(heights)["rgb"])
+                dr.eval(tracer.render_device(heights).rgb)
                 dr.sync_thread()
 
             host = timed(tracer.render, inputs, bench.frames)
@@ -198,7 +198,7 @@ def error(bench: Bench, references: References) -> dict[str, Metric]:
     metrics: dict[str, Metric] = {"reference.spp": bench.spp}
     inputs = moving(list(bench.surfaces.values()), 1, 6)
     variants = {"fast": FAST_VARIANTS["fast"]} if bench.args.quick else FAST_VARIANTS
-    for variant, options in tqdm(variants.items(), desc="error", leave=False, disable=None):
+    for variant, options in Progress(variants.items(), desc="error", leave=False):
         tracer = bench.tracer(**options)
         encode, key = tracer.response.encode_numpy, f"{variant}.{bench.key}"
         for scene, surface in bench.surfaces.items():
@@ -280,7 +280,7 @@ def peer(bench: Bench, references: References) -> dict[str, Metric]:
         tracer = bench.tracer(integrator=kind, progress=kind == "reference")
         rows_of: list[list[Row]] = []
         ratios: dict[str, list[float]] = {"": [], "_linear": [], "_without_rebuild": []}
-        for scene, surface in tqdm(bench.surfaces.items(), desc=f"peer {kind}", leave=False, disable=None):
+        for scene, surface in Progress(bench.surfaces.items(), desc=f"peer {kind}", leave=False):
             rows = trace_rows(bench, tracer, surface, references.linear(scene, surface))
             rebuild = rebuild_ms(tracer, surface, max(3, bench.frames // 6))
             rows_of.append(rows)
@@ -460,7 +460,6 @@ def draw(metrics: dict[str, Metric], bench: Bench, path: Path) -> None:
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     parts = parse_names(args.parts, "parts", PARTS)
     scenes = parse_names(args.scenes, "scenes")
     if args.spp < 2 or args.frames < 1:
@@ -475,8 +474,6 @@ def main(args: Args) -> None:
     tracers = Tracers(spec, device, args.seed)
     bench = Bench(args, device, spec, size, surfaces, frames, spp, peer_spp, out, tracers)
     references = References(out / "references", tracers, size, spp)
-    metrics: dict[str, Metric] = {"experiment": "bench_optics", "device": device, "seed": args.seed, **versions(), **machine()}
-    metrics |= {"frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
     jobs: dict[str, Callable[[], dict[str, Metric]]] = {
         "speed": lambda: speed(bench),
         "error": lambda: error(bench, references),
@@ -485,7 +482,8 @@ def main(args: Args) -> None:
         "memory": lambda: memory(bench),
         "first_image": lambda: first_image(bench),
     }
-    with result_folder(out) as folder:
+    with recorded(args, "bench_optics", device=device) as (folder, metrics):
+        metrics |= {**machine(), "frames": bench.frames, "grid_pitch_mm": 1e3 * next(iter(surfaces.values())).grid.pitch[0]}
         for part in parts:
             began = time.perf_counter()
             metrics |= jobs[part]()
@@ -493,14 +491,9 @@ def main(args: Args) -> None:
             print(f"{part}: {metrics[f'wall_s.{part}']:.1f} s")
         if "peer" in parts:
             draw(metrics, bench, folder / "pareto.png")
-        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
-        write_metrics(folder / "metrics.json", metrics)
+        metrics["machine.load_at_end"] = os.getloadavg()[0]
     print(as_text(metrics, bench))
-    print(f"{out / 'metrics.json'}" + (f", {out / 'pareto.png'}" if "peer" in parts else ""))
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as problem:
-        sys.exit(f"error: {problem}")
+    run(main, Args)

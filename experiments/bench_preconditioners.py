@@ -1,10 +1,10 @@
 """Which preconditioner makes a press step fast? Block-Jacobi, the rest inverse with and without contacts, and FSAI.
 
     python experiments/bench_preconditioners.py --sizes 300,1400 --out runs/bench_preconditioners
-    python experiments/bench_preconditioners.py --device cuda --sizes 300,1400,5300 --envs 1,128
+    python experiments/bench_preconditioners.py --device cuda --sizes 300,1400,5300 --envs 1,128 --linear-tolerance 1e-6
 
 The press of ``experiments/bench_ipc.py`` at ν = 0.45 and 0.49. Block-Jacobi has kernels of its own, all iterations of an environment in
-one thread on the CPU and in one block of threads on CUDA; the others are applied from the common loop, which is NumPy's on the CPU.
+one thread on the CPU and in one block of threads on CUDA; the others are applied from the common loop, launch by launch.
 FSAI is Warp's (adaptive, 32 entries a row, single precision, refitted in every Newton iteration to the matrix with the diagonal blocks
 of the contacts). Times are medians over the steps after the first; on a machine that others use too, the processor time says more than
 the clock, with one thread of BLAS (OPENBLAS_NUM_THREADS=1). On CUDA the stages are those of further steps launch by launch.
@@ -25,8 +25,8 @@ import warp as wp
 from bench_ipc_scenes import CELLS, D_HAT, DT, FRICTION, GAP, MATERIAL, PRESS, RADIUS, TRAVEL, ball_surface, press_pad
 
 import ipc
-from ipc import linear
-from ipc.rest_inverse import RestInverse
+from ipc.solver import linear
+from ipc.solver.preconditioners import RestInverse
 from raytac.errors import RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
 
@@ -46,6 +46,8 @@ class Args(CommonOptions):
     """Numbers of environments, joined by commas."""
     poisson: str = "0.45,0.49"
     """Poisson's ratios, joined by commas."""
+    linear_tolerance: float = ipc.Settings.linear_tolerance
+    """Relative residual of the linear solves."""
     kinds: str = "block_jacobi,fsai,rest_alone,rest_inverse"
     """Which: block_jacobi, fsai, rest_alone (without contacts), rest_inverse, rest_whole (never condensed), joined by commas."""
 
@@ -147,7 +149,8 @@ def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict
     mesh, base = press_pad(CELLS[size], "alike")
     pad = ipc.SoftBody("pad", mesh, replace(MATERIAL, poisson=poisson), bonded=base)
     ball = ipc.KinematicBody("ball", ball_surface(), ipc.Pose((0, 0, RADIUS + GAP)))
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, preconditioner="block_jacobi")
+    options: dict[str, Any] = {"preconditioner": "block_jacobi", "linear_tolerance": args.linear_tolerance}
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION, **options)
     world = ipc.World([pad, ball], settings, num_envs=envs, device=args.device)
     solver, begin = world._newton, time.perf_counter()
     lanes, on = solver.potential.collision.lanes, world.device
@@ -220,7 +223,8 @@ def main(args: Args) -> int:
                 for kind in kinds:
                     metrics |= measure(size, count, nu, kind, args)
     versioned = versions((*VERSIONED, "warp-lang"))
-    common = {"experiment": "bench_preconditioners", "device": args.device, "seed": args.seed, **versioned}
+    run = {"device": args.device, "seed": args.seed, "linear_tolerance": args.linear_tolerance}
+    common = {"experiment": "bench_preconditioners", **run, **versioned}
     with result_folder(args.out or Path("runs/bench_preconditioners"), ("metrics.json",)) as folder:
         write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})
     return 0

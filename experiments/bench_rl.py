@@ -17,19 +17,16 @@ stays where it is. ``numpy_frames_per_s`` is what the same costs with arrays of 
 from __future__ import annotations
 
 import itertools
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import tyro
 
+from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv
-from raytac.errors import RaytacError
 from raytac.gel import ElasticSurround, GelSurface
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, parse_resolution, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, versions
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
 from raytac.report import machine
 from raytac.sensor import TactileSensor
@@ -67,30 +64,21 @@ class Args(CommonOptions):
 
 def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
-    start = time.perf_counter()
     known = tuple(FRAMES) if args.frames else tuple(MODES)
     names = parse_names(args.modes or ",".join(name for name in known if name != "none"), "modes", known)
     device = resolve_device(args.device)
     parse_resolution(args.size)
-    found: dict[str, Metric] = {"device": device, "envs": args.envs, "steps": args.steps, **machine()}
-    with result_folder(args.out or Path("runs/bench_rl"), ("metrics.json",)) as folder:
+    with recorded(args, "bench_rl", device=device, owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
+        metrics |= {"envs": args.envs, "steps": args.steps, **machine()}
         for name in names:
             if args.frames:
                 where = "gpu" if device == "cuda" else "cpu"
-                found |= {f"{where}.{name}.{key}": value for key, value in frames(FRAMES[name], args).items()}
-                print(f"{name}: {found[f'{where}.{name}.frames_per_s']:.0f} frames/s")
+                metrics |= {f"{where}.{name}.{key}": value for key, value in frames(FRAMES[name], args).items()}
+                print(f"{name}: {metrics[f'{where}.{name}.frames_per_s']:.0f} frames/s")
             else:
-                found |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
-                print(f"{name}: {found[f'push.{name}.env_steps_per_s']:.0f} environment steps/s")
-        found |= {
-            "experiment": "bench_rl",
-            "seed": args.seed,
-            "wall_s": time.perf_counter() - start,
-            **versions((*VERSIONED, "gymnasium")),
-        }
-        write_metrics(folder / "metrics.json", found)
-    print(f"-> {args.out or Path('runs/bench_rl')}")
-    return found
+                metrics |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
+                print(f"{name}: {metrics[f'push.{name}.env_steps_per_s']:.0f} environment steps/s")
+    return metrics
 
 
 def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
@@ -209,7 +197,4 @@ class Policy:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args, __doc__)

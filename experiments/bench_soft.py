@@ -18,18 +18,17 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
 
-from raytac.errors import InputError, RaytacError
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
-from raytac.physics import PadLevel, SoftPad, pad_mesh
+from experiments.running import recorded, run
+from raytac.errors import InputError
+from raytac.io import CommonOptions, Metric, parse_names
+from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
@@ -52,21 +51,16 @@ class Args(CommonOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
-    def run(self) -> int:
-        start = time.perf_counter()
+    def run(self) -> None:
         levels = parse_names(self.levels, "levels")
         for level in levels:
             if level not in PADS:
                 raise InputError("levels", value=level, rule="must be a known level", choices=PADS)
-        out = self.out or Path("runs") / "bench_soft"
-        with result_folder(out, ("metrics.json",)) as folder:
-            metrics = measured(load_sensor(self.sensor), levels, self.refined, self.presses, self.device, self.seed)
-            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
-            write_metrics(folder / "metrics.json", metrics)
+        with recorded(self, "bench_soft", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+            metrics |= measured(load_sensor(self.sensor), levels, self.refined, self.presses, self.device, self.seed)
         for key, value in metrics.items():
             if not key.startswith("versions"):
                 print(f"{key} = {value:.5g}" if isinstance(value, float) else f"{key} = {value}")
-        return 0
 
 
 def ball(*stages: StageSpec, dynamics: str = "kinematic") -> PressScene:
@@ -75,12 +69,12 @@ def ball(*stages: StageSpec, dynamics: str = "kinematic") -> PressScene:
 
 
 def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: int, device: str, seed: int) -> dict[str, Metric]:
-    metrics: dict[str, Metric] = {"command": "bench_soft", "seed": seed}
+    metrics: dict[str, Metric] = {}
     heights, touched = {}, {}
     scene = ball(StageSpec("indent", depth=DEPTH))
     for level in [*levels, *(["refined"] if refined else [])]:
         pad = pad_mesh(spec.gelpad, REFINED) if level == "refined" else level
-        sensor = TactileSensor(spec, physics="ipc", pad=pad, device=device, seed=seed)
+        sensor = TactileSensor(spec, physics=Ipc(pad), device=device, seed=seed)
         metrics["device"] = sensor.device_used
         sensor.rest()
         loaded = sensor.load(scene)
@@ -106,7 +100,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
             f"soft.{level}.steps_per_s": 1.0 / float(np.median(timed)),
             f"soft.{level}.best_steps_per_s": 1.0 / min(timed),
             f"soft.{level}.imprint_error": float(surface.indentation.max()) / DEPTH - 1.0,
-            f"soft.{level}.force_n": -float(frame.force[0, 2]) if frame.force is not None else float("nan"),
+            f"soft.{level}.force_n": -float(frame.force[0, 2]),
             f"soft.{level}.contact_area_mm2": 1e6
             * float(surface.contact[0].sum())
             * surface.grid.pitch[0]
@@ -145,13 +139,5 @@ def layer_law(spec: SensorSpec) -> float:
     return float(pad.peak(pad.run()).normal_force[0])
 
 
-def main() -> int:
-    try:
-        return tyro.cli(Args).run()
-    except (InputError, RaytacError) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(Args.run, Args)

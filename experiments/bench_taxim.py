@@ -12,7 +12,6 @@ installed (``pip install taxim[jax-cpu]``); it is timed with its own sensor, and
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from tqdm import tqdm
 
+from experiments.running import recorded, run
 from raytac.device import resolve_device
-from raytac.errors import BackendError, RaytacError
+from raytac.errors import BackendError
 from raytac.gel import GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, Progress, parse_names
+from raytac.optics import Phong, RayTraced, Taxim
 from raytac.report import error_metrics, machine, moving, press_peaks, table_errors, timed, timed_within
 from raytac.specs import SensorSpec
 
@@ -53,11 +52,9 @@ class Args(CommonOptions):
 
 def mode_of(spec: SensorSpec, family: str, size: tuple[int, int], device: str, table: Any) -> Any:
     """Optical mode ``taxim``, ``taxim_shadow`` or ``phong``."""
-    from raytac.optics import PhongMode, TaximMode
-
     if family == "phong":
-        return PhongMode(spec, resolution=size, device=device)
-    return TaximMode(spec, calibration=table, shadows=family == "taxim_shadow", resolution=size, device=device)
+        return Phong().build(spec, resolution=size, device=device)
+    return Taxim(calibration=table, shadows=family == "taxim_shadow").build(spec, resolution=size, device=device)
 
 
 def speed(
@@ -70,7 +67,7 @@ def speed(
         (family, batch) for family in ("taxim", "taxim_shadow", "phong") for batch in ((1, 2) if args.quick else BATCHES[device])
     ]
     modes: dict[str, Any] = {}
-    for family, batch in tqdm(jobs, desc=f"speed {name}", leave=False, disable=None):
+    for family, batch in Progress(jobs, desc=f"speed {name}", leave=False):
         mode = modes.setdefault(family, mode_of(spec, family, size, device, table))
         inputs = moving(surfaces, batch, 6 if batch < 64 else 3)
         host = timed(mode.render, inputs, frames)
@@ -105,7 +102,8 @@ def device_call(mode: Any) -> Callable[[Any], None]:
     import drjit as dr
 
     def call(arrays: tuple[Any, Any]) -> None:
-        dr.eval(mode.render_device(*arrays))
+        frame = mode.render_device(*arrays)
+        dr.eval(frame.rgb, frame.flags)
         dr.sync_thread()
 
     return call
@@ -131,24 +129,20 @@ def error(
     spec: SensorSpec, surfaces: dict[str, GelSurface], table: Any, size: tuple[int, int], device: str, seed: int
 ) -> dict[str, Metric]:
     """Contact MAE and PSNR in the box of every scene, against ``fast``."""
-    from raytac.optics import RayTracer
-
-    tracer = RayTracer(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
+    tracer = RayTraced().build(spec, resolution=size, outputs=("rgb",), device=device, seed=seed)
     return error_metrics(table_errors(spec, surfaces, table, tracer))
 
 
 def main(args: Args) -> None:
     from raytac.optics import BakeSettings, baked_table
 
-    start = time.perf_counter()
     device = resolve_device(args.device)
-    out = args.out if args.out is not None else Path("runs") / "bench_taxim"
     scenes = parse_names(args.scenes, "scenes")[: 1 if args.quick else None]
     sizes = {"80x60": (80, 60)} if args.quick else SIZES
     first = next(iter(sizes.values()))
     spec, surfaces = press_peaks(args.sensor, scenes, first, args.seed)
-    metrics: dict[str, Metric] = {"experiment": "bench_taxim", "device": device, "seed": args.seed, **versions(), **machine()}
-    with result_folder(out, ("metrics.json",)) as folder:
+    with recorded(args, "bench_taxim", device=device, owned=("metrics.json",)) as (_, metrics):
+        metrics |= machine()
         began = time.perf_counter()
         settings, baked_at = (BakeSettings.quick(), first) if args.quick else (BakeSettings(), None)
         table = baked_table(spec, device=device, seed=args.seed, settings=settings, resolution=baked_at)
@@ -164,16 +158,11 @@ def main(args: Args) -> None:
             for family, other in (("taxim", "peer"), ("taxim_shadow", "peer_shadow")):
                 mine = 1e3 / float(metrics[f"{family}.{device}.{name}.fps"])
                 metrics[f"{family}.vs_peer_speedup"] = float(metrics[f"{other}.{device}.{name}.ms_per_frame"]) / mine
-        metrics |= {"machine.load_at_end": os.getloadavg()[0], "wall_s": time.perf_counter() - start}
-        write_metrics(folder / "metrics.json", metrics)
+        metrics["machine.load_at_end"] = os.getloadavg()[0]
     for key, value in metrics.items():
         if not key.startswith(("versions.", "machine.")):
             print(f"{key} = {value:.4g}" if isinstance(value, float) else f"{key} = {value}")
-    print(out / "metrics.json")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as problem:
-        sys.exit(f"error: {problem}")
+    run(main, Args)

@@ -28,7 +28,7 @@ from experiments.running import run
 from raytac.device import resolve_device
 from raytac.errors import RaytacError
 from raytac.io import CommonOptions, FolderLock, Metric, npz_bytes, versions, write_atomic, write_metrics
-from raytac.physics import Poses, SceneState
+from raytac.physics import Ipc, Poses, SceneState
 from raytac.specs import load_task
 from raytac.world import TactileWorld
 
@@ -136,7 +136,7 @@ def make_world(args: Args) -> TactileWorld:
         quaternion=(0.0, 1.0, 0.0, 0.0),
     )
     return TactileWorld(
-        replace(scene, robot=robot), physics="ipc", pad=args.pad, coupling=args.coupling, outputs=("wrench",), device=args.device
+        replace(scene, robot=robot), physics=Ipc(args.pad), coupling=args.coupling, outputs=("wrench",), device=args.device
     )
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from raytac.robots import CartesianImpedance, pose
+from raytac.robots import CartesianImpedance
+from raytac.se3 import pose
 from raytac.world import TactileWorld, WorldState
 
 __all__ = ["GraspController", "smooth"]

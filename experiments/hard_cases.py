@@ -23,10 +23,10 @@ from pathlib import Path
 
 import tyro
 
-from experiments.hard_run import Setup, Worst
-from experiments.hard_scenes import CASES, random_presses
 from raytac.errors import RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
+from tests.ipc.hard.run import Setup, Worst
+from tests.ipc.hard.scenes import CASES, random_presses
 
 
 @dataclass(frozen=True, kw_only=True)

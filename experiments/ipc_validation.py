@@ -18,13 +18,28 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 import ipc
-from experiments.contact_meshes import ball_tool, equal_area, even_block, flat_tool, rim_block
-from experiments.contact_oracles import BondedLayer, Elastic, boussinesq_displacement, hertz_force, punch_force
 from raytac.errors import RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
+from tests.ipc.oracles.closed_forms import BondedLayer, Elastic, hertz_force, punch_force
+from tests.ipc.oracles.meshes import ball_tool, equal_area, even_block, flat_tool, rim_block
+from tests.ipc.oracles.presses import (
+    CONTACT,
+    DEPTH,
+    REACH,
+    SOLID,
+    SPHERE,
+    Pressed,
+    cantilever_error,
+    growth,
+    hertz_error,
+    press,
+    press_punch,
+    press_sphere,
+    punch_error,
+    richardson,
+)
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -40,119 +55,6 @@ class Args(CommonOptions):
     """Names joined by commas."""
     cells: str = "4,6,9"
     """Cells to the contact radius of each mesh, joined by commas: rising, each the same multiple of the one before."""
-
-
-SOLID = Elastic(1e5, 0.3)
-CONTACT = 1e-3
-"""Radius of the contact [m]."""
-SPHERE = 50 * CONTACT
-"""Of the ball [m]: strains of about 1 %, so that the closed forms of small strain apply."""
-DEPTH = CONTACT**2 / SPHERE
-REACH = 8.0
-"""Radius and height of the block in contact radii."""
-
-
-@dataclass(frozen=True)
-class Pressed:
-    """What a press came to: force [N], depth with the stand-off added [m], number of vertices, seconds."""
-
-    force: float
-    depth: float
-    vertices: int
-    seconds: float
-
-    def error(self, exact: Callable[[float], float]) -> float:
-        """Relative error of the force against ``exact`` of the depth."""
-        return self.force / float(exact(self.depth)) - 1
-
-
-def press(
-    mesh: ipc.TetMesh,
-    held: NDArray,
-    tool: ipc.TriMesh,
-    depth: float,
-    *,
-    solid: Elastic = SOLID,
-    d_hat: float = 0.01 * CONTACT,
-    kappa: float = 10.0,
-    far_force: float | None = 0.0,
-    device: str = "cpu",
-) -> Pressed:
-    """Press ``tool`` in to about ``depth``, at rest, without friction.
-
-    Args:
-        mesh: upper side at z = 0.
-        held: bonded vertices.
-        tool: its lowest point at z = 0.
-        depth: [m], stand-off included.
-        solid: the material.
-        d_hat: [m].
-        kappa: barrier stiffness as a multiple of Young's modulus.
-        far_force: a first guess of the force [N]: held vertices carry the displacement that Boussinesq gives for the force, found again
-            with the force that came out until that changes by less than 0.1 %. None keeps them at rest.
-        device: Warp device.
-    """
-    begin = time.perf_counter()
-    body = ipc.SoftBody("block", mesh, ipc.Material(solid.young, solid.poisson), bonded=held)
-    settings = ipc.Settings(
-        dt=1e3, d_hat=d_hat, kappa=kappa * solid.young, velocity_tolerance=1e-14, linear_tolerance=1e-4, max_newton=200
-    )
-    start = ipc.Pose((0.0, 0.0, 1.01 * d_hat))
-    world = ipc.World([body, ipc.KinematicBody("tool", tool, start)], settings, device=device)
-    force, found = (0.0 if far_force is None else far_force), np.inf
-    while True:
-        if far_force is not None:
-            state = world.save()
-            state.y[0, held] = mesh.vertices[held] + boussinesq_displacement(solid, force, mesh.vertices[held])
-            world.restore(state)
-        world.set_target("tool", (0.0, 0.0, d_hat - depth))
-        report = world.step()
-        if not report.converged[0]:
-            raise ArithmeticError(f"the press did not converge: {report}")
-        found = float(world.wrench("tool").force[0, 2])
-        if far_force is None or abs(found - force) < 1e-3 * found:
-            break
-        force = found
-    pairs = world.contacts()
-    gap = float(pairs.force @ pairs.gap / pairs.force.sum())
-    return Pressed(found, depth - d_hat + gap, len(mesh.vertices), time.perf_counter() - begin)
-
-
-def growth(cells: float) -> float:
-    """Growth of cells away from the contact that belongs to a resolution: finer meshes grow more slowly."""
-    return 1.25 ** (4 / cells)
-
-
-def press_sphere(cells: int, reach: float = REACH, **options: float | str | None) -> Pressed:
-    """A ball on a half-space, ``cells`` to the contact radius."""
-    mesh, held = even_block(CONTACT, cells, growth(cells), reach * CONTACT)
-    tool = ball_tool(1.6 * CONTACT, round(3.2 * cells), SPHERE)
-    guess = {"far_force": float(hertz_force(SOLID, SPHERE, DEPTH))} | options
-    return press(mesh, held, tool, DEPTH, **guess)  # type: ignore[arg-type]
-
-
-def press_punch(cells: int, reach: float = REACH, **options: float | str | None) -> Pressed:
-    """A flat punch on a half-space, ``cells`` to its radius."""
-    mesh, held = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
-    guess = {"far_force": float(punch_force(SOLID, CONTACT, DEPTH))} | options
-    return press(mesh, held, flat_tool(CONTACT, cells), DEPTH, **guess)  # type: ignore[arg-type]
-
-
-def hertz_error(pressed: Pressed) -> float:
-    """Relative error of a ball's force."""
-    return pressed.error(lambda depth: float(hertz_force(SOLID, SPHERE, depth)))
-
-
-def punch_error(pressed: Pressed) -> float:
-    """Relative error of a punch's force."""
-    return pressed.error(lambda depth: float(punch_force(SOLID, CONTACT, depth)))
-
-
-def richardson(errors: Sequence[float], ratio: float) -> tuple[float, float]:
-    """Order of convergence and the limit of three values whose meshes are each ``ratio`` times finer."""
-    first, second, third = errors
-    order = float(np.log((first - second) / (second - third)) / np.log(ratio))
-    return order, third - (second - third) / (ratio**order - 1)
 
 
 def convergence(
@@ -186,12 +88,12 @@ PAD_SPHERE = 50 * PAD_CONTACT
 def press_pad(cells: int, tool: str, cut: ipc.Cut, device: str) -> tuple[Pressed, float]:
     """A flat pad of 20 × 20 × 4 mm of cubic cells, ``cells`` to its thickness, bonded below; and the oracle's force at that depth."""
     mesh = ipc.domed_pad((5 * PAD, 5 * PAD), PAD, (np.inf, np.inf), (5 * cells, 5 * cells, cells), cut=cut)
-    held = ipc.vertices_in_box(mesh, (-1, -1, -PAD), (1, 1, -PAD))
+    bonded = ipc.vertices_in_box(mesh, (-1, -1, -PAD), (1, 1, -PAD))
     layer = BondedLayer(PAD_SOLID, PAD)
     rings = 2 * round(cells * PAD_CONTACT / PAD) + 6
     surface = ball_tool(1.5 * PAD_CONTACT, rings, PAD_SPHERE) if tool == "ball" else flat_tool(PAD_CONTACT, max(4, rings // 2))
     depth = layer.sphere(PAD_SPHERE, PAD_CONTACT)[0]
-    pressed = press(mesh, held, surface, depth, solid=PAD_SOLID, far_force=None, device=device)
+    pressed = press(mesh, bonded, surface, depth, solid=PAD_SOLID, far_force=None, device=device)
     if tool == "ball":
         return pressed, layer.sphere_force(PAD_SPHERE, pressed.depth)
     return pressed, float(layer.punch_force(PAD_CONTACT, pressed.depth))
@@ -214,7 +116,7 @@ def pads(device: str) -> dict[str, Metric]:
 
 def causes(device: str) -> dict[str, Metric]:
     """One change at a time, at four cells to the radius: where an error of the force comes from."""
-    from experiments.nodal_press import nodal_press
+    from tests.ipc.oracles.nodal_press import nodal_press
 
     n = 4
     errors: dict[str, float] = {}
@@ -234,14 +136,14 @@ def causes(device: str) -> dict[str, Metric]:
         "hertz.kappa_100": {"kappa": 100.0},
     }.items():
         note(name, hertz_error(press_sphere(n, device=device, **options)))
-    mesh, held = even_block(CONTACT, n, growth(n), REACH * CONTACT)
+    mesh, bonded = even_block(CONTACT, n, growth(n), REACH * CONTACT)
     guess = float(hertz_force(SOLID, SPHERE, DEPTH))
     for name, inscribed in (("hertz.tool_as_coarse", False), ("hertz.tool_as_coarse_inscribed", True)):
         tool = ball_tool(1.6 * CONTACT, round(1.6 * n), SPHERE, inscribed)
-        note(name, hertz_error(press(mesh, held, tool, DEPTH, far_force=guess, device=device)))
+        note(name, hertz_error(press(mesh, bonded, tool, DEPTH, far_force=guess, device=device)))
     r2, top = (mesh.vertices[:, :2] ** 2).sum(axis=1), np.isclose(mesh.vertices[:, 2], 0)
     limit = np.where(top & (r2 < (2 * CONTACT) ** 2), r2 / (2 * SPHERE) - DEPTH, np.inf)
-    note("hertz.no_barrier", nodal_press(mesh, held, SOLID, limit) / guess - 1)
+    note("hertz.no_barrier", nodal_press(mesh, bonded, SOLID, limit) / guess - 1)
 
     for name, options in {
         "punch": {},
@@ -251,14 +153,14 @@ def causes(device: str) -> dict[str, Metric]:
     }.items():
         note(name, punch_error(press_punch(n, device=device, **options)))
     around = round(2 * np.pi * n)
-    rim, held_rim = rim_block(CONTACT, n, growth(n), REACH * CONTACT)
+    rim, bonded_rim = rim_block(CONTACT, n, growth(n), REACH * CONTACT)
     under = np.isclose(rim.vertices[:, 2], 0) & (np.hypot(*rim.vertices[:, :2].T) < 1.001 * CONTACT * equal_area(around))
     exact = float(punch_force(SOLID, CONTACT, DEPTH))
-    note("punch.no_barrier", nodal_press(rim, held_rim, SOLID, np.where(under, -DEPTH, np.inf)) / exact - 1)
+    note("punch.no_barrier", nodal_press(rim, bonded_rim, SOLID, np.where(under, -DEPTH, np.inf)) / exact - 1)
     # A rim between the rings of an even mesh: the force is that of a wider punch.
     for quarters in (-2, -1, 0, 1, 2):
         radius = CONTACT * (1 + quarters / (4 * n))
-        pressed = press(mesh, held, flat_tool(radius, n), DEPTH, far_force=exact, device=device)
+        pressed = press(mesh, bonded, flat_tool(radius, n), DEPTH, far_force=exact, device=device)
         where = f"{abs(quarters)}_quarters_{'inside' if quarters < 0 else 'outside'}" if quarters else "on_a_ring"
         note(f"punch.even_mesh_rim_{where}", pressed.force / float(punch_force(SOLID, radius, pressed.depth)) - 1)
     return {f"causes.{name}": value for name, value in errors.items()}
@@ -295,23 +197,6 @@ def block_pressure(device: str) -> dict[str, Metric]:
     return {"block.pressure_pa": pressure, "block.stress_spread": spread}
 
 
-def cantilever_error(cells: int, device: str = "cpu") -> float:
-    """Relative error of the sag of a clamped beam of length 5 heights under its weight against Timoshenko's, ν = 0."""
-    length, height, young, density, g = 0.1, 0.02, 1e6, 1000.0, 0.05
-    x, y = np.linspace(0, length, 5 * cells + 1), np.linspace(0, height, cells + 1)
-    mesh = ipc.box_mesh(x, y, y)
-    clamped = ipc.vertices_in_box(mesh, (0, -1, -1), (0, 1, 1))
-    beam = ipc.SoftBody("beam", mesh, ipc.Material(young, 0.0, density), bonded=clamped)
-    settings = ipc.Settings(dt=1e3, gravity=(0, 0, -g), velocity_tolerance=1e-12, linear_tolerance=1e-8, max_linear=20000)
-    world = ipc.World([beam], settings, device=device)
-    if not world.step().converged[0]:
-        raise ArithmeticError("the beam did not come to rest")
-    end = np.isclose(mesh.vertices[:, 0], length)
-    sag = (mesh.vertices[end, 2] - world.positions("beam")[0, end, 2]).mean()
-    load, bending, shear = density * g * height**2, young * height**4 / 12, 5 / 6 * young / 2 * height**2
-    return float(sag / (load * length**4 / (8 * bending) + load * length**2 / (2 * shear)) - 1)
-
-
 def cantilever(device: str) -> dict[str, Metric]:
     """Sag against cells across the height, each mesh twice as fine."""
     cells = (2, 4, 8, 16)
@@ -335,11 +220,11 @@ def curves(device: str, cells: int = 6) -> tuple[plt.Figure, dict[str, Metric]]:
         for share in (0.25, 0.5, 0.75, 1.0):
             depth = share * DEPTH
             if name == "Sphere":
-                mesh, held = even_block(CONTACT, cells, growth(cells), REACH * CONTACT)
+                mesh, bonded = even_block(CONTACT, cells, growth(cells), REACH * CONTACT)
                 tool = ball_tool(1.6 * CONTACT, round(3.2 * cells), SPHERE)
             else:
-                (mesh, held), tool = rim_block(CONTACT, cells, growth(cells), REACH * CONTACT), flat_tool(CONTACT, cells)
-            points.append(press(mesh, held, tool, depth, far_force=float(exact(depth)), device=device))
+                (mesh, bonded), tool = rim_block(CONTACT, cells, growth(cells), REACH * CONTACT), flat_tool(CONTACT, cells)
+            points.append(press(mesh, bonded, tool, depth, far_force=float(exact(depth)), device=device))
             metrics[f"curve.{name.split()[-1].lower()}.{share}.error"] = points[-1].error(lambda d, f=exact: float(f(d)))
         axis.plot(line * 1e6, exact(line) * 1e3, "k-", lw=1, label="closed form")
         depths, forces = np.array([(p.depth, p.force) for p in points]).T

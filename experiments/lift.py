@@ -20,6 +20,7 @@ from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions
+from raytac.physics import Ipc
 from raytac.specs import TaskScene, load_task
 from raytac.world import TactileWorld, WorldState
 
@@ -138,8 +139,7 @@ def make_world(args: Args, case: str, physics: str) -> TactileWorld:
         )
     return TactileWorld(
         replace(scene, bodies=bodies, robot=robot),
-        physics=physics,
-        pad=args.pad if physics == "ipc" else None,
+        physics=Ipc(args.pad) if physics == "ipc" else physics,
         outputs=("wrench",),
         device=args.device,
         seed=args.seed,
@@ -214,7 +214,7 @@ def summary(world: TactileWorld, record: Record, times: Times) -> dict[str, floa
         "steps": len(t),
         "steps_per_s": 1.0 / float(np.median(record.seconds)),
     }
-    if world.physics == "ipc":
+    if world.physics.is_simulated:
         found |= {
             "min_gap_m": float(np.min(record.gap)),
             "min_det_f": float(np.min(record.det)),

@@ -12,16 +12,13 @@ It generates data: nothing in it is random, and it computes on the CPU whatever 
 from __future__ import annotations
 
 import math
-import sys
-import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import tyro
 
-from raytac.errors import InputError, RaytacError
-from raytac.io import CommonOptions, result_folder, versions, write_metrics
+from experiments.running import recorded, run
+from raytac.errors import InputError
+from raytac.io import CommonOptions
 
 FEWEST_TEETH = 12
 """With fewer, the roots of the teeth would cut into the face, whose outer edge has radius 4.3 m."""
@@ -106,32 +103,21 @@ def main(args: Args) -> None:
 
     from raytac.specs import load_mesh
 
-    start = time.perf_counter()
     args.check()
-    out = args.out if args.out is not None else Path("runs") / "make_gear_mesh"
     vertices, faces = solid(args.teeth, args.module_mm, args.width_mm)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    with result_folder(out, ("gear.stl", "metrics.json")) as folder:
+    with recorded(args, "make_gear_mesh", device="cpu", owned=("gear.stl",)) as (folder, metrics):
         path = folder / "gear.stl"
         mesh.export(path)
         read_vertices, read_faces = load_mesh(path, 0.001)
-        metrics = {
-            "experiment": "make_gear_mesh",
-            "device": "cpu",
-            "seed": args.seed,
-            **versions(),
+        metrics |= {
             "mesh.vertices": len(read_vertices),
             "mesh.faces": len(read_faces),
             "mesh.volume_mm3": float(mesh.volume),
             "mesh.bytes": path.stat().st_size,
-            "wall_s": time.perf_counter() - start,
         }
-        write_metrics(folder / "metrics.json", metrics)
-    print(f"{out / 'gear.stl'}: {len(read_vertices)} vertices, {len(read_faces)} faces, {metrics['mesh.bytes']} bytes")
+        print(f"gear.stl: {len(read_vertices)} vertices, {len(read_faces)} faces, {metrics['mesh.bytes']} bytes")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

@@ -17,7 +17,6 @@ either, and 1 to 2 mm from it; ``force_n`` of all.
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,10 +25,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from raytac.errors import InputError, RaytacError
+from experiments.running import recorded, run
+from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel import GelSurface
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
+from raytac.io import CommonOptions, Metric, parse_names
+from raytac.physics import Ipc
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, load_press
 
@@ -57,7 +58,7 @@ class Args(CommonOptions):
     quick: bool = False
     """Small images of the first scene only: enough to see that all works."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         start = time.perf_counter()
         names = parse_names(self.scenes, "scenes")
         if self.pad not in PADS:
@@ -66,15 +67,14 @@ class Args(CommonOptions):
             raise InputError("against", value=self.against, rule="must be a level with one below it", choices=PADS[1:])
         names = names[:1] if self.quick else names
         if self.against:
-            return self._levels(names, start)
-        out = self.out or Path("runs") / "physics_sheet"
-        with result_folder(out, ("sheet.png", "metrics.json")) as folder:
-            metrics: dict[str, Metric] = {"command": "physics_sheet", "pad": self.pad, "seed": self.seed}
+            self._levels(names, start)
+            return
+        with recorded(self, "physics_sheet", owned=("sheet.png",), packages=("warp-lang",)) as (folder, metrics):
+            metrics["pad"] = self.pad
             sensors = {
                 physics: TactileSensor(
                     self.sensor,
-                    physics=physics,
-                    pad=self.pad if physics == "ipc" else None,
+                    physics=Ipc(self.pad) if physics == "ipc" else physics,
                     outputs=("rgb", "wrench"),
                     device=self.device,
                     seed=self.seed,
@@ -94,20 +94,17 @@ class Args(CommonOptions):
                 rows.append((name, frames["rigid"], frames["ipc"]))
                 print(f"{name}: done after {time.perf_counter() - start:.0f} s", flush=True)
             sheet_figure(rows, sensors["ipc"], self.pad).savefig(folder / "sheet.png", pil_kwargs={"optimize": True})
-            metrics |= {"device": sensors["ipc"].device_used, "wall_s": time.perf_counter() - start}
-            write_metrics(folder / "metrics.json", metrics | versions((*VERSIONED, "warp-lang")))
-        print(out / "sheet.png")
-        return 0
+            metrics["device"] = sensors["ipc"].device_used
 
-    def _levels(self, names: tuple[str, ...], start: float) -> int:
-        out = self.out or Path("runs") / "physics_levels"
-        with result_folder(out, ("metrics.json",)) as folder:
-            metrics: dict[str, Metric] = {"command": "physics_sheet", "against": self.against, "seed": self.seed}
+    def _levels(self, names: tuple[str, ...], start: float) -> None:
+        out = Path("runs") / "physics_levels"
+        with recorded(self, "physics_sheet", out=out, owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+            metrics["against"] = self.against
             for name in names:
                 surfaces = {}
                 for level in PADS[PADS.index(self.against) :: -1]:
                     sensor = TactileSensor(
-                        self.sensor, physics="ipc", pad=level, outputs=("height", "wrench"), device=self.device, seed=self.seed
+                        self.sensor, physics=Ipc(level), outputs=("height", "wrench"), device=self.device, seed=self.seed
                     )
                     frame = sensor.press(load_press(name))
                     surfaces[level] = frame.surface
@@ -117,12 +114,9 @@ class Args(CommonOptions):
                         found = levels_apart(surfaces[level], surfaces[self.against])
                         metrics |= {f"{name}.{level}.{key}": value for key, value in found.items()}
                     print(f"{name}, {level}: done after {time.perf_counter() - start:.0f} s", flush=True)
-            metrics |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "warp-lang"))}
-            write_metrics(folder / "metrics.json", metrics)
         for key, value in metrics.items():
             if isinstance(value, float):
                 print(f"{key} = {value:.4g}")
-        return 0
 
 
 def levels_apart(one: GelSurface, truth: GelSurface) -> dict[str, Metric]:
@@ -141,7 +135,7 @@ def measured(frame: TactileFrame) -> dict[str, Metric]:
         "bulge_mm": -1e3 * float(surface.indentation.min()),
         "contact_mm2": 1e6 * float(surface.contact[0].sum()) * surface.grid.pitch[0] * surface.grid.pitch[1],
     }
-    if frame.force is not None:
+    if "force" in frame.outputs:
         found["force_n"] = -float(frame.force[0, 2])
     return found
 
@@ -197,7 +191,6 @@ def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: Tac
         dents = [1e3 * frame.surface.indentation[0] for frame in (rigid, soft)]
         deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
         for axis, frame in zip(line[:2], (rigid, soft), strict=True):
-            assert frame.rgb is not None
             axis.imshow(frame.rgb[0], extent=(left, right, bottom, top))
         for axis, dent in zip(line[2:4], dents, strict=True):
             shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
@@ -220,13 +213,5 @@ def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: Tac
     return figure
 
 
-def main() -> int:
-    try:
-        return tyro.cli(Args).run()
-    except (InputError, RaytacError) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(Args.run, Args)

@@ -11,11 +11,9 @@ evaluation: no training has seen them.
 from __future__ import annotations
 
 import itertools
-import os
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,11 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import tyro
 
-from raytac.errors import BackendError, InputError, RaytacError
-from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
+from experiments.running import recorded, run
+from raytac.errors import BackendError, InputError
+from raytac.io import CommonOptions, Metric
 from raytac.observe import MODALITIES, ObservationSettings
+from raytac.optics import OPTICS
 from raytac.report import machine
-from raytac.sensor import OPTICS
 
 if TYPE_CHECKING:
     from experiments.ppo_learner import Evaluation, Recipe
@@ -68,21 +67,18 @@ class Film:
 
 
 def main(args: Args) -> dict[str, Metric]:
-    """Play, and write all."""
-    start = time.perf_counter()
+    """Play a policy and write the film, the strip and the metrics."""
     if args.episodes < 0 or args.num_envs < 1:
         name, least = ("episodes", 0) if args.episodes < 0 else ("num_envs", 1)
         raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
-    if args.optics not in OPTICS:
-        raise InputError("optics", value=args.optics, rule="must be a known optical model", choices=OPTICS)
+    OPTICS.config_class(args.optics)
     if args.mp4 and shutil.which("ffmpeg") is None:
         raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
     recipe = _recipe(args)
-    out = args.out or Path("runs/play") / (f"{args.task}_scripted" if recipe is None else Path(args.policy).stem)
-    found: dict[str, Metric] = {"device": "cpu" if args.device == "auto" else args.device, "policy": args.policy, **machine()}
-    found["task"] = args.task if recipe is None else recipe.task
-    names = ("film.gif", "film.mp4", "strip.png", "metrics.json")
-    with result_folder(out, names) as folder:
+    out = Path("runs/play") / (f"{args.task}_scripted" if recipe is None else Path(args.policy).stem)
+    device, files = "cpu" if args.device == "auto" else args.device, ("film.gif", "film.mp4", "strip.png")
+    with recorded(args, "play", out=out, device=device, owned=files, packages=("gymnasium",)) as (folder, metrics):
+        metrics |= {"policy": args.policy, "task": args.task if recipe is None else recipe.task, **machine()}
         if args.film:
             try:
                 film = _film(args, recipe)
@@ -94,23 +90,15 @@ def main(args: Args) -> dict[str, Metric]:
         if args.episodes:
             result = _rate(args, recipe)
             low, high = result.interval
-            found |= {
+            metrics |= {
                 "episodes": result.episodes, "failed": result.failures, "success": result.successes / result.episodes, "success_low": low,
                 "success_high": high, "return": result.mean_return, "length": result.mean_length,
             }  # fmt: skip
             print(
-                f"{found['task']}: success {result.successes}/{result.episodes} (95 %: {low:.3f} to {high:.3f}), "
+                f"{metrics['task']}: success {result.successes}/{result.episodes} (95 %: {low:.3f} to {high:.3f}), "
                 f"return {result.mean_return:.1f}, length {result.mean_length:.0f}"
             )
-        found |= {
-            "experiment": "play",
-            "seed": args.seed,
-            "wall_s": time.perf_counter() - start,
-            **versions((*VERSIONED, "gymnasium")),
-        }
-        write_metrics(folder / "metrics.json", found)
-    print(f"-> {out}")
-    return found
+    return metrics
 
 
 def _recipe(args: Args) -> Recipe | None:
@@ -257,8 +245,4 @@ def _write_strip(film: Film, path: Path, count: int = 4) -> None:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo is imported later, and reads it then
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args, __doc__)

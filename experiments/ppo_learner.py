@@ -1,4 +1,4 @@
-"""What is trained and what it is trained in: recipes, networks, environments with their normaliser, checkpoints, evaluation."""
+"""Recipes, networks, environments with their normaliser, checkpoints and evaluation of a training by PPO."""
 
 # pyright: reportMissingImports=false
 # (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
@@ -45,20 +45,20 @@ KINDS: Mapping[str, type[TactileVectorEnv]] = {
 HELD_OUT = 2**31
 """Seeds of evaluation start here; those of training are below."""
 SMALLEST_SIDE = 36
-"""Of an image [px]: DQN's convolutions (``NatureCNN``, which ``MultiInputPolicy`` uses too) leave nothing of fewer pixels."""
+"""Smallest side of an image [px] for DQN's convolutions (``NatureCNN``, which ``MultiInputPolicy`` uses too)."""
 _SMALL = 64
-"""Observations of up to so many numbers go into the network as they are."""
+"""Greatest size of observations that go into the network unchanged."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that decides what is trained; a checkpoint holds it."""
+    """Settings of a training, with the names of stable-baselines3; a checkpoint holds them."""
 
     task: str
     tactile: str
     """``task``: as the environment has it; ``none``; or modalities joined by ``+``."""
     seed: int
-    steps: int
+    total_timesteps: int
     """Environment steps of the whole training; the learning rate falls to a tenth over them."""
     resolution: str = "48x36"
     """WIDTHxHEIGHT of images [px], where ``rgb`` is felt; by default the smallest of 4:3, the shape of the sensors' view."""
@@ -66,34 +66,34 @@ class Recipe:
     processes: int = 1
     history: int = 1
     """Last observations that the policy is given."""
-    rollout: int = 64
+    n_steps: int = 64
     """Steps of each environment between two updates."""
     segment: int = 20
     """Rollouts between two checkpoints."""
-    epochs: int = 10
-    minibatch: int = 256
+    n_epochs: int = 10
+    batch_size: int = 256
     learning_rate: float = 1e-3
     gamma: float = 0.98
     gae_lambda: float = 0.95
     clip_range: float = 0.2
-    log_std: float = -0.5
-    """Logarithm of the first standard deviation of an action."""
-    entropy: float = 0.0
+    log_std_init: float = -0.5
+    """Logarithm of the initial standard deviation of an action."""
+    ent_coef: float = 0.0
     hidden: int = 64
-    teacher_steps: int = 0
-    """Of the steps, so many at first imitate the scripted policy, which knows the state; 0 is PPO alone."""
+    imitation_steps: int = 0
+    """Environment steps at the beginning that imitate the scripted policy, which knows the state; 0 is PPO alone."""
     device: str = "cpu"
     """Of the network and of the sensors."""
 
     def __post_init__(self) -> None:
         check_seed("seed", self.seed)
-        for name in ("steps", "num_envs", "processes", "rollout", "segment", "epochs", "minibatch"):
+        for name in ("total_timesteps", "num_envs", "processes", "n_steps", "segment", "n_epochs", "batch_size"):
             check_whole(name, getattr(self, name))
-        check_whole("teacher_steps", self.teacher_steps, 0)
+        check_whole("imitation_steps", self.imitation_steps, 0)
         check_whole("history", self.history, 1, 1000)
         check_whole("hidden", self.hidden, 1, 65536)
         ranges = {"learning_rate": "(0, inf)", "gamma": "[0, 1]", "gae_lambda": "[0, 1]", "clip_range": "(0, inf)"}
-        for name, interval in (ranges | {"log_std": "(-inf, inf)", "entropy": "[0, inf)"}).items():
+        for name, interval in (ranges | {"log_std_init": "(-inf, inf)", "ent_coef": "[0, inf)"}).items():
             check_number(name, getattr(self, name), interval)
         for name in ("task", "tactile", "device"):
             if not isinstance(getattr(self, name), str):
@@ -247,7 +247,7 @@ class Learner:
         """
         if recipe.task not in KINDS:
             raise InputError("task", value=recipe.task, rule="must be a known task", choices=tuple(KINDS))
-        if recipe.teacher_steps and recipe.processes > 1:
+        if recipe.imitation_steps and recipe.processes > 1:
             rule = "must be 1 while a scripted policy teaches: it sees the state, which other processes keep"
             raise InputError("processes", value=recipe.processes, rule=rule)
         self.recipe = recipe
@@ -275,15 +275,15 @@ class Learner:
             "MultiInputPolicy",
             self.normaliser,
             learning_rate=self._rate,
-            n_steps=recipe.rollout,
-            batch_size=min(recipe.minibatch, recipe.rollout * count),
-            n_epochs=recipe.epochs,
+            n_steps=recipe.n_steps,
+            batch_size=min(recipe.batch_size, recipe.n_steps * count),
+            n_epochs=recipe.n_epochs,
             gamma=recipe.gamma,
             gae_lambda=recipe.gae_lambda,
             clip_range=recipe.clip_range,
-            ent_coef=recipe.entropy,
+            ent_coef=recipe.ent_coef,
             policy_kwargs={
-                "log_std_init": recipe.log_std,
+                "log_std_init": recipe.log_std_init,
                 "net_arch": [recipe.hidden, recipe.hidden],
                 "features_extractor_class": KeyedExtractor,
             },
@@ -292,7 +292,7 @@ class Learner:
 
     def _rate(self, _: float) -> float:
         done = self.model.num_timesteps if hasattr(self, "model") else 0
-        return self.recipe.learning_rate * max(0.1, 1.0 - done / self.recipe.steps)
+        return self.recipe.learning_rate * max(0.1, 1.0 - done / self.recipe.total_timesteps)
 
     def checkpoint(self) -> Checkpoint:
         """As it is now."""

@@ -105,7 +105,7 @@ class Training:
 
     @property
     def is_done(self) -> bool:
-        return self.steps >= self.recipe.steps
+        return self.steps >= self.recipe.total_timesteps
 
     def run_segment(self) -> None:
         """Train up to the next checkpoint, write it, and evaluate it."""
@@ -115,13 +115,13 @@ class Training:
         assert env is not None
         env.seed(_training_seed(recipe.seed, self.steps))
         begin = time.perf_counter()
-        if self.steps < recipe.teacher_steps:
+        if self.steps < recipe.imitation_steps:
             imitate(self.learner)
             self._wall += time.perf_counter() - begin
             return self._conclude()
         model._last_obs = None  # so that learn resets
         progress = _Progress(lambda row: _append(self.folder / "progress.csv", row), self._wall)
-        todo = min(recipe.segment * recipe.rollout * recipe.num_envs, recipe.steps - self.steps)
+        todo = min(recipe.segment * recipe.n_steps * recipe.num_envs, recipe.total_timesteps - self.steps)
         model.learn(todo, progress, log_interval=1, reset_num_timesteps=False)
         self._wall += time.perf_counter() - begin
         self._conclude()

@@ -5,17 +5,13 @@ This is what ``make demo`` runs: ``python experiments/press_sheet.py --out runs/
 
 from __future__ import annotations
 
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
-from raytac.errors import RaytacError
+from experiments.running import recorded, run
 from raytac.frame import OUTPUTS
-from raytac.io import CommonOptions, read_metrics, result_folder, versions, write_metrics
-from raytac.report import run_press, write_sheet
+from raytac.io import CommonOptions, read_metrics, write_sheet
+from raytac.report import run_press
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 
@@ -33,7 +29,6 @@ class Args(CommonOptions):
 
 
 def main(args: Args) -> None:
-    start = time.perf_counter()
     out = args.out if args.out is not None else Path("runs") / "press_sheet"
     sensor = TactileSensor(
         args.sensor, outputs=OUTPUTS, device=args.device, seed=args.seed, resolution=(80, 60) if args.quick else None
@@ -42,18 +37,12 @@ def main(args: Args) -> None:
     for scene in scenes:
         run_press(sensor, scene, out / scene.name, outputs=OUTPUTS)
         print(f"{scene.name}: {out / scene.name}/preview.png, rgb.png, frame.exr, height.npy, metrics.json")
-    with result_folder(out) as folder:
+    with recorded(args, "press_sheet", device=sensor.device_used) as (folder, metrics):
         write_sheet([out / scene.name / "preview.png" for scene in scenes], folder / "sheet.png")
-        metrics = {"experiment": "press_sheet", "device": sensor.device_used, "seed": args.seed, **versions()}
         for scene in scenes:
             pressed = read_metrics(out / scene.name / "metrics.json")
             metrics |= {f"{scene.name}.{key}": value for key, value in pressed.items() if key.startswith(("time.", "contact."))}
-        write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
-    print(f"all on one sheet: {out / 'sheet.png'}")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

@@ -9,7 +9,6 @@ Killed at any time, the same command goes on where it stopped. docs/datasets.md 
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,14 @@ from typing import Annotated
 
 import tyro
 
+from experiments.running import run
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
-from raytac.errors import InputError, RaytacError
+from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
-from raytac.physics import hush_solver
+from raytac.optics import OPTICS
+from raytac.physics import PHYSICS, quiet_solver
 from raytac.report import machine
-from raytac.sensor import OPTICS
-from raytac.specs import PHYSICS, SweepSpec, load_sweep
+from raytac.specs import SweepSpec, load_sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +38,9 @@ class Args(CommonOptions):
     """Number of presses."""
     shard_size: int | None = None
     """Presses in one shard."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms."""
-    optics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = None
+    optics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = None
     """How images are made."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels."""
@@ -65,7 +65,7 @@ class Args(CommonOptions):
 def main(args: Args) -> RunReport | None:
     """Render, or verify, and write ``metrics.json`` beside the data set's own files."""
     start = time.perf_counter()
-    hush_solver()
+    quiet_solver()
     out = args.out if args.out is not None else Path("runs") / "dataset"
     if args.verify:
         check = verify_dataset(out, progress=True)
@@ -132,7 +132,4 @@ def _asked(args: Args) -> SweepSpec:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args)

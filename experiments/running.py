@@ -1,4 +1,4 @@
-"""What every recorded experiment does around its work: a folder, metrics with seed, device, versions and time, and plain errors.
+"""Runner of the experiments: a result folder, metrics with seed, device, versions and time, and one line for a mistake of the user's.
 
 ``store`` and ``resumed`` keep the rows of a long run, so that an interrupted one goes on where it stopped.
 """
@@ -17,33 +17,51 @@ import tyro
 
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
-from raytac.io import CommonOptions, Metric, result_folder, versions, write_atomic, write_metrics
+from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_atomic, write_metrics
 
 __all__ = ["recorded", "resumed", "run", "store"]
 
-Args = TypeVar("Args", bound=CommonOptions)
+Args = TypeVar("Args")
 
 
 @contextmanager
-def recorded(args: CommonOptions, name: str) -> Iterator[tuple[Path, dict[str, Metric]]]:
-    """The folder of a run, ``runs/NAME`` where the arguments say nothing else, and its metrics, to be filled.
+def recorded(
+    args: CommonOptions,
+    name: str,
+    *,
+    out: Path | None = None,
+    device: str | None = None,
+    owned: Sequence[str] = (),
+    packages: Sequence[str] = (),
+) -> Iterator[tuple[Path, dict[str, Metric]]]:
+    """Folder of a run, and its metrics, to be filled in the block.
 
-    ``metrics.json`` is written when the block ends well; after an error nothing is left.
+    ``metrics.json`` is written when the block ends without an error; after an error nothing is left.
+
+    Args:
+        args: options of the command line; ``args.out`` is the folder if it is given.
+        name: name of the experiment.
+        out: folder if ``args.out`` is None; None is ``runs/NAME``.
+        device: device that the metrics name; None is the solver's.
+        owned: files that the run may write; those that an earlier run left are removed (see ``result_folder``).
+        packages: distributions whose versions are recorded, beside the usual ones.
     """
     start = time.perf_counter()
-    out = args.out if args.out is not None else Path("runs") / name
-    device = resolve_device(args.device, ray_tracing=False)  # the solver's
+    out = args.out or out or Path("runs") / name
+    device = resolve_device(args.device, ray_tracing=False) if device is None else device
     metrics: dict[str, Metric] = {"experiment": name, "seed": args.seed, "device": device}
-    with result_folder(out) as folder:
+    with result_folder(out, (*owned, "metrics.json") if owned else ()) as folder:
         yield folder, metrics
-        write_metrics(folder / "metrics.json", metrics | versions() | {"wall_s": time.perf_counter() - start})
+        metrics |= versions((*VERSIONED, *packages))
+        metrics["wall_s"] = time.perf_counter() - start
+        write_metrics(folder / "metrics.json", metrics)
     print(f"written: {out}")
 
 
-def run(main: Callable[[Args], object], options: type[Args]) -> None:
-    """Read the command line and do it; a mistake of the user's ends with one line."""
+def run(main: Callable[[Args], object], options: type[Args], description: str | None = None) -> None:
+    """Read the command line and call ``main``; a mistake of the user's ends with one line. ``description`` is that of ``--help``."""
     try:
-        main(tyro.cli(options))
+        main(tyro.cli(options, description=description))
     except RaytacError as error:
         sys.exit(f"error: {error}")
 

@@ -115,7 +115,7 @@ def play(name: str, how: str, episodes: int, seed: int, timestep: float | None =
     batch = TaskBatch(case.task, num_envs=episodes, tactile=None, physics="rigid", scene=scene, seed=seed, device="cpu")
     batch.reset(range(episodes), [np.random.default_rng((seed, b)) for b in range(episodes)])
     pressed = how == "pressed"
-    act = _press(case, episodes, batch.steering.size) if pressed else lambda _: SCRIPTED[case.policy](batch)
+    act = _press(case, episodes, batch.control.size) if pressed else lambda _: SCRIPTED[case.policy](batch)
     body, world = batch.world.composed.bodies[case.task.body], batch.world
     upright = world.state().world_from_body[case.task.body][:, :3, 2]
     forces, lowest, cosines = [], [], []

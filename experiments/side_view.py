@@ -28,7 +28,7 @@ def snapshot(world: TactileWorld, names: Sequence[str], title: str, env: int = 0
     """The surfaces of these bodies and pads as they are; a rigid pad has none and is drawn as a plate."""
     found = []
     for name in names:
-        if world.physics == "rigid" and name in world.sensor_names:
+        if not world.physics.is_simulated and name in world.sensor_names:
             vertices, faces = _plate(world, name, env)
         else:
             all_vertices, faces = world.mesh(name)

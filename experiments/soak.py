@@ -11,18 +11,16 @@ tenth of its blocks: by then what is made once is made, such as kernels for ever
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
-from experiments.running import resumed, store
+from experiments.running import resumed, run, store
 from raytac.device import resolve_device
 from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
-from raytac.errors import InputError, RaytacError
+from raytac.errors import InputError
 from raytac.io import VERSIONED, CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
 from raytac.observe import MODALITIES, ObservationSettings
 from raytac.report import machine
@@ -82,7 +80,7 @@ def main(args: Args) -> dict[str, Metric]:
         kept = {name: [Block(**row) for row in resumed(out / f"{name}.json", settings_of(args))] for name in names}
         found: dict[str, Metric] = {"experiment": "soak", "device": device, "seed": args.seed, **machine()}
         for name in names:
-            blocks = run(name, args, modalities, kept[name], out / f"{name}.json")
+            blocks = remaining_blocks(name, args, modalities, kept[name], out / f"{name}.json")
             found |= {f"{name}.{key}": value for key, value in summary(blocks).items()}
             print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in summary(blocks).items()), flush=True)
         found |= {"wall_s": time.perf_counter() - start, **versions((*VERSIONED, "gymnasium"))}
@@ -91,8 +89,8 @@ def main(args: Args) -> dict[str, Metric]:
     return found
 
 
-def run(name: str, args: Args, modalities: tuple[str, ...], blocks: list[Block], path: Path) -> list[Block]:
-    """The rest of one task's steps, recorded block by block."""
+def remaining_blocks(name: str, args: Args, modalities: tuple[str, ...], blocks: list[Block], path: Path) -> list[Block]:
+    """Play the remaining steps of one task, recorded block by block."""
     done = sum(block.steps for block in blocks)
     if done >= args.steps:
         return blocks
@@ -152,7 +150,4 @@ def settings_of(args: Args) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args, __doc__)

@@ -32,16 +32,17 @@ from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
 from raytac.gel import cell_areas
 from raytac.io import CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
-from raytac.physics import SoftPad, hush_solver
+from raytac.physics import Ipc, SoftPad, quiet_solver
 from raytac.report import machine
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PHYSICS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
+from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
 
 SENSORS = ("gelsight_mini", "gelsight_dome")
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh", "soft_ball")
 """Shipped scenes whose objects are pressed; a soft one on the simulated pad alone."""
 SHALLOW = 0.6
 """Share of the thickness that a pad should hold anywhere."""
+PHYSICS = ("rigid", "ipc")
 DEEP = {"rigid": 0.5, "ipc": 0.2}
 """Share of the presses that go deeper."""
 BALANCE = 1e-3
@@ -80,7 +81,7 @@ def main(args: Args) -> dict[str, Metric]:
     out = args.out or Path("runs/stress")
     settings = {"seed": args.seed, "deepest": args.deepest, "pad": args.pad, "device": device}
     if "ipc" in names:
-        hush_solver()
+        quiet_solver()
     with FolderLock(out):
         kept = {name: resumed(out / f"{name}.json", settings) for name in names}
         metrics: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}
@@ -103,7 +104,7 @@ def main(args: Args) -> dict[str, Metric]:
 def make_sensor(name: str, physics: str, args: Args, device: str) -> TactileSensor:
     """A sensor without images."""
     outputs = ("height", "wrench", "traction")
-    return TactileSensor(name, physics=physics, pad=args.pad if physics == "ipc" else None, outputs=outputs, device=device)
+    return TactileSensor(name, physics=Ipc(args.pad) if physics == "ipc" else physics, outputs=outputs, device=device)
 
 
 def random_press(physics: str, seed: int, number: int, deepest: float) -> tuple[str, str, PressScene]:
@@ -153,7 +154,7 @@ def pressed(physics: str, number: int, args: Args, sensors: dict[str, TactileSen
             warnings.simplefilter("ignore")
             validate_press(sensor.spec, scene)
             pad = sensor.load(scene)
-            frame = sensor.update(pad.peak(pad.run()))  # type: ignore[arg-type]
+            frame = sensor.update(pad.peak(pad.run()))
         row |= rigid_faults(sensor, frame) if physics == "rigid" else soft_faults(pad, frame)  # type: ignore[arg-type]
     except (InputError, SpecError) as error:
         row["refused"] = str(error)
@@ -165,7 +166,6 @@ def pressed(physics: str, number: int, args: Args, sensors: dict[str, TactileSen
 
 def rigid_faults(sensor: TactileSensor, frame: TactileFrame) -> Row:
     """What is wrong with a press on the rigid pad."""
-    assert frame.failed is not None and frame.wrench is not None and frame.traction is not None
     if frame.failed[0]:
         return {"failed": True}
     thickness = sensor.spec.gelpad.thickness
@@ -181,7 +181,7 @@ def rigid_faults(sensor: TactileSensor, frame: TactileFrame) -> Row:
 
 def soft_faults(pad: SoftPad, frame: TactileFrame) -> Row:
     """What is wrong with a press on the simulated pad."""
-    assert frame.failed is not None and frame.unconverged is not None and pad.solver is not None
+    assert pad.solver is not None
     row: Row = {"failed": bool(frame.failed[0]), "unconverged_steps": int(frame.unconverged[0])}
     if row["failed"]:
         return row
@@ -192,7 +192,6 @@ def soft_faults(pad: SoftPad, frame: TactileFrame) -> Row:
 
 def is_finite(frame: TactileFrame) -> bool:
     """Whether every number of the frame is."""
-    assert frame.wrench is not None and frame.traction is not None
     return all(np.isfinite(values).all() for values in (frame.surface.height, frame.wrench, frame.traction))
 
 

@@ -1,7 +1,7 @@
 """Train policies by stable-baselines3's PPO: a task, with and without touch, over seeds; resumable, evaluated on seeds never trained on.
 
     python experiments/train_ppo.py --task PushCube --seeds 0,1,2 --tactile task,none --processes 4
-    python experiments/train_ppo.py --task BalancePole --steps 300000 --side-by-side --most-s 540
+    python experiments/train_ppo.py --task BalancePole --total-timesteps 300000 --side-by-side --most-s 540
 
 The same command again goes on where it was, after Ctrl-C, a crash or ``--most-s``. Each pair of touch and seed is one training in
 ``<out>/<tactile>/seed<k>/``: ``progress.csv`` (one row a rollout), ``evaluation.csv`` (one a segment), ``checkpoint.pt`` (to resume)
@@ -23,23 +23,22 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from experiments.running import run
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, versions, write_metrics
 from raytac.report import machine
 
 TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
 RECIPES: dict[str, dict[str, Any]] = {
-    "PushCube": {"steps": 600_000},
-    "BalancePole": {"steps": 600_000, "history": 3},
-    "LiftCube": {"steps": 1_000_000},
-    "RollBall": {"steps": 400_000, "history": 3},
+    "PushCube": {"total_timesteps": 600_000},
+    "BalancePole": {"total_timesteps": 600_000, "history": 3},
+    "LiftCube": {"total_timesteps": 1_000_000},
+    "RollBall": {"total_timesteps": 400_000, "history": 3},
 }
-"""What differs from ``Recipe``'s own, by task."""
+"""Settings that differ from the defaults of ``Recipe``, by task."""
 _TUNED = (
-    "steps", "resolution", "teacher_steps", "rollout", "learning_rate", "gamma", "log_std", "history", "segment", "epochs", "entropy",
-    "minibatch",
+    "total_timesteps", "resolution", "imitation_steps", "n_steps", "learning_rate", "gamma", "log_std_init", "history", "segment",
+    "n_epochs", "ent_coef", "batch_size",
 )  # fmt: skip
 """Fields of ``Recipe`` that options may change."""
 
@@ -57,7 +56,7 @@ class Args(CommonOptions):
     """WIDTHxHEIGHT of images in pixels, where ``rgb`` is felt; at least 36x36, 48x36 if not given."""
     seeds: str = "0,1,2"
     """Seeds joined by commas; the same seed gives the same weights."""
-    steps: int | None = None
+    total_timesteps: int | None = None
     """Environment steps of each training; the task's own if not given."""
     num_envs: int = 16
     """Environments of each training."""
@@ -71,17 +70,17 @@ class Args(CommonOptions):
     """Episodes of the last evaluation, on other held-out seeds."""
     most_s: float | None = None
     """Begin nothing that would not be done by so many seconds from the start (judged by the last segment); resume later."""
-    teacher_steps: int | None = None
-    """Of the steps, so many at first imitate the scripted policy, which knows the state: minutes instead of hours."""
-    rollout: int | None = None
+    imitation_steps: int | None = None
+    """Environment steps at the beginning that imitate the scripted policy, which knows the state: minutes instead of hours."""
+    n_steps: int | None = None
     learning_rate: float | None = None
     gamma: float | None = None
-    log_std: float | None = None
+    log_std_init: float | None = None
     history: int | None = None
     segment: int | None = None
-    epochs: int | None = None
-    entropy: float | None = None
-    minibatch: int | None = None
+    n_epochs: int | None = None
+    ent_coef: float | None = None
+    batch_size: int | None = None
     """These nine: of ``experiments.ppo_learner.Recipe``; the task's own if not given."""
 
 
@@ -111,7 +110,7 @@ def main(args: Args) -> dict[str, Metric]:
     seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
     from experiments.ppo_learner import Recipe, tactile_settings
 
-    for kind in kinds:  # so that what cannot be observed is told before anything is trained
+    for kind in kinds:  # so that a modality that cannot be observed is an error before any training
         tactile_settings(kind, Recipe.resolution if args.resolution is None else args.resolution)
     jobs = [_Job(args, kind, seed, start) for seed in seeds for kind in kinds]
     found: dict[str, Metric] = {"device": "cpu" if args.device == "auto" else args.device, **machine()}
@@ -157,10 +156,10 @@ def _train(job: _Job) -> None:
 
     torch.set_num_threads(1)
     args = job.args
-    told = {f.name: getattr(args, f.name) for f in fields(Recipe) if f.name in _TUNED and getattr(args, f.name) is not None}
+    given = {f.name: getattr(args, f.name) for f in fields(Recipe) if f.name in _TUNED and getattr(args, f.name) is not None}
     device = "cpu" if args.device == "auto" else args.device
     recipe = Recipe(
-        args.task, job.tactile, job.seed, **{**RECIPES[args.task], **told},
+        args.task, job.tactile, job.seed, **{**RECIPES[args.task], **given},
         num_envs=args.num_envs, processes=args.processes, device=device,
     )  # fmt: skip
     training = Training(recipe, job.folder, evaluation=args.evaluation, say=lambda text: print(text, flush=True))
@@ -188,7 +187,7 @@ def _train(job: _Job) -> None:
 
 def _final_s(args: Args, last: float, recipe: Any) -> float:
     """About how long the last evaluation takes, by the pace of a segment [s]."""
-    segment = recipe.segment * recipe.rollout * recipe.num_envs + 200 * args.evaluation
+    segment = recipe.segment * recipe.n_steps * recipe.num_envs + 200 * args.evaluation
     return last * 200 * args.final_evaluation / segment
 
 
@@ -239,7 +238,4 @@ def _gathered(jobs: list[_Job]) -> dict[str, Metric]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(main, Args, __doc__)

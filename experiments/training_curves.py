@@ -11,7 +11,6 @@ that ran in processes of their own, each with its own ``--out``, become one figu
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,8 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from raytac.errors import InputError, RaytacError
+from experiments.running import run
+from raytac.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,9 +110,9 @@ def _draw(axes: Axes, runs: Mapping[str, Sequence[Mapping[str, np.ndarray]]], ke
     factor = 100.0 if key == "success" else 1.0
     for kind, colour in zip(runs, _COLOURS * len(runs), strict=False):
         mine, style = runs[kind], "--" if kind == "none" else "-"
-        for run in mine:
-            axes.plot(1e-3 * run["steps"], factor * run[key], style, color=colour, alpha=0.45, linewidth=0.7)
-        steps, values = _common([(run["steps"], factor * run[key]) for run in mine])
+        for curve in mine:
+            axes.plot(1e-3 * curve["steps"], factor * curve[key], style, color=colour, alpha=0.45, linewidth=0.7)
+        steps, values = _common([(curve["steps"], factor * curve[key]) for curve in mine])
         name = {"none": "no touch", "task": "touch"}.get(kind, kind)
         label = f"{name} (n = {len(mine)})"
         axes.plot(1e-3 * steps, np.median(values, axis=0), style, color=colour, linewidth=2.0, label=label)
@@ -171,7 +171,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    try:
-        print(main(tyro.cli(Args, description=__doc__)))
-    except RaytacError as error:
-        sys.exit(f"error: {error}")
+    run(lambda args: print(main(args)), Args, __doc__)

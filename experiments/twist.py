@@ -18,6 +18,7 @@ from experiments.running import recorded, run
 from experiments.side_view import draw_strip, film, snapshot
 from raytac.errors import RaytacError
 from raytac.io import CommonOptions, Metric
+from raytac.physics import Ipc
 from raytac.specs import load_task
 from raytac.world import TactileWorld
 
@@ -91,9 +92,7 @@ def make_world(args: Args) -> TactileWorld:
     opening = float(scene.body(BEAM).params["width"]) + 2e-3 * args.gap_mm
     scene = replace(scene, robot=replace(scene.robot, opening=opening))
     # One-way: the gripper is a positioner, and what moves it is known.
-    return TactileWorld(
-        scene, physics="ipc", pad=args.pad, coupling="one_way", outputs=("wrench",), device=args.device, seed=args.seed
-    )
+    return TactileWorld(scene, physics=Ipc(args.pad), coupling="one_way", outputs=("wrench",), device=args.device, seed=args.seed)
 
 
 def twist(world: TactileWorld, args: Args) -> tuple[Record, list, tuple[float, ...]]:

@@ -1,4 +1,4 @@
-"""Incremental potential contact for soft gel pads: a package of its own that never imports ``raytac``.
+"""Incremental potential contact for soft gel pads; never imports ``raytac``.
 
 Bodies go into a :class:`World`, ``World.step`` returns a :class:`StepReport`, and positions, forces and contacts come out as NumPy
 arrays whose first axis is the environment. SI units; see ``ipc/README.md``.
@@ -8,20 +8,44 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ipc.bodies import AffineBody, HalfSpace, KinematicBody, Pose, SoftBody, vertices_in_box, vertices_near
+from ipc.bodies import (
+    AffineBody,
+    Body,
+    HalfSpace,
+    KinematicBody,
+    Material,
+    Pose,
+    SoftBody,
+    Stiff,
+    rotation_matrix,
+    vertices_in_box,
+    vertices_near,
+)
 from ipc.errors import IpcError, OverlapError, SolverError
-from ipc.materials import Material, Stiff
-from ipc.meshes import Cut, TetMesh, TriMesh, box_mesh, box_surface, domed_pad, graded, icosphere
+from ipc.meshes import (
+    Cut,
+    TetMesh,
+    TriMesh,
+    box_mesh,
+    box_surface,
+    domed_pad,
+    graded,
+    icosphere,
+    surface_of,
+    tetrahedralize,
+)
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
-from ipc.tetwild import tetrahedralize
 
 if TYPE_CHECKING:
-    from ipc.world import State, World
+    from ipc.state import State
+    from ipc.warp_start import start_warp, use_writable_cache
+    from ipc.world import World
 
 __all__ = [
     "RAYTAC_IPC_MARKER",
     "AffineBody",
+    "Body",
     "ContactPairs",
     "Cut",
     "HalfSpace",
@@ -49,13 +73,17 @@ __all__ = [
     "domed_pad",
     "graded",
     "icosphere",
+    "rotation_matrix",
+    "start_warp",
+    "surface_of",
     "tetrahedralize",
+    "use_writable_cache",
     "vertices_in_box",
     "vertices_near",
 ]
 
 RAYTAC_IPC_MARKER = "raytac-ipc"
-"""Tells this package from the other ``ipc`` packages that can be installed; ``raytac`` looks for it."""
+"""Mark by which ``raytac`` tells this package from others named ``ipc``."""
 
 __version__ = "0.1.0"
 
@@ -66,4 +94,8 @@ def __getattr__(name: str) -> Any:
         from ipc import world
 
         return getattr(world, name)
+    if name in ("start_warp", "use_writable_cache"):
+        from ipc import warp_start
+
+        return getattr(warp_start, name)
     raise AttributeError(f"module 'ipc' has no attribute {name!r}")

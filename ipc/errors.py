@@ -1,4 +1,4 @@
-"""The errors that this package raises; each names the value, the rule and the choices."""
+"""Errors of this package; each names the value, the rule and the choices."""
 
 from __future__ import annotations
 
@@ -14,4 +14,4 @@ class OverlapError(IpcError):
 
 
 class SolverError(RuntimeError):
-    """A solve that could not go on, for a reason that is not one environment's state (a buffer that cannot grow, say)."""
+    """A failure of the solver as a whole, such as a buffer that cannot grow."""

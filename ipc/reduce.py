@@ -1,4 +1,4 @@
-"""Sums, minima and maxima of each environment's numbers, in an order that does not depend on scheduling.
+"""Sums, minima and maxima of each environment's numbers, in a fixed order.
 
 On CUDA a block of threads takes a strided share and adds it up in shared memory, and a second kernel adds the shares; on a CPU, where
 Warp runs one thread after the other, one thread adds everything.
@@ -121,7 +121,7 @@ def raise_if_any(flags: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)
 
 
 class Reducer:
-    """Reductions over rows of at most ``longest`` numbers for ``batch`` environments; nothing is allocated after this.
+    """Reductions over rows of ``longest`` numbers or fewer; calls allocate nothing.
 
     Args:
         batch: environments, B.
@@ -142,12 +142,12 @@ class Reducer:
         return self._counts[n]
 
     def prepare(self, *lengths: int) -> None:
-        """Make ready for rows of these lengths without a count, so that a recording need not allocate."""
+        """Prepare for rows of these lengths without a count, so that no recording allocates."""
         for n in lengths:
             self._whole(n)
 
     def __call__(self, values: wp.array, active: wp.array, kind: int, out: wp.array, count: wp.array | None = None) -> None:
-        """out (B,) ← out ∘ the reduction of ``values`` (B, n), or of the first ``count`` (B,) of each row, where active."""
+        """out (B,) ← out ∘ the reduction of the first ``count`` (B,) of ``values`` (B, n), or all."""
         n = values.shape[1]
         if n == 0:
             return

@@ -1,4 +1,4 @@
-"""What a step says about itself."""
+"""Records that a world returns: reports of steps, contacts, forces and motions."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ class ContactPairs:
 
 @dataclass(frozen=True)
 class PairForces:
-    """What the first of two bodies bears from the second, world frame.
+    """Forces on the first of two bodies by the second, world frame.
 
     Attributes:
         normal: sum of the normal forces [N], shape (B, 3).
-        place: where they act in the mean [m], shape (B, 3); NaN where the two do not touch.
+        place: their mean point of action [m], shape (B, 3); NaN where the two do not touch.
         wrench: all forces, friction included [N], and their torque about ``place`` [N m], shape (B, 6).
     """
 
@@ -105,14 +105,14 @@ class Wrench:
 
 @dataclass(frozen=True)
 class PatchMotion:
-    """A patch of a bonded body that moves as a whole, in one environment, world frame (see ``ipc/patch_motion.py``).
+    """A patch of a bonded body that moves as a whole, in one environment, world frame.
 
     Attributes:
-        mass: of what moves with it [kg].
+        mass: of the patch and of what moves with it [kg].
         inertia: about ``centre`` [kg m²], shape (3, 3).
         centre: mean of its nodes [m], shape (3,).
         velocity: of the centre [m/s] and about it [rad/s], shape (6,).
-        stiffness: that the body holds it with, about ``centre`` [N/m], [N m/rad], shape (6, 6), symmetric.
+        stiffness: of its support by the body, about ``centre`` [N/m], [N m/rad], shape (6, 6), symmetric.
     """
 
     mass: float

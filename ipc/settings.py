@@ -1,4 +1,4 @@
-"""The numbers that steer a step."""
+"""Settings of a time step."""
 
 from __future__ import annotations
 
@@ -18,22 +18,27 @@ class Settings:
     Attributes:
         dt: time step h [s].
         gravity: acceleration [m/s²], world frame.
-        integrator: ``"euler"`` (backward Euler) or ``"bdf2"`` (second order; its first step, and the one after a reset, is Euler).
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
         max_newton: Newton iterations a step; reaching it is reported, and the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
         kappa: barrier stiffness κ [Pa]; None: the largest Young's modulus of the soft bodies (1e5 Pa without one).
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
         friction_velocity: ε_v [m/s]; below this sliding speed friction grows smoothly from zero.
-        friction_relags: how often a step may renew the lagged normal forces and tangents after its first solve.
+        friction_relags: number of times that a step may renew the lagged normal forces and tangents after its first solve.
         friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
-            part; ``ipc/rest_inverse.py``), or ``"auto"``, whichever was measured to be faster on the device.
+            part; ``docs/ipc-preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
+        armijo: share of the decrease that the slope promises which a step must achieve to be accepted [-].
+        ccd_slack: share of a gap that a Newton step has to leave [-].
         motion_fraction: share of a gap that one advance of the driven bodies may use up [-].
-        broad_phase: how pairs that may touch are found: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
+        gap_floor: gap, as a share of d̂, that an advance of the driven bodies has to leave; the soft side is given time to yield first.
+        max_advance_attempts: how often an advance of the driven bodies is shortened; the last but one stays in place.
+        poor_advance: share of the remaining motion below which the unknowns get time to rest before the bodies advance again [-].
+        blocked_advance: share of the motion of the driven bodies below which an advance after such a rest says that they are blocked [-].
+        broad_phase: search for pairs that may touch: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
             (bounding volume hierarchies), or ``"auto"`` (by the numbers of edges and of body pairs). The pairs are the same.
         cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
             ``World.timers``.
@@ -44,7 +49,6 @@ class Settings:
 
     dt: float = 0.01
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    integrator: Literal["euler", "bdf2"] = "euler"
     velocity_tolerance: float = 1e-4
     max_newton: int = 100
     d_hat: float | None = None
@@ -57,7 +61,13 @@ class Settings:
     max_linear: int = 2000
     preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
+    armijo: float = 1e-4
+    ccd_slack: float = 0.1
     motion_fraction: float = 0.8
+    gap_floor: float = 0.01
+    max_advance_attempts: int = 8
+    poor_advance: float = 0.05
+    blocked_advance: float = 1e-4
     broad_phase: Literal["auto", "lists", "bvh"] = "auto"
     cuda_graph: bool = True
     deterministic: bool = False
@@ -79,11 +89,12 @@ class Settings:
             raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
         if self.friction_relags < 0:
             raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
-        if self.integrator not in ("euler", "bdf2"):
-            raise IpcError(f"integrator = {self.integrator!r}: choose 'euler' or 'bdf2'")
         if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):
             raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'block_jacobi' or 'rest_inverse'")
         if self.broad_phase not in ("auto", "lists", "bvh"):
             raise IpcError(f"broad_phase = {self.broad_phase!r}: choose 'auto', 'lists' or 'bvh'")
-        if not 0 < self.motion_fraction < 1:
-            raise IpcError(f"motion_fraction = {self.motion_fraction}: it must lie between 0 and 1")
+        if self.max_advance_attempts < 2:
+            raise IpcError(f"max_advance_attempts = {self.max_advance_attempts}: at least two are needed")
+        for name in ("armijo", "ccd_slack", "motion_fraction", "gap_floor", "poor_advance", "blocked_advance"):
+            if not 0 < getattr(self, name) < 1:
+                raise IpcError(f"{name} = {getattr(self, name)}: it must lie between 0 and 1")

@@ -1,16 +1,17 @@
-"""A snapshot of a world, and what moving a frame at once changes in it."""
+"""Snapshots of a world, frames moved at once, and a caller's values for environments."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ipc.bodies import AffineBody, Body
-from ipc.layout import Layout, rotation_matrix
+from ipc.bodies.body import AffineBody, Body, rotation_matrix
+from ipc.bodies.layout import Layout
+from ipc.errors import IpcError
 
-__all__ = ["State", "start_state", "teleported"]
+__all__ = ["State", "env_mask", "per_env", "start_state", "teleported", "unit_pose"]
 
 Floats = NDArray[np.float64]
 
@@ -21,37 +22,29 @@ class State:
 
     Attributes:
         y: node positions in their body's frame [m] (B, N, 3).
-        velocity, velocity_before: node velocities, world frame [m/s] (B, N, 3).
-        position_before: node positions one step earlier, world frame [m] (B, N, 3).
+        velocity: node velocities, world frame [m/s] (B, N, 3).
         frame_rotation, frame_position: frames of bodies, grips and aims, quaternion (w, x, y, z) (B, frames, 4) and [m] (B, frames, 3).
-        second_order: BDF2 has a history (B,).
         kappa: [Pa] (B,).
         failed: (B,).
     """
 
     y: Floats
     velocity: Floats
-    velocity_before: Floats
-    position_before: Floats
     frame_rotation: Floats
     frame_position: Floats
-    second_order: NDArray[np.int32]
     kappa: Floats
     failed: NDArray[np.bool_]
 
 
 def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
-    """Undeformed and at rest, where the layout has the bodies."""
+    """The state of undeformed bodies at rest, placed as in the layout."""
     nodes = np.broadcast_to(layout.node_rest, (num_envs, *layout.node_rest.shape))
     frames = layout.frame_pose
     return State(
         y=nodes.copy(),
         velocity=np.zeros(nodes.shape),
-        velocity_before=np.zeros(nodes.shape),
-        position_before=np.zeros(nodes.shape),
         frame_rotation=np.broadcast_to(frames[:, 3:], (num_envs, len(frames), 4)).copy(),
         frame_position=np.broadcast_to(frames[:, :3], (num_envs, len(frames), 3)).copy(),
-        second_order=np.zeros(num_envs, np.int32),
         kappa=np.full(num_envs, kappa),
         failed=np.zeros(num_envs, bool),
     )
@@ -66,10 +59,12 @@ def teleported(
     rotation: Floats | None,
     mask: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Put a frame elsewhere in the environments of the mask, with all that is bonded to it, at rest; changes ``state``.
+    """Move a frame, and all that is bonded to it, in the environments of the mask.
+
+    Changes ``state``; velocities become zero.
 
     Args:
-        body: that the frame belongs to.
+        body: owner of the frame.
         position, rotation: [m] (B, 3), unit quaternion (w, x, y, z) (B, 4); None keeps it.
 
     Returns:
@@ -90,12 +85,11 @@ def teleported(
         turned = np.einsum("bij,nj->bni", rotation_matrix(state.frame_rotation[:, frame]), layout.aim_local[nodes])
         state.y[mask, nodes] = (turned + state.frame_position[:, frame, None])[mask]
     state.velocity[mask, nodes] = 0.0
-    state.second_order[mask] = 0
     return moved
 
 
 def _carry_grips(state: State, layout: Layout, body: int, mask: NDArray[np.bool_], before: tuple[Floats, Floats]) -> None:
-    """Grips keep their places in the frame of the body that was moved."""
+    """Move grips along with the frame of their body."""
     turn = rotation_matrix(state.frame_rotation[:, body]) @ np.swapaxes(before[0][:, body], -1, -2)
     for grip in np.flatnonzero((layout.frame_body == body) & (layout.frame_moves == 1)):
         if grip == body:
@@ -106,7 +100,7 @@ def _carry_grips(state: State, layout: Layout, body: int, mask: NDArray[np.bool_
 
 
 def _quaternions(rotations: Floats) -> Floats:
-    """Unit quaternions (w, x, y, z) of rotation matrices, (..., 3, 3) to (..., 4): the eigenvector of Bar-Itzhack's matrix."""
+    """Unit quaternions (..., 4) of rotation matrices, eigenvectors of Bar-Itzhack's matrix."""
     m = np.moveaxis(rotations, (-2, -1), (0, 1))
     zero = m[0, 0] * 0
     rows = [
@@ -117,3 +111,43 @@ def _quaternions(rotations: Floats) -> Floats:
     ]
     matrix = np.stack([np.stack([zero + e for e in row], axis=-1) for row in rows], axis=-2)
     return np.linalg.eigh(matrix)[1][..., -1]
+
+
+def per_env(values: ArrayLike, shape: tuple[int, ...], what: str, num_envs: int) -> NDArray:
+    """Finite values (B, \\*shape), given for all environments or for each."""
+    array = np.asarray(values, dtype=float)
+    if array.shape not in (shape, (num_envs, *shape)):
+        raise IpcError(f"{what} has shape {array.shape}: it must be {shape} or {(num_envs, *shape)}")
+    if not np.isfinite(array).all():
+        raise IpcError(f"{what} = {array}: it must be finite")
+    return np.broadcast_to(array, (num_envs, *shape))
+
+
+def unit_pose(position: ArrayLike | None, rotation: ArrayLike | None, num_envs: int) -> tuple[Floats | None, Floats | None]:
+    """Position (B, 3) and unit quaternion (w, x, y, z) (B, 4), where given."""
+    p = None if position is None else per_env(position, (3,), "position", num_envs)
+    if rotation is None:
+        return p, None
+    q = per_env(rotation, (4,), "rotation", num_envs)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.allclose(length, 1, atol=1e-6):
+        raise IpcError(f"rotation = {rotation}: a quaternion (w, x, y, z) must have length 1")
+    return p, q / length
+
+
+def env_mask(envs: ArrayLike | None, num_envs: int) -> NDArray[np.bool_]:
+    """A mask (B,) from a mask, a list of environments, or None for all."""
+    if envs is None:
+        return np.ones(num_envs, bool)
+    chosen = np.asarray(envs)
+    if chosen.dtype == bool:
+        if chosen.shape != (num_envs,):
+            raise IpcError(f"envs is a mask of shape {chosen.shape}: it must be ({num_envs},)")
+        return chosen.copy()
+    if chosen.size and not np.issubdtype(chosen.dtype, np.integer):
+        raise IpcError(f"envs = {envs}: give a mask or whole numbers")
+    if chosen.size and (chosen.min() < 0 or chosen.max() >= num_envs):
+        raise IpcError(f"envs names environments {chosen.min()} to {chosen.max()}: there are {num_envs}")
+    mask = np.zeros(num_envs, bool)
+    mask[chosen.astype(int)] = True
+    return mask

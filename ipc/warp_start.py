@@ -23,7 +23,7 @@ def start_warp() -> None:
 
 @functools.cache
 def use_writable_cache() -> None:
-    """Give Warp a folder of this process alone for compiled kernels where the user's cannot be written, with a warning.
+    """Give Warp a temporary folder for kernels where the user's cannot be written; warns.
 
     Warp itself stops at a read-only home, and for a user without one it makes a folder named ``~``.
     """
@@ -46,7 +46,7 @@ def use_writable_cache() -> None:
 
 
 def _kernel_folder() -> Path:
-    """Where Warp is going to keep compiled kernels: its setting, ``WARP_CACHE_PATH``, or the user's cache."""
+    """Folder of compiled kernels: Warp's setting, ``WARP_CACHE_PATH``, or the user's cache."""
     chosen = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
     folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "warp"
     return folder if folder.name == wp.config.version else folder / wp.config.version

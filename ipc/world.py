@@ -1,4 +1,4 @@
-"""The public face: bodies in, steps, positions and forces out."""
+"""A world of bodies: time steps, positions and forces."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from ipc.arguments import env_mask, per_env, unit_pose
-from ipc.bodies import AffineBody, Body, HalfSpace, SoftBody
+from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody, rotation_matrix
+from ipc.bodies.layout import build_layout
+from ipc.contact.overlap import check_overlap, find_overlap
 from ipc.errors import IpcError
-from ipc.forces import bond_wrench, contact_pairs, host, pair_forces, plane_forces, rigid_motion, touching
-from ipc.layout import build_layout, rotation_matrix
-from ipc.newton import Newton
-from ipc.overlap import check_overlap, find_overlap
-from ipc.patch_motion import RestPatches
-from ipc.potential import Potential
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
-from ipc.state import State, start_state, teleported
+from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, pair_forces, rigid_motion, touching
+from ipc.solver.newton import Newton
+from ipc.solver.patch_motion import RestPatches
+from ipc.solver.potential import Potential
+from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
 from ipc.warp_start import start_warp
 
 __all__ = ["State", "World"]
@@ -31,8 +30,8 @@ class World:
     """Bodies that deform, move and touch, in ``num_envs`` copies that do not see each other.
 
     Args:
-        bodies: what there is; names are unique.
-        settings: how to step.
+        bodies: of unique names.
+        settings: of the time step.
         num_envs: number of environments, B.
         device: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"auto"`` (CUDA if there is one).
         friction: μ by pair of body names, where it differs from ``settings.friction``.
@@ -74,10 +73,10 @@ class World:
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
         frames = self.layout.frame_pose
-        # What the device is told before a step, kept here so that telling it costs one copy and no wait.
+        # Targets of the next step. They are copied to the device before a step if they changed.
         self._goal_p = np.zeros((num_envs, len(frames), 3))
         self._goal_q = np.zeros((num_envs, len(frames), 4))
-        self._told = False
+        self._targets_set = True
         self._start = start_state(self.layout, num_envs, self.kappa)
         self.restore(self._start)
 
@@ -87,6 +86,14 @@ class World:
         if name not in self.layout.names:
             raise IpcError(f"no body is named {name!r}: choose from {', '.join(self.layout.names)}")
         return self.layout.names.index(name)
+
+    def _nodes(self, name: str) -> slice:
+        """Nodes of a soft or affine body."""
+        body = self._index(name)
+        nodes = slice(*self.layout.node_start[body : body + 2])
+        if nodes.start == nodes.stop:
+            raise IpcError(f"{name!r} has no unknowns: set_target prescribes its motion")
+        return nodes
 
     def _frame(self, name: str) -> int:
         """Frame of a driven body, of a grip, or the aim of a driven affine body."""
@@ -100,11 +107,11 @@ class World:
         raise IpcError(f"no body or grip is named {name!r}: choose from {choices}")
 
     def set_target(self, name: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None) -> None:
-        """Say where a driven body's frame shall be at the end of the next step; it stays there until told otherwise.
+        """Set the pose of a driven frame from the end of the next step on.
 
         Args:
             name: a kinematic body, a half-space, a soft body with bonded vertices, a grip ``"<body>.<grip>"``, or an affine body with
-                a drive, which goes there as far as its drive and contacts let it.
+                a drive, which reaches the pose as far as its drive and contacts allow.
             position: frame origin in the world [m], shape (3,) or (B, 3); None keeps the last target's.
             rotation: quaternion (w, x, y, z), shape (4,) or (B, 4); None keeps the last target's. Steps turn by less than half a turn.
         """
@@ -114,29 +121,18 @@ class World:
             self._goal_p[:, frame] = p
         if q is not None:
             self._goal_q[:, frame] = q[:, [1, 2, 3, 0]]
-        self._told = False
+        self._targets_set = True
 
     def set_gravity(self, gravity: ArrayLike) -> None:
         """Set the acceleration of every body [m/s²], world frame, shape (3,) or (B, 3)."""
         self._potential.acceleration.assign(np.ascontiguousarray(per_env(gravity, (3,), "gravity", self.num_envs)))
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
-        """Set the velocity of all nodes of a soft or affine body [m/s], shape (3,) or (B, 3), world frame.
-
-        With BDF2 the next step of these environments is backward Euler.
-        """
-        body = self._index(name)
-        first, last = self.layout.node_start[body : body + 2]
-        if first == last:
-            raise IpcError(f"{name!r} has no unknowns: drive it with set_target")
-        mask = env_mask(envs, self.num_envs)
+        """Set the world velocity of a soft or affine body's nodes [m/s], shape (3,) or (B, 3)."""
+        mask, nodes = env_mask(envs, self.num_envs), self._nodes(name)
         v = host(self._potential.v).copy()
-        v[mask, first:last] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
+        v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
-        # The earlier states that BDF2 looks back to know nothing of this velocity.
-        history = host(self._potential.second_order).copy()
-        history[mask] = 0
-        self._potential.second_order.assign(history)
 
     # --- stepping --------------------------------------------------------------------------------------------------------------
 
@@ -146,35 +142,33 @@ class World:
         On CUDA every new ``dt`` costs a recording; take few different ones.
 
         Raises:
-            IpcError: ``dt`` is not positive, or differs from ``settings.dt`` with BDF2, whose formulas want equal steps.
+            IpcError: if ``dt`` is not positive.
         """
         if dt is not None and not 0.0 < dt < np.inf:
             raise IpcError(f"dt = {dt}: it must be positive")
-        if dt is not None and dt != self.settings.dt and self.settings.integrator == "bdf2":
-            raise IpcError(f"dt = {dt}: with BDF2 every step is as long as settings.dt = {self.settings.dt}")
         pot, alive = self._potential, ~self._failed
         pot.set_dt(dt or self.settings.dt)
-        if not self._told:
+        if self._targets_set:
             pot.goal_p.assign(self._goal_p)
             pot.goal_q.assign(self._goal_q)
-            self._told = True
-        found = self._newton.step(alive)
-        failed = found["failed"].astype(bool)
+            self._targets_set = False
+        values = self._newton.step(alive)
+        failed = values["failed"].astype(bool)
         self._failed |= failed
         return StepReport(
-            converged=found["converged"].astype(bool),
+            converged=values["converged"].astype(bool),
             failed=self._failed.copy(),
-            stalled=found["stalled"].astype(bool),
-            blocked=1.0 - found["share"],
-            min_gap=found["min_gap"],
-            min_det=found["min_det"],
-            newton=found["newton"].astype(np.int64),
-            linear=found["linear"].astype(np.int64),
-            line_search=found["line_search"].astype(np.int64),
-            relags=np.maximum(found["relags"], 0).astype(np.int64),
+            stalled=values["stalled"].astype(bool),
+            blocked=1.0 - values["progress"],
+            min_gap=values["min_gap"],
+            min_det=values["min_det"],
+            newton=values["newton"].astype(np.int64),
+            linear=values["linear"].astype(np.int64),
+            line_search=values["line_search"].astype(np.int64),
+            relags=np.maximum(values["relags"], 0).astype(np.int64),
             projected=host(pot.project).astype(bool),
-            ccd=found["ccd"],
-            speed=found["speed"],
+            ccd=values["ccd"],
+            speed=values["speed"],
             pairs=host(pot.collision.contacts.count).astype(np.int64),
             kappa=host(pot.kappa).copy(),
             elastic=host(pot.elastic_energy).copy(),
@@ -184,18 +178,18 @@ class World:
 
     @property
     def timers(self) -> dict[str, float]:
-        """Seconds spent in ``step`` so far, and in each of its stages (on CUDA only with ``Settings.cuda_graph`` off)."""
+        """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
         return dict(self._newton.timers)
 
     # --- outputs ---------------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
-        """Where a driven body's or a grip's frame is in the world: rotations (B, 3, 3) and positions [m] (B, 3)."""
+        """World rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or grip's frame."""
         body = self._frame(name)
         return host(self._potential.R)[:, body].copy(), host(self._potential.t)[:, body].copy()
 
     def positions(self, name: str, frame: str = "world") -> Floats:
-        """Positions [m] of a body, (B, n, 3): all vertices of a soft body's mesh, else its surface's vertices.
+        """Positions [m] (B, n, 3) of all vertices of a soft body's mesh, or of another's surface.
 
         Args:
             name: the body.
@@ -219,12 +213,8 @@ class World:
         return host(solver.x)[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
 
     def velocities(self, name: str) -> Floats:
-        """World velocities [m/s] of a soft body's vertices, (B, n, 3), or of an affine body's four reference corners (B, 4, 3)."""
-        body = self._index(name)
-        first, last = self.layout.node_start[body : body + 2]
-        if first == last:
-            raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return host(self._potential.v)[:, first:last].copy()
+        """World velocities [m/s] of a soft body's vertices or an affine body's corners, (B, n, 3)."""
+        return host(self._potential.v)[:, self._nodes(name)].copy()
 
     def affine_pose(self, name: str) -> tuple[Floats, Floats]:
         """A (B, 3, 3) and p [m] (B, 3) of an affine body's map x = A X + p."""
@@ -239,7 +229,7 @@ class World:
         return A, y[:, 0] - A @ corner
 
     def surface(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """A body's surface: mesh vertex of each surface vertex (n,), and triangles (F, 3) in surface vertex numbers."""
+        """Mesh vertex of each surface vertex (n,), and triangles (F, 3) of surface vertices."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
         faces = self.layout.faces[self.layout.face_start[body] : self.layout.face_start[body + 1]] - first
@@ -248,7 +238,7 @@ class World:
         return np.arange(last - first, dtype=np.int32), faces
 
     def contact_forces(self, name: str) -> Floats:
-        """Contact and friction force on each surface vertex [N], world frame, (B, n, 3); order as in :meth:`surface`."""
+        """Contact and friction force on each vertex of :meth:`surface` [N], world frame, (B, n, 3)."""
         body = self._index(name)
         first, last = self.layout.vert_start[body : body + 2]
         return -host(self._potential.vert_gradient)[:, first:last]
@@ -260,27 +250,22 @@ class World:
         return self.contact_forces(name) / area[None, :, None]
 
     def wrench(self, name: str) -> Wrench:
-        """What the others do to a body: contact forces on a kinematic or affine body or half-space, the bond's pull on a pad's frame.
+        """Force and torque on a body by the others, or on a frame by the nodes bonded to it.
 
         For a soft body with bonded vertices this is the force of the pad on what holds it, and ``"<body>.<grip>"`` gives the force on
         that grip; for a free soft body it is the sum of its contacts.
         """
-        solver, layout = self._potential, self.layout
+        layout = self.layout
         if name in layout.frame_names[len(layout.names) :] and not name.endswith(".aim"):
             frame = layout.frame_names.index(name)
-            return bond_wrench(solver, int(layout.frame_body[frame]), frame, layout.grip_node[layout.grip_frame == frame])
+            nodes = layout.grip_node[layout.grip_frame == frame]
+            return bond_wrench(self._potential, int(layout.frame_body[frame]), frame, nodes)
         body = self._index(name)
-        origin = host(solver.t)[:, body] if layout.framed[body] else np.zeros((self.num_envs, 3))
-        first, last = layout.vert_start[body : body + 2]
-        if isinstance(self.bodies[body], HalfSpace):
-            points, forces = plane_forces(layout, solver, body)
-        elif isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
+        if isinstance(self.bodies[body], SoftBody) and layout.framed[body]:
             nodes = np.arange(layout.node_start[body], layout.node_start[body + 1])
-            held = nodes[(layout.node_free[nodes] == 0) & ~np.isin(nodes, layout.grip_node)]
-            return bond_wrench(solver, body, body, held)
-        else:
-            points, forces = host(solver.x)[:, first:last], -host(solver.vert_gradient)[:, first:last]
-        return Wrench(forces.sum(axis=1), np.cross(points - origin[:, None], forces).sum(axis=1))
+            nodes = nodes[(layout.node_free[nodes] == 0) & ~np.isin(nodes, layout.grip_node)]
+            return bond_wrench(self._potential, body, body, nodes)
+        return contact_wrench(layout, self._potential, body)
 
     def contacts(self, env: int = 0) -> ContactPairs:
         """The contact pairs of one environment at the end of the last step."""
@@ -289,21 +274,18 @@ class World:
         return contact_pairs(self.layout, self._potential, env)
 
     def pressing(self) -> dict[tuple[str, str], PairForces]:
-        """Forces at the end of the last step by names of the two bodies; pairs that nowhere touch are not in it."""
+        """Forces at the end of the last step by names of two bodies that touch in any environment."""
         return pair_forces(self.layout, self._potential)
 
     def rigid_motion(self, name: str) -> RigidMotion:
-        """Mass, centre, inertia and velocities of a soft or affine body as if it moved as a whole at this instant; world frame."""
-        body = self._index(name)
-        if self.layout.node_start[body] == self.layout.node_start[body + 1]:
-            raise IpcError(f"{name!r} has no unknowns: its motion is what set_target says")
-        return rigid_motion(self.layout, self._potential, body)
+        """Mass, centre, inertia and velocities of a soft or affine body as if it were rigid now."""
+        self._nodes(name)
+        return rigid_motion(self.layout, self._potential, self._index(name))
 
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
-        """The part of a bonded soft body that bore contact forces at the end of the last step, as if it moved as a whole.
+        """The part of a bonded soft body under contact forces, as if it moved as a whole.
 
-        None where nothing touches what is free of it. The first call for a body inverts its rest matrix (before any step it
-        answers None, and that is done).
+        None where nothing touches its free nodes, as before any step. The first call for a body inverts its rest matrix.
 
         Raises:
             IpcError: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
@@ -316,11 +298,11 @@ class World:
         return self._patches[body].loaded(self._potential, env)
 
     def touching(self, name: str) -> dict[str, NDArray[np.bool_]]:
-        """Which bodies were closer than d̂ to a body at the end of the last step, (B,) by name; without those that nowhere were."""
+        """Masks (B,) of other bodies that were closer than d̂ at the end of the last step, by name."""
         return touching(self.layout, self._potential, self._index(name))
 
     def overlap(self, env: int = 0) -> str | None:
-        """Say which surfaces cross, touch or contain each other in one environment as it is now; None where all are apart.
+        """Describe surfaces that cross, touch or contain each other; None where all are apart.
 
         Edges and triangles are compared exactly, on the host: a check for tests and experiments, not for every step of a batch. Only
         pairs of bodies that may touch are looked at, a body with itself where it has ``self_contact``.
@@ -338,11 +320,8 @@ class World:
         return State(
             y=host(s.y).copy(),
             velocity=host(s.v).copy(),
-            velocity_before=host(s.v_before).copy(),
-            position_before=host(s.xw_before).copy(),
             frame_rotation=host(s.frame_q)[..., [3, 0, 1, 2]].copy(),
             frame_position=host(s.frame_p).copy(),
-            second_order=host(s.second_order).copy(),
             kappa=host(s.kappa).copy(),
             failed=self._failed.copy(),
         )
@@ -360,24 +339,21 @@ class World:
             OverlapError: if surfaces cross or touch in that state.
         """
         mask, s = env_mask(envs, self.num_envs), self._potential
-        for what, found, needed in (
+        for what, given, needed in (
             ("nodes", state.y.shape, (*s.y.shape, 3)),
             ("frames", state.frame_position.shape, (*s.frame_p.shape, 3)),
         ):
-            if found != needed:
-                raise IpcError(f"the state has {what} of shape {found}: this world has {needed}")
+            if given != needed:
+                raise IpcError(f"the state has {what} of shape {given}: this world has {needed}")
         check_overlap(self.layout, state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         for target, values in (
             (s.y, state.y),
             (s.v, state.velocity),
-            (s.v_before, state.velocity_before),
-            (s.xw_before, state.position_before),
             (s.frame_q, quaternions),
             (s.goal_q, quaternions),
             (s.frame_p, state.frame_position),
             (s.goal_p, state.frame_position),
-            (s.second_order, state.second_order),
             (s.kappa, state.kappa),
         ):
             merged = host(target).copy()
@@ -395,13 +371,13 @@ class World:
         s.place_vertices(s.y, s.R, s.t, s.x)
 
     def reset(self, envs: ArrayLike | None = None) -> None:
-        """Put environments (a mask (B,), a list, or None for all) back to how the world was made."""
+        """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""
         self.restore(self._start, envs)
 
     def teleport(
         self, name: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None, envs: ArrayLike | None = None
     ) -> None:
-        """Move a driven body's frame at once, with all that is bonded to it; its velocities become zero.
+        """Move a driven frame at once, with all that is bonded to it; velocities become zero.
 
         Its target becomes that pose; those of other bodies stay. An affine body is put there, undeformed.
 
@@ -420,4 +396,4 @@ class World:
         goal_p, goal_q = self._goal_p[:, ~moved].copy(), self._goal_q[:, ~moved].copy()
         self.restore(state, mask)
         self._goal_p[:, ~moved], self._goal_q[:, ~moved] = goal_p, goal_q
-        self._told = False
+        self._targets_set = True

@@ -23,6 +23,7 @@ from .errors import MeshError as MeshError
 from .errors import OverlapError as OverlapError
 from .errors import RaytacError as RaytacError
 from .errors import SpecError as SpecError
+from .frame import MissingOutputError as MissingOutputError
 from .frame import TactileFrame as TactileFrame
 from .gel.surface import GelSurface as GelSurface
 from .gel.surface import PadGrid as PadGrid
@@ -32,10 +33,10 @@ from .sensor.tactile_sensor import TactileSensor as TactileSensor
 from .specs.files import available as available
 from .specs.press import PressScene as PressScene
 from .specs.press_file import load_press as load_press
-from .specs.scene_file import load_scene as load_scene
 from .specs.sensor import SensorSpec as SensorSpec
 from .specs.sensor_file import load_sensor as load_sensor
 from .specs.task import TaskScene as TaskScene
+from .specs.task_file import load_scene as load_scene
 from .specs.task_file import load_task as load_task
 from .world.world import TactileWorld as TactileWorld
 

@@ -1,4 +1,4 @@
-"""Where the shipped data lies: found alike from a wheel, an editable install and a plain checkout."""
+"""Folders of the shipped data, the same from a wheel, an editable install and a plain checkout."""
 
 from __future__ import annotations
 

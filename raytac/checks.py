@@ -57,12 +57,12 @@ class Interval:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a real number of Python or NumPy; a truth value is none."""
+    """True for a real number of Python or NumPy; a truth value is none."""
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 def is_whole(value: object) -> bool:
-    """Whether a value is a whole number of Python or NumPy; a truth value is none."""
+    """True for a whole number of Python or NumPy; a truth value is none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 

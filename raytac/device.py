@@ -1,4 +1,4 @@
-"""Where the work runs: choose CPU or CUDA once, and find the LLVM library that Dr.Jit compiles CPU code with.
+"""Devices: choose CPU or CUDA once, and find the LLVM library that Dr.Jit compiles CPU code with.
 
 Nothing here imports Mitsuba, Dr.Jit or Warp, so that asking is cheap and safe.
 """
@@ -34,7 +34,7 @@ CUDA_MINIMUM = (12, 2)
 CUDA_REFUSED = (12, 7)
 """CUDA whose OptiX Dr.Jit 1.5 refuses."""
 LLVM_NAMED_BY_USER = bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
-"""Whether the environment already named a libLLVM when raytac started; ``raytac.optics``, which imports this first, sets it otherwise."""
+"""True if the environment named a libLLVM before raytac started; else ``raytac.optics``, which imports this first, names one."""
 LLVM_MINIMUM = 16
 """Oldest LLVM looked for on the system: 14 is refused by Dr.Jit 1.5, and 15 was seen to abort the process."""
 
@@ -62,7 +62,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
 
 
 def cuda_missing(ray_tracing: bool = True) -> str:
-    """What CUDA lacks here, found without running anything on a device; nothing if it should work."""
+    """Reason why CUDA cannot work here, found without running anything on a device; empty if it should work."""
     if cuda_device_count() == 0:
         return "no NVIDIA driver, or no CUDA device that this process may see"
     if not ray_tracing:
@@ -71,8 +71,8 @@ def cuda_missing(ray_tracing: bool = True) -> str:
         return "the NVIDIA driver brings no OptiX (libnvoptix.so.1; in a container ask for the 'graphics' capability)"
     version = cuda_driver_version()
     if version < CUDA_MINIMUM:
-        found, least = (".".join(map(str, v)) for v in (version, CUDA_MINIMUM))
-        return f"the NVIDIA driver speaks CUDA {found}, and Dr.Jit needs {least} (driver R535 or newer)"
+        present, least = (".".join(map(str, v)) for v in (version, CUDA_MINIMUM))
+        return f"the NVIDIA driver speaks CUDA {present}, and Dr.Jit needs {least} (driver R535 or newer)"
     if version == CUDA_REFUSED:
         return "the NVIDIA driver speaks CUDA 12.7 (R565), whose OptiX Dr.Jit refuses as prone to miscompile; older and newer ones work"
     return ""
@@ -134,9 +134,9 @@ def _packaged_llvm() -> Path | None:
     except importlib.metadata.PackageNotFoundError:
         return None
     named = [file for file in files if file.name in ("libLLVM.so", "libLLVM.dylib", "LLVM-C.dll")]
-    found = [Path(str(file.locate())) for file in named]
+    paths = [Path(str(file.locate())) for file in named]
     beside = [Path(sys.prefix) / "lib" / name for name in ("libLLVM.so", "libLLVM.dylib")]  # RECORD may not list links
-    return next((path.resolve() for path in (*found, *beside) if path.exists()), None)
+    return next((path.resolve() for path in (*paths, *beside) if path.exists()), None)
 
 
 def _system_llvm() -> Path | None:

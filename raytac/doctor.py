@@ -54,7 +54,7 @@ print("MuJoCo", mujoco.__version__, "dropped a ball and it came to rest")
 _EXR = """
 import pathlib, tempfile
 import numpy as np
-from raytac.io.exr import read_exr, write_exr
+from raytac.io.images import read_exr, write_exr
 with tempfile.TemporaryDirectory() as folder:
     path = pathlib.Path(folder) / "probe.exr"
     image = np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4)
@@ -85,7 +85,7 @@ print("matplotlib", matplotlib.__version__, "drew a figure; trimesh", trimesh.__
 
 _WARP = """
 import warp as wp
-from ipc.warp_start import start_warp
+from ipc import start_warp
 wp.config.log_level = wp.LOG_WARNING
 start_warp()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))
@@ -125,16 +125,16 @@ class Probe:
     name: str
     code: str
     required: bool
-    """Whether the default job cannot run without it."""
+    """True if the default job cannot run without it."""
     fix: str
-    """How to mend it."""
+    """Advice that mends it."""
     skip: Callable[[], str] = field(default=lambda: "")
     """Why there is nothing to try, or an empty text."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What came of one probe."""
+    """Result of one probe."""
 
     name: str
     ok: bool
@@ -147,13 +147,13 @@ class Check:
 @dataclass(frozen=True)
 class Report:
     device: str
-    """What the default job will run on: ``cuda``, ``cpu`` or ``none``."""
+    """Device of the default job: ``cuda``, ``cpu`` or ``none``."""
     checks: tuple[Check, ...]
     versions: dict[str, str]
 
     @property
     def ok(self) -> bool:
-        """Whether the default job can run."""
+        """True if the default job can run."""
         return self.device != "none" and all(check.ok for check in self.checks if check.required)
 
     @property
@@ -216,11 +216,11 @@ PROBES = (
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
     Probe(
         "warp", _WARP, False, "pip install 'raytac[ipc]'",
-        _absent("physics ipc (the simulated pad), raytac calibrate, and raytac compare with --pad or --markers need it", "warp"),
+        _absent("physics ipc (the soft pad), raytac calibrate, and raytac compare with --level or --markers need it", "warp"),
     ),
     Probe(
         "pytetwild", _TETWILD, False, "pip install 'raytac[ipc]'",
-        _absent("soft objects on the simulated pad need it", "pytetwild", "pyvista"),
+        _absent("soft objects on the soft pad need it", "pytetwild", "pyvista"),
     ),
     Probe(
         "report", _REPORT, False, "pip install 'raytac[report]'",
@@ -285,5 +285,5 @@ def _check_ipc() -> Check:
     where = foreign_ipc()
     if where is None:
         return Check("ipc", True, False, "the package of that name is raytac's own", "")
-    fix = "uninstall the other package, or put raytac first on the path; only the simulated pad needs it"
+    fix = "uninstall the other package, or put raytac first on the path; only the soft pad needs it"
     return Check("ipc", False, False, f"another package answers to that name: {where}", fix)

@@ -66,7 +66,7 @@ class InputError(RaytacError, ValueError):
         super().__init__(f"{name} = {short_repr(value)}: {rule}{_choices_text(value, self.choices)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Made anew from its parts, so that it comes whole from another process."""
+        """Rebuild it from its parts, so that it is complete when it comes from another process."""
         return partial(type(self), value=self.value, rule=self.rule, choices=self.choices), (self.name,)
 
 

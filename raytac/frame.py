@@ -1,73 +1,126 @@
-"""What a sensor returns: one dataclass of arrays, each present only if it was asked for."""
+"""What a sensor returns: one record of arrays, of which outputs are present only if they were asked for."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, summary
 
 if TYPE_CHECKING:
     from raytac.markers import MarkerFrame
 
-__all__ = ["OUTPUTS", "TactileFrame"]
+__all__ = ["IMAGES", "OUTPUTS", "MissingOutputError", "TactileFrame"]
 
 OUTPUTS = ("rgb", "layers", "normals", "depth", "height", "wrench", "traction")
 """Names that ``TactileSensor(outputs=…)`` and ``raytac press --outputs`` accept."""
+IMAGES = ("rgb", "layers", "normals", "position", "depth", "contact", "uncovered")
+"""Fields of a frame that an optical mode makes."""
 
 
-@dataclass(frozen=True, repr=False)
+class MissingOutputError(InputError, AttributeError):
+    """A field of a frame that is not there, since it was not asked for or cannot be; the message says how to ask for it."""
+
+
+_ASK = {
+    "markers": "was not asked for: give the sensor a marker model, as in markers='fots'",
+    "position": "comes with the normals, which were not asked for: outputs=('normals', …)",
+    "contact": "comes with normals or depth, which were not asked for: outputs=('normals', …)",
+    "uncovered": "is of optics='taxim' alone, where an image is asked for and the table tells its coverage",
+    "contact_area": "comes with wrench or traction, which were not asked for: outputs=('wrench', …)",
+    "contact_cells": "is of soft pads, and comes with wrench or traction: physics='ipc', outputs=('wrench', …)",
+    "force": "is not known: the frame was made from a bare surface, and not by a pad",
+    "force_law_area": "is of the rigid pad's presses alone: physics='rigid'",
+    "unconverged": "is of soft pads alone: physics='ipc'",
+}
+"""How to ask for what is not named in ``outputs=`` by its own name."""
+
+
+@dataclass(frozen=True, repr=False, eq=False, init=False)
 class TactileFrame:
-    """Images of B sensors at one instant; an output that was not asked for is None.
+    """What B sensors see and feel at one instant. All images are (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
 
-    All images have shape (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
+    ``surface``, ``failed``, ``time_ms`` and ``label`` are always there, and ``force`` too unless the frame was made from a bare surface.
+    What ``OUTPUTS`` names is there if the sensor was asked for it, so ``wrench``, which holds the same force with its torque; markers if
+    the sensor has a marker model. ``outputs`` names all that is there. What is not raises ``MissingOutputError``, which says how to ask
+    for it.
     """
 
     surface: GelSurface
-    rgb: np.ndarray | None = None
+    rgb: np.ndarray
     """8-bit image after the camera response, shape (B, H, W, 3), uint8."""
-    layers: dict[str, np.ndarray] | None = None
+    layers: dict[str, np.ndarray]
     """Linear radiance by light layer, each shape (B, H, W, 3), float32; their sum is the linear image."""
-    normals: np.ndarray | None = None
+    normals: np.ndarray
     """Unit normal of the coat towards the camera side (n_z < 0), pad frame, shape (B, H, W, 3), float32."""
-    position: np.ndarray | None = None
+    position: np.ndarray
     """Seen point of the coat, pad frame [m], shape (B, H, W, 3), float32 (comes with ``normals``)."""
-    depth: np.ndarray | None = None
+    depth: np.ndarray
     """Camera-axis depth z − z_camera [m], shape (B, H, W), float32 (not distance along the ray)."""
-    height: np.ndarray | None = None
+    height: np.ndarray
     """Surface height on the pad grid [m], shape (B, Ny, Nx), float32."""
-    contact: np.ndarray | None = None
+    contact: np.ndarray
     """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
-    uncovered: np.ndarray | None = None
-    """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact; None
-    for other modes, and where the table does not tell its coverage."""
-    markers: MarkerFrame | None = None
-    """Where the markers have gone, in metres and pixels; None unless the sensor was given a marker model."""
-    wrench: np.ndarray | None = None
+    uncovered: np.ndarray
+    """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact;
+    of the mode ``taxim`` alone, where the table tells its coverage."""
+    markers: MarkerFrame
+    """Where the markers have gone, in metres and pixels; there if the sensor was given a marker model."""
+    wrench: np.ndarray
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
-    traction: np.ndarray | None = None
+    traction: np.ndarray
     """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
     Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
     over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is the wrench's force."""
-    contact_area: np.ndarray | None = None
+    contact_area: np.ndarray
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
-    contact_cells: np.ndarray | None = None
+    contact_cells: np.ndarray
     """Width of the narrowest patch of contact in cells of a simulated pad, shape (B,), NaN without contact (comes with ``wrench`` or
-    ``traction``): with fewer than 6 the force at a given depth is too large. None for the rigid pad."""
-    force: np.ndarray | None = None
-    """Force of the object on the pad, pad frame [N], shape (B, 3); None if the frame was made from a bare surface."""
-    force_law_area: np.ndarray | None = None
-    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. None as for
-    ``force``, and for a simulated pad, which follows no such law."""
-    failed: np.ndarray | None = None
-    """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use. None as for ``force``."""
-    unconverged: np.ndarray | None = None
+    ``traction``): with fewer than 6 the force at a given depth is too large."""
+    force: np.ndarray
+    """Force of the object on the pad, pad frame [N], shape (B, 3); not of a bare surface."""
+    force_law_area: np.ndarray
+    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. Of the rigid
+    pad's presses."""
+    failed: np.ndarray
+    """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use."""
+    unconverged: np.ndarray
     """Steps of a simulated pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
-    shape (B,), int. An environment whose last step is one of them has ``failed``. None for the rigid pad, and as for ``force``."""
-    time_ms: dict[str, float] = field(default_factory=dict)
+    shape (B,), int. An environment whose last step is one of them has ``failed``."""
+    time_ms: dict[str, float]
     """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 
+    label: str
+    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not told."""
+
+    def __init__(self, surface: GelSurface, **values: Any) -> None:
+        """``values``: further fields; None is as if it were not given."""
+        known = [f.name for f in fields(type(self))]
+        for name in values:
+            if name not in known:
+                raise InputError("values", value=name, rule="must be a field of a frame", choices=known)
+        always: dict[str, Any] = {"failed": np.zeros(surface.batch, bool), "time_ms": {}, "label": ""}
+        given = {name: value for name, value in values.items() if value is not None}
+        self.__dict__.update({"surface": surface, **always, **given})
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of all fields that are there."""
+        return tuple(f.name for f in fields(self) if f.name in self.__dict__)
+
+    def with_values(self, **values: Any) -> TactileFrame:
+        """The same with other values of some fields; None leaves one out."""
+        return TactileFrame(**{**self.__dict__, **values})
+
+    if not TYPE_CHECKING:  # a type checker knows the fields, and so finds names that do not exist
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in type(self).__dataclass_fields__:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            raise MissingOutputError(name, value=None, rule=_ASK.get(name, f'was not asked for: outputs=("{name}", …)'))
+
     def __repr__(self) -> str:
-        return summary(self)
+        return summary(self, self.outputs)

@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms of a batch: matrices, quaternions, rotation vectors, and checks of poses that users give."""
+"""Rotations and rigid transforms: matrices, quaternions, rotation vectors, wrenches, and checks of poses that users give."""
 
 from __future__ import annotations
 
@@ -7,21 +7,57 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from raytac.checks import check_numbers
 from raytac.errors import InputError
 
 __all__ = [
+    "about_z",
     "batch_of",
     "between",
+    "check_pose",
     "inverse",
     "nearest_rotation",
+    "pose",
+    "pose_error",
+    "pose_of",
     "quaternion",
     "quaternions",
     "rigid_poses",
     "rotation_of",
     "rotation_vector",
     "rotations",
+    "shifted_wrench",
     "turn_angle",
 ]
+
+_ORTHONORMAL = 1e-6
+"""Largest entry of RᵀR − 1 of a matrix R that counts as a rotation."""
+
+
+def pose(rotation: np.ndarray, position: ArrayLike) -> np.ndarray:
+    """``target_from_source`` (4, 4) from a rotation matrix (3, 3) and a position (3,) [m]."""
+    matrix = np.zeros((4, 4))  # np.eye takes three times as long
+    matrix[:3, :3], matrix[:3, 3], matrix[3, 3] = rotation, position, 1.0
+    return matrix
+
+
+def pose_of(position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
+    """``target_from_source`` (4, 4) from a position (3,) [m] and a unit quaternion wxyz (4,)."""
+    return pose(rotation_of(quaternion), position)
+
+
+def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
+    """Displacement from b to a (…, 6), world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long.
+
+    Poses (…, 4, 4) that broadcast.
+    """
+    turn = rotation_vector(world_from_a[..., :3, :3] @ np.swapaxes(world_from_b[..., :3, :3], -1, -2))
+    return np.concatenate([world_from_a[..., :3, 3] - world_from_b[..., :3, 3], turn], axis=-1)
+
+
+def shifted_wrench(wrench: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from that point to the one that they were about."""
+    return np.concatenate([wrench[..., :3], wrench[..., 3:] + np.cross(arm, wrench[..., :3])], axis=-1)
 
 
 def rotation_of(quaternion: ArrayLike) -> np.ndarray:
@@ -46,7 +82,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     q = quaternion(rotation)
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     sine = np.sqrt(np.square(q[..., 1:]).sum(axis=-1, keepdims=True))
-    # θ / sin(θ/2), 2 where there is no turn
+    # θ / sin(θ/2), which is 2 at θ = 0
     factor = np.where(sine > 0.0, 2.0 * np.arctan2(sine, q[..., :1]) / np.where(sine > 0.0, sine, 1.0), 2.0)
     return factor * q[..., 1:]
 
@@ -54,8 +90,8 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 def quaternion(r: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz (…, 4) of rotation matrices (…, 3, 3).
 
-    The component is rooted that is greatest (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so that
-    they are as accurate at no turn as at half a turn.
+    The root is taken of the greatest component (S. W. Shepperd, "Quaternion from rotation matrix", J. Guid. Control 1(3), 1978), so
+    that the result is accurate for any angle.
     """
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     x, y, z = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
@@ -75,12 +111,12 @@ def quaternion(r: np.ndarray) -> np.ndarray:
 
 def inverse(poses: np.ndarray) -> np.ndarray:
     """Inverses of rigid transforms (…, 4, 4)."""
-    found = np.zeros_like(poses)
-    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
-    found[..., :3, :3] = turned
-    found[..., :3, 3] = -(turned @ poses[..., :3, 3, None])[..., 0]
-    found[..., 3, 3] = 1.0
-    return found
+    result = np.zeros_like(poses)
+    transposed = np.swapaxes(poses[..., :3, :3], -1, -2)
+    result[..., :3, :3] = transposed
+    result[..., :3, 3] = -(transposed @ poses[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
 
 
 def turn_angle(rotations: np.ndarray) -> np.ndarray:
@@ -91,7 +127,7 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Poses (B, 4, 4) a ``share`` of the way: positions along the line, rotations along the shorter arc (slerp)."""
+    """Poses (B, 4, 4) at a ``share``: linear positions, rotations along the shorter arc (slerp)."""
     if share <= 0.0 or share >= 1.0:
         return (start if share <= 0.0 else end).copy()
     a, b = quaternions(start), quaternions(end)
@@ -101,14 +137,14 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     small = half < 1e-6
     sine = np.where(small, 1.0, np.sin(half))
     q = np.where(small, (1.0 - share) * a + share * b, (np.sin((1.0 - share) * half) * a + np.sin(share * half) * b) / sine)
-    found = np.tile(np.eye(4), (len(start), 1, 1))
-    found[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
-    found[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
-    return found
+    result = np.tile(np.eye(4), (len(start), 1, 1))
+    result[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
+    result[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
+    return result
 
 
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
-    """The rotations closest to matrices (…, 3, 3) in the Frobenius norm: the orthogonal factors of their polar decompositions."""
+    """Rotations closest to matrices (…, 3, 3) in the Frobenius norm (polar decomposition)."""
     u, _, v = np.linalg.svd(matrices)
     mirrored = np.linalg.det(u @ v) < 0.0
     u[mirrored, :, 2] *= -1.0
@@ -116,29 +152,47 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:
-    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3) [rad] (Rodrigues' formula)."""
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula)."""
+    shape, vectors = vectors.shape, vectors.reshape(-1, 3)
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     half = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 − cos a)/a²
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross
+    return (np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross).reshape(*shape, 3)
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:
-    """Environments that poses with a first axis speak of; 1 if none has one."""
+    """Number of environments of poses with a batch axis; 1 if none has one."""
     given = [np.shape(world_from_pad)] if np.ndim(world_from_pad) == axes else []
     given += [np.shape(pose) for pose in bodies.values() if np.ndim(pose) == axes - 1]
     return given[0][0] if given else 1
 
 
+def check_pose(name: str, value: ArrayLike) -> np.ndarray:
+    """``value`` as a float64 (4, 4) rigid transform. Raises ``InputError``, naming ``name``, if it is none."""
+    matrix = check_numbers(name, value, (4, 4), finite=True)
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL:
+        raise InputError(name, value=matrix[3].tolist(), rule="must have the last row 0, 0, 0, 1")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
+        raise InputError(name, value=rotation.tolist(), rule="must hold a rotation: orthonormal columns, determinant +1")
+    return matrix
+
+
 def rigid_poses(what: str, values: ArrayLike, batch: int, count: int | None = None) -> np.ndarray:
-    """Rigid transforms (B, 4, 4), or (B, count, 4, 4), from these with or without the first axis; raises ``InputError``."""
+    """Rigid transforms (B, 4, 4) or (B, count, 4, 4) of ``values`` that may lack the batch axis."""
     array = np.asarray(values, float)
     shape = (4, 4) if count is None else (count, 4, 4)
     if array.shape not in (shape, (batch, *shape)):
         raise InputError(what, value=array.shape, rule=f"must have shape {shape} or {(batch, *shape)}")
     off = np.abs(np.swapaxes(array[..., :3, :3], -1, -2) @ array[..., :3, :3] - np.eye(3)).max(initial=0.0)
-    if not (np.isfinite(array).all() and off < 1e-6 and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
+    if not (np.isfinite(array).all() and off < _ORTHONORMAL and (np.linalg.det(array[..., :3, :3]) > 0.0).all()):
         raise InputError(what, value=array.tolist(), rule="must hold finite rigid transforms (4, 4)")
     return np.broadcast_to(array, (batch, *shape)).copy()
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Rotation by ``angle`` [rad] about z, (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

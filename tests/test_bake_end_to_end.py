@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.optics.taxim.folder import CALIBRATION_FILES, load_calibration
 
 

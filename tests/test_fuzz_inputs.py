@@ -22,14 +22,15 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ipc.errors import IpcError
+from ipc import IpcError
 from raytac import TactileSensor
 from raytac.assets import asset_root
 from raytac.errors import RaytacError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.metrics import read_metrics
-from raytac.markers import MarkerPerturbation
+from raytac.markers import ContactSettings, MarkerPerturbation, Superposition
 from raytac.observe import ObservationSettings, Randomization, TactileObserver
+from raytac.optics import Phong, RayTraced, Taxim
 from raytac.optics.image.mlp_weights import load_mlp
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.folder import load_calibration, save_calibration
@@ -39,9 +40,8 @@ from raytac.specs import load_lights, load_press, load_sensor, load_sweep
 from raytac.specs.marker_motion import load_marker_motion
 from raytac.specs.mesh import load_mesh
 from raytac.specs.press import PressScene
-from raytac.specs.scene_file import load_scene
 from raytac.specs.sweep import PressRanges
-from raytac.specs.task_file import load_task
+from raytac.specs.task_file import load_scene, load_task
 
 LONGEST = 2500
 """Characters of a message, with the path of a temporary folder in it."""
@@ -311,10 +311,11 @@ def updated(**changes: Any) -> object:
 CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     TactileSensor: {
         "sensor": MINI, "physics": "rigid", "pad": None, "optics": "phong", "outputs": ("height",), "resolution": (32, 24),
-        "integrator": "fast",
-        "spp": None, "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None, "marker_perturbation": None,
-        "optics_options": None,
+        "device": "cpu", "seed": 1, "num_envs": 2, "pitch": 1e-3, "markers": None,
     },
+    RayTraced: dict(vars(RayTraced())),
+    Taxim: dict(vars(Taxim())),
+    Phong: dict(vars(Phong())),
     press: {"offsets": None, "depths": None, "rotations": None, "shears": None, "twists": None, "seeds": None},
     pressed_pad: {name: getattr(MINI.gelpad, name) for name in vars(MINI.gelpad)},
     pressed_object: {name: getattr(BALL.object, name) for name in vars(BALL.object)},
@@ -339,6 +340,8 @@ CONSTRUCTORS: Mapping[Callable[..., object], Mapping[str, Any]] = {
     partial(replace, TASK): {name: value for name, value in vars(TASK).items() if name not in ("name", "source")},
     Randomization: {name: getattr(Randomization(), name) for name in vars(Randomization())},
     MarkerPerturbation: dict(vars(MarkerPerturbation())),
+    ContactSettings: dict(vars(ContactSettings())),
+    Superposition: dict(vars(Superposition())),
     ObservationSettings: dict(vars(ObservationSettings())),
     TactileObserver: {"sensor": MINI, "settings": ObservationSettings(("height",)), "num_envs": 2, "randomization": None, "seed": 0},
     BakeSettings: dict(vars(BakeSettings())),

@@ -12,9 +12,8 @@ from scipy.ndimage import map_coordinates
 import raytac
 from raytac.cli import main
 from raytac.frame import TactileFrame
-from raytac.io.exr import read_exr
+from raytac.io.images import read_exr, read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.specs import load_sensor
 
 ROOT = Path(__file__).parents[1]
@@ -137,9 +136,9 @@ def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
     frame = names["frame"]
     assert isinstance(frame, TactileFrame)
-    assert frame.rgb is not None and frame.rgb.shape == (1, 240, 320, 3) and frame.rgb.dtype == np.uint8
-    assert frame.depth is not None and frame.depth.shape == (1, 240, 320) and frame.depth.dtype == np.float32
-    assert frame.force is not None and frame.force.shape == (1, 3)
+    assert frame.rgb.shape == (1, 240, 320, 3) and frame.rgb.dtype == np.uint8
+    assert frame.depth.shape == (1, 240, 320) and frame.depth.dtype == np.float32
+    assert frame.force.shape == (1, 3)
 
 
 def test_the_readmes_soft_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,9 +149,9 @@ def test_the_readmes_soft_example_runs(tmp_path: Path, monkeypatch: pytest.Monke
     exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
     frame = names["frame"]
     assert isinstance(frame, TactileFrame)
-    assert frame.wrench is not None and frame.wrench[0, 2] < -1.0
-    assert frame.traction is not None and frame.traction[0, ..., 2].min() < -1e4
-    assert frame.markers is not None and frame.markers.displacement_px.shape == (1, 63, 2)
+    assert frame.wrench[0, 2] < -1.0
+    assert frame.traction[0, ..., 2].min() < -1e4
+    assert frame.markers.displacement_px.shape == (1, 63, 2)
     assert np.nanmax(np.abs(frame.markers.displacement_px)) > 0.5
 
 
@@ -164,5 +163,5 @@ def test_the_readmes_world_example_runs(tmp_path: Path, monkeypatch: pytest.Monk
     exec(compile(snippet.replace("outputs=(", 'device="cpu", outputs=('), "README.md", "exec"), names)
     frame = names["frame"]
     assert isinstance(frame, TactileFrame)
-    assert frame.markers is not None and frame.markers.displacement_px.shape == (1, 99, 2)
-    assert frame.wrench is not None and not frame.wrench.any()  # the pad starts clear of the ball
+    assert frame.markers.displacement_px.shape == (1, 99, 2)
+    assert not frame.wrench.any()  # the pad starts clear of the ball

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.frame import OUTPUTS
+from raytac.frame import OUTPUTS, MissingOutputError, TactileFrame
+from raytac.optics import OPTICS
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
 from tests.conftest import Shader, make_surface
@@ -25,11 +26,9 @@ from tests.conftest import Shader, make_surface
         ({"outputs": ("rgb", "deph")}, r"outputs = 'deph'.*did you mean 'depth'.*rgb, layers"),
         ({"outputs": 3}, "sequence of names"),
         ({"outputs": "rgb,depth"}, "outputs = 'rgb,depth'.*layers"),
-        ({"integrator": "quick"}, "fast, reference"),
         ({"device": "gpu"}, "auto, cpu, cuda"),
         ({"num_envs": 0}, "num_envs = 0"),
-        ({"spp": 0}, "spp = 0"),
-        ({"spp": 1.5}, "spp = 1.5"),
+        ({"optics": "mlp"}, "weights = None: must name a network"),
         ({"resolution": (0, 240)}, "resolution = 0"),
         ({"resolution": (320, 9000)}, "resolution = 9000.*8192"),
         ({"resolution": (320,)}, r"\(width, height\)"),
@@ -96,12 +95,11 @@ def test_the_area_of_the_force_law_is_told_beside_that_of_the_surface(sensor_spe
     """A ball on a flat pad: π R δ in the law (Hertz), and less in the surface, whose Gaussians hold the gel off the ball."""
     sensor = TactileSensor(sensor_spec, outputs="height", num_envs=2)
     frame = sensor.press("sphere", depths=np.array([0.3e-3, 0.5e-3]))
-    assert frame.force_law_area is not None
     np.testing.assert_allclose(frame.force_law_area, np.pi * 3.155e-3 * np.array([0.3e-3, 0.5e-3]), rtol=0.05)
     pitch = sensor.grid.pitch
     area = frame.surface.contact.sum(axis=(1, 2)) * pitch[0] * pitch[1]
     assert (area > 0).all() and not np.allclose(area, frame.force_law_area, rtol=0.05)
-    assert sensor.rest().force_law_area is None
+    assert "force_law_area" not in sensor.rest().outputs
 
 
 def test_a_state_of_another_scene_is_refused(sensor_spec: SensorSpec) -> None:
@@ -113,6 +111,28 @@ def test_a_state_of_another_scene_is_refused(sensor_spec: SensorSpec) -> None:
         sensor.update(state)
     sensor.load("coin")
     assert sensor.update(state).height is not None
+
+
+def test_what_was_not_asked_for_says_how_to_ask(sensor_spec: SensorSpec) -> None:
+    frame = TactileSensor(sensor_spec, outputs="height", pitch=0.5e-3).press("sphere")
+    assert frame.outputs == ("surface", "height", "force", "force_law_area", "failed", "time_ms", "label")
+    for name, how in (
+        ("rgb", r'outputs=\("rgb", …\)'),
+        ("contact_area", "wrench"),
+        ("markers", "markers='fots'"),
+        ("unconverged", "ipc"),
+    ):
+        with pytest.raises(MissingOutputError, match=rf"{name} = None: .*{how}"):
+            getattr(frame, name)
+        assert not hasattr(frame, name)
+    with pytest.raises(AttributeError, match="no attribute 'hight'"):
+        _ = frame.hight  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match=r"must be a field of a frame.*rgb"):
+        frame.with_values(rbg=frame.height)
+    again = pickle.loads(pickle.dumps(frame.with_values(time_ms={}, force=None)))
+    assert again.time_ms == {} and "force" not in again.outputs and again.label == "rigid"
+    with pytest.raises(InputError, match="bare surface"):
+        _ = TactileFrame(frame.surface).force
 
 
 def test_environments_differ_by_offset_and_depth(sensor_spec: SensorSpec) -> None:
@@ -144,14 +164,14 @@ def test_a_surface_is_all_that_a_loop_needs(sensor_spec: SensorSpec) -> None:
     sensor = TactileSensor(sensor_spec, optics=Shader(sensor_spec), outputs=("rgb", "height"))
     surface = make_surface(batch=3)
     frame = sensor.update(surface)
-    assert frame.rgb is not None and frame.rgb.shape[0] == 3 and frame.rgb.dtype == np.uint8
-    assert frame.height is surface.height and frame.force is None
+    assert frame.rgb.shape[0] == 3 and frame.rgb.dtype == np.uint8
+    assert frame.height is surface.height and "force" not in frame.outputs
 
 
 def test_force_pushes_into_the_pad_and_holds_for_every_environment(sensor_spec: SensorSpec) -> None:
     sensor = TactileSensor(sensor_spec, outputs=("height",), num_envs=2, pitch=0.5e-3)
     frame = sensor.press("sphere")
-    assert frame.force is not None and frame.force.shape == (2, 3) and frame.failed is not None and not frame.failed.any()
+    assert frame.force.shape == (2, 3) and not frame.failed.any()
     assert (frame.force[:, 2] < 0).all()
     np.testing.assert_array_equal(frame.surface.height[0], frame.surface.height[1])
 
@@ -164,7 +184,7 @@ assert not heavy & set(sys.modules), ("import raytac", heavy & set(sys.modules))
 sensor = raytac.TactileSensor("gelsight_mini", outputs=("height",), pitch=0.5e-3)
 assert not {"mujoco", "mitsuba"} & set(sys.modules), "a sensor that has done nothing"
 frame = sensor.press("sphere")
-assert frame.height.max() <= 0 and frame.rgb is None
+assert frame.height.max() <= 0 and "rgb" not in frame.outputs
 assert "mujoco" in sys.modules
 assert not {"mitsuba", "drjit", "matplotlib"} & set(sys.modules), "a press without images"
 """
@@ -179,16 +199,8 @@ def test_outputs_are_kept_in_one_order(sensor_spec: SensorSpec) -> None:
     assert TactileSensor(sensor_spec, outputs=tuple(reversed(OUTPUTS))).outputs == OUTPUTS
 
 
-def test_a_built_mode_takes_no_settings_of_another(sensor_spec: SensorSpec) -> None:
-    settings: tuple[dict[str, Any], ...] = ({"integrator": "path"}, {"spp": 4}, {"optics_options": {"shadows": True}})
-    for setting in settings:
-        with pytest.raises(InputError, match="it has its own"):
-            TactileSensor(sensor_spec, optics=Shader(sensor_spec), **setting)
-
-
 @pytest.mark.parametrize(("optics", "known"), [("raytrace", "denoise"), ("taxim", "calibration"), ("phong", "lights")])
-@pytest.mark.renderer
-def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(sensor_spec: SensorSpec, optics: str, known: str) -> None:
+def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(optics: str, known: str) -> None:
     for name in ("calibratoin", "resolution"):
-        with pytest.raises(InputError, match=f"optics_options.*{name}.*choose from: .*{known}"):
-            _ = TactileSensor(sensor_spec, optics=optics, device="cpu", optics_options={name: 1}).optical_mode
+        with pytest.raises(InputError, match=f"{name} = 1: is no option of optics='{optics}'.*choose from: .*{known}"):
+            OPTICS.config(optics, **{name: 1})

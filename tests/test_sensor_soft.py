@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from raytac.errors import InputError
+from raytac.errors import InputError, SpecError
 from raytac.gel.traction import cell_areas
+from raytac.physics import PHYSICS, Ipc
 from raytac.physics.soft.contact_width import NarrowContactWarning
 from raytac.report.press import press_metrics
 from raytac.sensor import TactileSensor
@@ -42,13 +43,13 @@ def test_wrench_traction_and_area_mean_the_same(frames, physics):
     assert total == pytest.approx(frame.wrench[0, :3], rel=1e-4, abs=1e-5)
     assert frame.wrench[0, 2] < -0.2
     assert frame.contact_area[0] == pytest.approx(frame.surface.contact.sum() * 0.2e-3**2, rel=0.01)
-    assert (frame.force_law_area is None) == (physics == "ipc")
-    assert (None if frame.unconverged is None else frame.unconverged.tolist()) == ([0] if physics == "ipc" else None)
+    assert ("force_law_area" in frame.outputs) == (physics == "rigid")
+    assert (frame.unconverged.tolist() if "unconverged" in frame.outputs else None) == ([0] if physics == "ipc" else None)
 
 
 def test_metrics_count_the_steps_that_did_not_converge(frames):
     sensor, frame = frames["ipc"]
-    found = press_metrics(sensor, SCENE, replace(frame, unconverged=np.array([3])), sensor.rest())
+    found = press_metrics(sensor, SCENE, frame.with_values(unconverged=np.array([3])), sensor.rest())
     assert found["contact.unconverged_steps"] == 3
     assert "contact.unconverged_steps" not in press_metrics(frames["rigid"][0], SCENE, frames["rigid"][1], sensor.rest())
 
@@ -67,15 +68,26 @@ def test_labels_tell_the_pads_apart(frames):
 def test_the_scene_chooses_unless_the_caller_does():
     scene = replace(load_press("none"), physics="ipc", pad="medium")
     sensor = TactileSensor(outputs=("height",), pitch=0.5e-3, device="cpu")
-    assert sensor.press(scene).surface.coat is not None and (sensor.physics, sensor.pad) == ("ipc", "medium")
+    assert sensor.press(scene).surface.coat is not None and sensor.label == "ipc-medium"
+    assert sensor.physics is None  # as it was asked for: the next scene chooses again
+    assert sensor.press(replace(scene, physics=None, pad=None)).surface.coat is None and sensor.label == "rigid"
     asked = TactileSensor(outputs=("height",), pitch=0.5e-3, device="cpu", physics="rigid")
-    assert asked.press(scene).surface.coat is None and asked.pad == ""
+    assert asked.press(scene).surface.coat is None and asked.label == "rigid"
+    soft = TactileSensor(outputs=("height",), pitch=0.5e-3, device="cpu", physics="ipc")
+    soft.press(scene)
+    assert soft.physics == Ipc() and soft.label == "ipc-medium"
+
+
+def test_a_scene_that_names_unknown_physics_is_refused_with_file_and_key(tmp_path):
+    path = tmp_path / "odd.toml"
+    path.write_text('physics = "mpm"\n[object]\nkind = "none"\n')
+    with pytest.raises(SpecError, match=r"odd\.toml: physics = 'mpm'.*rigid, ipc"):
+        TactileSensor(outputs=("height",)).load(path)
 
 
 def test_no_object_no_force():
     sensor = TactileSensor(outputs=OUTPUTS, physics="ipc", pitch=0.5e-3, device="cpu")
     frame = sensor.press("none")
-    assert frame.wrench is not None and frame.traction is not None and frame.contact_area is not None and frame.height is not None
     assert not frame.wrench.any() and not frame.traction.any() and frame.contact_area[0] == 0.0
     assert np.array_equal(frame.height[0], sensor.grid.rest.astype(np.float32))
 
@@ -83,10 +95,12 @@ def test_no_object_no_force():
 def test_unknown_names_are_refused_with_the_choices():
     with pytest.raises(InputError, match=r"physics.*'mpm'.*rigid, ipc"):
         TactileSensor(physics="mpm")
-    with pytest.raises(InputError, match=r"pad.*'huge'.*coarse, medium, fine"):
-        TactileSensor(physics="ipc", pad="huge")
-    with pytest.raises(InputError, match=r"pad.*physics='rigid' has none"):
-        TactileSensor(physics="rigid", pad="fine")
+    with pytest.raises(InputError, match=r"level.*'huge'.*coarse, medium, fine"):
+        TactileSensor(physics=Ipc(level="huge"))
+    with pytest.raises(InputError, match=r"level.*'fine'.*no option of physics='rigid'"):
+        PHYSICS.config("rigid", level="fine")
+    with pytest.raises(InputError, match=r"physics.*rigid, ipc, or a configuration"):
+        TactileSensor(physics=3)  # type: ignore[arg-type]
 
 
 class Terminal(io.StringIO):
@@ -104,9 +118,9 @@ def test_a_long_press_shows_its_stages_on_a_terminal(progress, monkeypatch):
         assert screen.getvalue() == ""
 
 
-def loop(scene: Any, outputs=("height", "wrench"), pad="coarse") -> tuple[list[Any], list[str]]:
+def loop(scene: Any, outputs=("height", "wrench"), level="coarse") -> tuple[list[Any], list[str]]:
     """Frames of a press in three steps a stage, and the warnings of narrow contacts on the way."""
-    sensor = TactileSensor(outputs=outputs, physics="ipc", pad=pad, pitch=0.1e-3, device="cpu")
+    sensor = TactileSensor(outputs=outputs, physics=Ipc(level), pitch=0.1e-3, device="cpu")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         frames = [sensor.update(state) for state in sensor.load(scene).run(steps_per_stage=3)]
@@ -125,7 +139,7 @@ def test_a_contact_of_few_cells_is_warned_of_once_a_press():
     assert 1.0 < frames[3].contact_cells[0] < 3.0
     assert len(told) == 1
     width = f"{frames[3].contact_cells[0]:.1f} cells across"
-    assert all(word in told[0] for word in ("pad = 'coarse'", width, "at least 6", "choose pad='medium'"))
+    assert all(word in told[0] for word in ("level = 'coarse'", width, "at least 6", "choose level='medium'"))
 
 
 def test_neither_a_wide_contact_nor_a_given_force_nor_an_image_is_warned_of():
@@ -135,12 +149,12 @@ def test_neither_a_wide_contact_nor_a_given_force_nor_an_image_is_warned_of():
     frames, told = loop(ball(3e-3, StageSpec("indent", force=0.2), StageSpec("shear", shear=(1e-4, 0.0))))
     assert frames[-1].contact_cells[0] < 3.0 and not told
     frames, told = loop(ball(3e-3, StageSpec("indent", depth=0.3e-3)), outputs=("height",))
-    assert frames[-1].contact_cells is None and not told
+    assert "contact_cells" not in frames[-1].outputs and not told
 
 
 @pytest.mark.slow
 def test_a_fine_pad_has_cells_enough_for_the_shipped_ball():
-    frames, told = loop("sphere", pad="fine")
+    frames, told = loop("sphere", level="fine")
     assert max(np.nan_to_num(frame.contact_cells[0]) for frame in frames) > 9.0 and not told
 
 

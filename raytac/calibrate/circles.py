@@ -1,4 +1,4 @@
-"""Contact circles found in images of ball presses: where the colour steps most, all the way round.
+"""Contact circles found in images of ball presses: where the colour steps most along the whole circle.
 
 With D the image minus that of the untouched sensor, the score of a circle is the mean over its angles of the step |D(r − δ) − D(r + δ)|,
 Euclidean over the channels [levels]. The shading of a pressed ball is strongest at the rim of its contact and falls off within the
@@ -13,6 +13,7 @@ import numpy as np
 
 from raytac.calibrate.presses import RealPresses
 from raytac.errors import InputError
+from raytac.gel.interpolate import sampled
 
 __all__ = ["DOUBTFUL", "FoundCircles", "circle_score", "find_circles", "with_found_circles"]
 
@@ -29,7 +30,7 @@ _STEPS = (0.2, 0.1, 0.05, 0.02, 0.01)
 
 @dataclass(frozen=True)
 class FoundCircles:
-    """What ``find_circles`` found."""
+    """Result of ``find_circles``."""
 
     circles: np.ndarray
     """x, y, radius [px], (N, 3)."""
@@ -38,7 +39,7 @@ class FoundCircles:
 
     @property
     def doubtful(self) -> np.ndarray:
-        """Whether a circle's step is below ``DOUBTFUL``, (N,) bool."""
+        """True where a circle's step is below ``DOUBTFUL``, (N,) bool."""
         return self.score < DOUBTFUL
 
 
@@ -57,13 +58,13 @@ def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
         rule = f"must be smaller than the view: {1e3 * smallest * pixel_pitch:.4g} mm across, {smallest} px of {pixel_pitch * 1e3:.4g} mm"
         raise InputError("ball_diameter_mm", value=large, rule=rule)
     background = presses.background.astype(np.float32)
-    found, scores = [], []
+    circles, scores = [], []
     for image, limit in zip(presses.images, widest, strict=True):
         change = _smoothed(image.astype(np.float32) - background)
         circle, score = _climb(change, _first_guess(change, limit), limit)
-        found.append(circle)
+        circles.append(circle)
         scores.append(score)
-    return FoundCircles(np.array(found).reshape(-1, 3), np.array(scores))
+    return FoundCircles(np.array(circles).reshape(-1, 3), np.array(scores))
 
 
 def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPresses, np.ndarray]:
@@ -72,14 +73,17 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
     doubtful = np.zeros(len(presses), bool)
     if not unknown.any():
         return presses, doubtful
-    found = find_circles(presses.take(unknown), pixel_pitch)
+    result = find_circles(presses.take(unknown), pixel_pitch)
     circles = presses.circles.copy()
-    circles[unknown], doubtful[unknown] = found.circles, found.doubtful
+    circles[unknown], doubtful[unknown] = result.circles, result.doubtful
     return presses.with_circles(circles), doubtful
 
 
 def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3); −1 where too little of it is in the image."""
+    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3).
+
+    It is −1 where too little of a circle is in the image.
+    """
     x, y, r = np.asarray(circles, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     sides, valid = [], True
@@ -123,12 +127,8 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
     height, width = image.shape[:2]
     x, y = u - 0.5, v - 0.5
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    x, y = np.clip(x, 0, width - 1.001), np.clip(y, 0, height - 1.001)
-    i, j = x.astype(int), y.astype(int)
-    wx, wy = (x - i)[..., None], (y - j)[..., None]
-    top = image[j, i] * (1 - wx) + image[j, i + 1] * wx
-    bottom = image[j + 1, i] * (1 - wx) + image[j + 1, i + 1] * wx
-    return top * (1 - wy) + bottom * wy, inside
+    channels = sampled(np.moveaxis(image, -1, 0), np.arange(width), np.arange(height), x, y)
+    return np.moveaxis(channels, 0, -1), inside
 
 
 def _smoothed(image: np.ndarray) -> np.ndarray:

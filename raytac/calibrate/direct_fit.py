@@ -1,4 +1,6 @@
-"""Lights, response, imprint and contact circles fitted at once to photographs of ball presses, with direct light as forward model.
+"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses.
+
+The forward model is direct light.
 
 Residuals are those of the presses with the real background B as flat field, and of the image at rest,
 
@@ -19,9 +21,17 @@ import numpy as np
 from raytac.calibrate.direct_light import LedLight, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import CEILING, DARKEST, HEIGHT, HEIGHTS, REFERENCE_DISTANCE, LightParameters, darkest
+from raytac.calibrate.light_parameters import (
+    CEILING,
+    DARKEST,
+    HEIGHT,
+    HEIGHTS,
+    REFERENCE_DISTANCE,
+    LightParameters,
+    darkest,
+    side_ties,
+)
 from raytac.calibrate.photographs import Photographs, decode, encode
-from raytac.calibrate.symmetry import side_ties
 from raytac.specs import LightsSpec, SensorSpec
 
 __all__ = ["DirectFit", "FitSettings", "FitState"]
@@ -38,9 +48,9 @@ SIGMA = {
     "vignette": 0.5,
     "slope": 0.15,
 }
-"""How far a parameter is believed to be from its start: mm, rad, 1, full scales (own channel), …"""
+"""Standard deviation of a parameter about its start: mm, rad, 1, full scales (own channel), …"""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
-"""How far a contact circle is believed to be from its label: x, y, radius, over the image's width."""
+"""Standard deviation of a contact circle about its label: x, y, radius, over the image's width."""
 CIRCLE_PRIOR = 300.0
 """Squared residual [levels²] that a circle's deviation of one sigma is worth."""
 ACTIVE = 6
@@ -53,7 +63,7 @@ REST_FACTOR = 8
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What a fit does."""
+    """Settings of a fit."""
 
     reach: float = 2.4
     """Pixels up to this many radii from a circle's centre count."""
@@ -66,7 +76,7 @@ class FitSettings:
     samples: tuple[int, int] = (150, 90)
     """Pixels of every press that count, drawn at random inside the labelled circle and outside."""
     circles: bool = True
-    """Whether circles are fitted."""
+    """True fits the circles too."""
     fixed: tuple[str, ...] = ()
     """Blocks of parameters that stay: names of ``SIGMA``."""
     prior: float = 30.0
@@ -77,7 +87,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitState:
-    """Where a fit stands: lights and response, s of the imprint at its inner knots, circles (N, 3) [px]."""
+    """State of a fit: lights and response, s of the imprint at its inner knots, circles (N, 3) [px]."""
 
     p: LightParameters
     slopes: np.ndarray
@@ -131,7 +141,7 @@ class DirectFit:
         return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
 
     def geometry(self, state: FitState) -> PixelGeometry:
-        """What the pixels of presses see."""
+        """Points and normals that the pixels of presses see."""
         return self._geometry(state, self.u, self.v, self.press)
 
     def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
@@ -175,12 +185,12 @@ class DirectFit:
 
     @property
     def _sees_heights(self) -> bool:
-        """Whether images change with the heights of LEDs: shadows are all that tells them."""
+        """True if images depend on the heights of LEDs, which only shadows do."""
         return self.extra is not None and HEIGHT in self.extra.by_led
 
     def free(self, p: LightParameters) -> np.ndarray:
-        held = (*self.settings.fixed, *(() if self._sees_heights else ("height",)))
-        return np.concatenate([np.full(n, name not in held) for name, n in self.blocks(p)])
+        fixed = (*self.settings.fixed, *(() if self._sees_heights else ("height",)))
+        return np.concatenate([np.full(n, name not in fixed) for name, n in self.blocks(p)])
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
@@ -298,7 +308,10 @@ class DirectFit:
     def _gains(
         self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slopes of levels by light pressed, by light at rest in the same pixels (with the sign turned), and of the rest image."""
+        """Slopes of levels by light pressed, by light at rest (negated), and of the rest image.
+
+        The light at rest is that in the same pixels.
+        """
         gamma, *stray, _, _ = p.response
         black = np.array(stray) * self.darkest**gamma
 
@@ -361,7 +374,7 @@ class DirectFit:
         return trial
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
-        """Levenberg and Marquardt's method from ``state``; ``tick`` is told every accepted state and its cost."""
+        """Levenberg and Marquardt's method from ``state``; ``tick`` is called with every accepted state and its cost."""
         damping, state, slow = 1e-2, self.inside_bounds(state), 0
         cost = self.cost(state, self.residuals(state))
         for _ in range(iterations):
@@ -385,13 +398,13 @@ class DirectFit:
 
 def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii. All where there are fewer than wanted."""
-    rng, found = np.random.default_rng(seed), []
+    rng, results = np.random.default_rng(seed), []
     for k, one in enumerate(rho):
         for low, high, wanted in zip((0.0, 1.0), (1.0, settings.reach), settings.samples, strict=True):
             row, column = np.nonzero((one >= low) & (one < high))
             chosen = np.sort(rng.permutation(len(row))[:wanted])
-            found.append(np.stack([np.full(len(chosen), k), row[chosen], column[chosen]]))
-    press, row, column = np.concatenate(found, axis=1)
+            results.append(np.stack([np.full(len(chosen), k), row[chosen], column[chosen]]))
+    press, row, column = np.concatenate(results, axis=1)
     return press, row, column
 
 
@@ -401,7 +414,7 @@ def _summed(p: LightParameters, light: Light) -> list[np.ndarray]:
 
 
 def _reach(lights: LightsSpec, leds: np.ndarray) -> np.ndarray:
-    """How far [mm] every LED's rectangle goes from its centre along x, y and z, (L, 3)."""
+    """Half extents [mm] of every LED's rectangle along x, y and z, (L, 3)."""
     (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(leds[:, k]), np.cos(leds[:, k])) for k in (3, 4))
     u = np.stack([-sin_a, cos_a, np.zeros(len(leds))], axis=1)
     v = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)

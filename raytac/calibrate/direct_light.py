@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.imprint import PixelGeometry
+from raytac.optics.trace.led import lobe_gain, lobe_slopes
 
 __all__ = ["LedLight", "case_light", "led_light"]
 
@@ -45,16 +46,15 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
     inverse = 1 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     w = d * inverse
     towards = -(axis @ w)
-    ahead = towards > _BEHIND
-    c = np.where(ahead, towards, _BEHIND)
-    log_c = np.log(c)
+    c = np.maximum(towards, _BEHIND)
+    by_cosine, by_lobe = lobe_slopes(towards, lobe, _BEHIND)
     cosine = w[0] * seen.n[0] + w[1] * seen.n[1] + w[2] * seen.n[2]
     root = np.sqrt(cosine * cosine + _SOFT**2)
     soft = 0.5 * (cosine + root)
-    arriving = np.exp(lobe * log_c) * (reference * inverse) ** 2
+    arriving = lobe_gain(np, towards, lobe, _BEHIND) * (reference * inverse) ** 2
     light = arriving * soft
     by_normal = arriving * (0.5 * (1 + cosine / root)) * w
-    steep = np.where(ahead, lobe / c, 0) * light
+    steep = by_cosine * light
     by_led = np.empty((6, len(light)))
     # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
     turned = by_normal[0] * w[0] + by_normal[1] * w[1] + by_normal[2] * w[2]
@@ -62,7 +62,7 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
     for k in range(3):
         by_led[k] = -steep * (axis[k] + c * w[k]) + slope * seen.n[k] - (turned * cosine + 2 * light) * w[k]
     by_led[:3] *= 1e-3 * inverse
-    by_led[3], by_led[4], by_led[5] = -steep * (by_azimuth @ w), -steep * (by_elevation @ w), light * log_c
+    by_led[3], by_led[4], by_led[5] = -steep * (by_azimuth @ w), -steep * (by_elevation @ w), light * by_lobe
     return LedLight(light, by_led, by_normal)
 
 

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from raytac.calibrate.direct_fit import SIGMA, FitSettings
+from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_cast_shadows, with_shading
 from raytac.calibrate.imprint import press_surface
-from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.press_samples import press_samples
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
 from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
-from raytac.calibrate.shading_fit import with_shading
-from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.optics.base import OpticalMode
-from raytac.optics.image.mlp import MlpMode
-from raytac.optics.image.phong import PhongMode
-from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.image.config import Mlp, Phong
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.tracer import Tracer
 from raytac.specs import SensorSpec
 
 __all__ = ["ALONE", "MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
@@ -37,14 +33,14 @@ ALONE = "raytrace_alone"
 MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
 SHADOW_TABLES = ("none", "raytrace")
-"""Where the shadows of a table are from: it has none, or those that the fitted ray tracer casts."""
+"""Sources of a table's shadows: none, or the fitted ray tracer."""
 GRID_PITCH = 0.06e-3
 """Spacing of the pad's nodes [m], about a pixel's."""
 
 
 @dataclass(frozen=True)
 class Models:
-    """What one set of presses gave: the lights with imprint and circles, and a mode of each kind."""
+    """Fits to one set of presses: the lights with imprint and circles, and a mode of each kind."""
 
     fitted: Fitted
     rest: np.ndarray
@@ -53,13 +49,13 @@ class Models:
     """Name of the strength of priors (``STRENGTHS``)."""
     modes: dict[str, OpticalMode]
     device: str
-    options: Mapping[str, Any]
-    """Further options of the ray tracer."""
+    tracing: RayTraced
+    """How rays are traced."""
 
     def circles(self, shots: Photographs) -> np.ndarray:
         """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
         own = dataclasses.replace(shots, background=self.rest)
-        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, options=self.options)
+        return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, tracing=self.tracing)
 
 
 def check_fit(
@@ -91,11 +87,11 @@ def check_fit(
     check_whole("rounds", rounds, 0)
 
 
-def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, options: Mapping[str, Any]) -> RayTracer:
+def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, tracing: RayTraced) -> Tracer:
     """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
     height, width = background.shape[:2]
     field = background.astype(np.uint8)
-    return RayTracer(sensor, resolution=(width, height), device=device, flat_field=field, **options)
+    return dataclasses.replace(tracing, flat_field=field).build(sensor, resolution=(width, height), device=device)
 
 
 def fit_models(
@@ -111,10 +107,12 @@ def fit_models(
     settle: bool = True,
     prior: str | None = None,
     shadow_table: str = SHADOW_TABLES[0],
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
-    """Fit ``modes`` to the presses of ``shots``; all of them with the imprint and the circles that the lights were fitted with.
+    """Fit ``modes`` to the presses of ``shots``.
+
+    All use the imprint and the circles that the lights were fitted with.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
     ``shadow_table``: one of ``SHADOW_TABLES``.
@@ -122,7 +120,7 @@ def fit_models(
 
     Raises as ``check_fit`` and ``fit_lights``.
     """
-    options = {} if options is None else options
+    tracing = RayTraced() if tracing is None else tracing
     settings = FitSettings() if settings is None else settings
     check_fit(
         modes=modes,
@@ -138,11 +136,11 @@ def fit_models(
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
     settings = dataclasses.replace(settings, **STRENGTHS[prior])
     fitted = fit_lights(
-        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, options=options, tick=tick
+        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, tracing=tracing, tick=tick
     )
     state, background, built = fitted.state, shots.background, {}
 
-    def told(images: int) -> None:
+    def count_rendered(images: int) -> None:
         if tick is not None:
             tick(f"{images} images of shadows", fitted.costs[-1])
 
@@ -150,20 +148,20 @@ def fit_models(
         samples = press_samples(sensor, shots, state.circles, state.slopes, device=device)
     for name in modes:
         if name == "raytrace":
-            built[name] = raytrace_mode(fitted.sensor, background, device, options)
+            built[name] = raytrace_mode(fitted.sensor, background, device, tracing)
         elif name == ALONE:
-            shaded = with_shading(fitted.sensor, background, device=device, options=options)
-            built[name] = RayTracer(shaded, resolution=(background.shape[1], background.shape[0]), device=device, **options)
+            shaded = with_shading(fitted.sensor, background, device=device, tracing=tracing)
+            built[name] = tracing.build(shaded, resolution=(background.shape[1], background.shape[0]), device=device)
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
-                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=told)
-            built[name] = TaximMode(sensor, calibration=table, shadows=table.shadow is not None, device=device)
+                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
+            built[name] = Taxim(table, shadows=table.shadow is not None).build(sensor, device=device)
         elif name == "mlp":
-            built[name] = MlpMode(sensor, calibration=fit_mlp(sensor, background, samples, seed=seed), device=device)
+            built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
         else:
-            built[name] = PhongMode(sensor, background=background.astype(np.uint8), device=device)
-    return Models(fitted, background, prior, built, device, options)
+            built[name] = Phong(background=background.astype(np.uint8)).build(sensor, device=device)
+    return Models(fitted, background, prior, built, device, tracing)
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:

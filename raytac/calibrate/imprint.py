@@ -1,6 +1,8 @@
-"""The imprint of a ball as calibration sees it: one radial profile of slopes, shared by all presses, about each contact circle.
+"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle.
 
-Real photographs tell where a ball touched but not how the gel gave way around it. So the slope of the coat is a free function of the
+All presses share it.
+
+Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
 
     sin θ(t) = s(t) · a / R,  s linear between ``KNOTS``,
@@ -32,7 +34,7 @@ _TABLE = np.linspace(0, KNOTS[-1], 751)
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """What pixels see of the coat: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
+    """Coat that pixels see: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
 
     p: np.ndarray
     n: np.ndarray
@@ -79,7 +81,7 @@ def pixel_geometry(
     ball_radius: np.ndarray,
     slopes: np.ndarray,
 ) -> PixelGeometry:
-    """What the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses with index ``press`` (M,) see.
+    """Coat seen by the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses ``press`` (M,).
 
     ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
     The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.

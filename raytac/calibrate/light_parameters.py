@@ -1,8 +1,15 @@
-"""What a fit of lights varies: every LED's place, aim, lobe, height and power, the case's even glow, and the camera's response."""
+"""Parameters of a fit of lights, and ties between LEDs of one side.
+
+Every LED has a place, aim, lobe, height and power. The case has an even glow, and the camera a response.
+
+A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
+nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +26,11 @@ __all__ = [
     "HEIGHT",
     "HEIGHTS",
     "LightParameters",
+    "Ties",
     "darkest",
     "leds_at_walls",
     "leds_split",
+    "side_ties",
     "with_parameters",
 ]
 
@@ -44,7 +53,7 @@ REFERENCE_DISTANCE = 10e-3
 
 @dataclass(frozen=True)
 class LightParameters:
-    """What a fit varies of lights and camera, as arrays."""
+    """Parameters of lights and camera, as arrays."""
 
     template: LightsSpec
     """The light file that names, layers and widths come from."""
@@ -131,7 +140,9 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
-    """A start for a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
+    """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
+
+    They stand side by side over ``SPREAD`` times its width.
 
     What would stick out of the case's walls is moved inside.
 
@@ -189,3 +200,77 @@ def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
                 )
             )
     return LightsSpec(tuple(leds))
+
+
+PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
+"""Standard deviations of LEDs about mirrored places [mm] and aims [rad], and about the lobe, height [mm] and power [full scales] of the
+LED beside them."""
+
+LEAST = 1.0
+"""Least distance [mm] of the middle of a layer's LEDs from the pad's, for them to be on one side of it."""
+
+
+@dataclass(frozen=True)
+class Ties:
+    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,), in standard deviations."""
+
+    matrix: np.ndarray
+    offset: np.ndarray
+
+    def off(self, x: np.ndarray) -> np.ndarray:
+        """Standard deviations by which x (n,) is off, (T,)."""
+        return self.matrix @ x - self.offset
+
+
+def side_ties(p: LightParameters, size: int) -> Ties:
+    """Ties of the LEDs of every layer, which stand on one side of the pad.
+
+    They are mirrored about the line from the pad's middle to theirs.
+
+    An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
+    whose first entries are ``p.leds`` and ``p.power``.
+    """
+    rows: list[np.ndarray] = []
+    offsets: list[float] = []
+    wide = p.leds.shape[1]
+
+    def tie(sigma: float, offset: float, *terms: tuple[int, float]) -> None:
+        row = np.zeros(size)
+        for place, factor in terms:
+            row[place] += factor / sigma
+        rows.append(row)
+        offsets.append(offset / sigma)
+
+    for layer in range(len(CHANNELS)):
+        own = [int(led) for led in np.flatnonzero(p.layer == layer)]
+        if not own:
+            continue
+        middle = p.leds[own, :2].mean(0)
+        if np.hypot(*middle) > LEAST:
+            out = middle / np.hypot(*middle)
+            across = np.array([-out[1], out[0]])
+            mirrored = p.leds[own, :2] - 2 * np.outer(p.leds[own, :2] @ across, across)
+            nearest = np.argmin(np.linalg.norm(mirrored[:, None] - p.leds[own, :2], axis=2), axis=1)
+            for k in np.flatnonzero(nearest[nearest] == np.arange(len(own))):
+                a, b = own[k], own[nearest[k]]
+                if a > b:
+                    continue
+                tie(PLACE, 0.0, *((wide * led + axis, float(across[axis])) for led in (a, b) for axis in (0, 1)))
+                # Mirrored, an azimuth A becomes 2 φ − A with φ that of ``out``, up to whole turns.
+                turn, total = 2 * float(np.arctan2(out[1], out[0])), float(p.leds[a, 3] + p.leds[b, 3])
+                tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (wide * a + 3, 1), (wide * b + 3, 1))
+                if a < b:
+                    tie(
+                        PLACE,
+                        0.0,
+                        *((wide * led + axis, float(sign * out[axis])) for led, sign in ((a, 1), (b, -1)) for axis in (0, 1)),
+                    )
+                    tie(PLACE, 0.0, (wide * a + 2, 1), (wide * b + 2, -1))
+                    tie(AIM, 0.0, (wide * a + 4, 1), (wide * b + 4, -1))
+        for a, b in itertools.pairwise(own):
+            tie(LOBE, 0.0, (wide * a + 5, 1), (wide * b + 5, -1))
+            tie(TALL, 0.0, (wide * a + HEIGHT, 1), (wide * b + HEIGHT, -1))
+            for c in range(3):
+                first = p.leds.size + c
+                tie(POWER, 0.0, (first + 3 * a, 1), (first + 3 * b, -1))
+    return Ties(np.array(rows).reshape(len(rows), size), np.array(offsets))

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from raytac.errors import CalibrationError, InputError
-from raytac.io.png import read_png
+from raytac.io.images import read_png
 from raytac.optics.taxim.restricted_pickle import npz_arrays
 
-__all__ = ["RealPresses", "read_presses"]
+__all__ = ["RealPresses", "Split", "by_half", "by_press", "read_presses", "shallow_to_deep"]
 
 LAYOUTS = ("labels.csv", "catalog.csv", "dataPack.npz")
 """The file that tells a layout."""
@@ -43,7 +43,7 @@ class RealPresses:
     circles: np.ndarray
     """Contact circle of each press: x and y of its centre, radius [px], (N, 3); NaN where the data set has none."""
     names: tuple[str, ...]
-    """What messages and figures call each press."""
+    """Name of each press, for messages and figures."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -55,7 +55,7 @@ class RealPresses:
 
     @property
     def fully_visible(self) -> np.ndarray:
-        """Whether all of the circle lies in the image, (N,) bool; False where the circle is unknown."""
+        """True where all of the circle lies in the image, (N,) bool; False where the circle is unknown."""
         width, height = self.resolution
         x, y, r = self.circles.T
         return (x - r >= 0) & (y - r >= 0) & (x + r <= width) & (y + r <= height)
@@ -93,10 +93,10 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
     if ball_diameter is not None and not (math.isfinite(ball_diameter) and ball_diameter > 0):
         raise InputError("ball_diameter", value=ball_diameter, rule="must be a length > 0 [m]")
     if data.is_dir():
-        found = [name for name in LAYOUTS if (data / name).exists()]
-        if not found:
+        matching = [name for name in LAYOUTS if (data / name).exists()]
+        if not matching:
             raise InputError("data", value=str(data), rule="must hold one of the files that tell a layout", choices=LAYOUTS)
-        data = data / found[0]
+        data = data / matching[0]
     if data.name.endswith(".npz"):
         if ball_diameter is None:
             raise InputError("ball_diameter", value=None, rule=f"must be given: {data.name} does not say how large the ball is")
@@ -214,3 +214,60 @@ def _image(path: Path, shape: tuple[int, ...] | None) -> np.ndarray:
         rule = f"must have the size of background.png, {shape[1]} x {shape[0]}"
         raise CalibrationError(rule, file=path, value=f"{pixels.shape[1]} x {pixels.shape[0]}")
     return pixels
+
+
+Split = tuple[np.ndarray, np.ndarray]
+"""Indices of the presses to fit to and of those to test on."""
+
+
+def by_press(count: int, folds: int) -> list[Split]:
+    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th.
+
+    Neighbours of a scan are thus in different folds.
+
+    ``folds = count`` leaves one out.
+
+    Raises:
+        InputError: fewer than two folds, or more folds than presses.
+    """
+    if int(folds) != folds or not 2 <= folds <= count:
+        raise InputError("folds", value=folds, rule=f"must be a whole number from 2 to the number of presses, {count}")
+    index = np.arange(count)
+    return [(index[index % folds != k], index[index % folds == k]) for k in range(folds)]
+
+
+def by_half(presses: RealPresses) -> list[Split]:
+    """Splits from the left half of the pad to the right one, and the reverse.
+
+    A press belongs to the half that its circle's centre lies in.
+
+    Raises:
+        InputError: a half without a press.
+    """
+    in_left_half = _known(presses)[:, 0] < presses.resolution[0] / 2
+    if in_left_half.all() or not in_left_half.any():
+        raise InputError("presses", value=f"{len(presses)} presses", rule="must lie on both halves of the image")
+    a, b = np.flatnonzero(in_left_half), np.flatnonzero(~in_left_half)
+    return [(a, b), (b, a)]
+
+
+def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
+    """Split from the shallower ``share`` of the presses to the deeper ones.
+
+    Depth over the ball's radius grows with the circle over the ball.
+
+    Raises:
+        InputError: a share that leaves one side empty.
+    """
+    relative = _known(presses)[:, 2] / presses.ball_radius
+    order, cut = np.argsort(relative, kind="stable"), round(share * len(presses))
+    if not 0 < cut < len(presses):
+        raise InputError("share", value=share, rule=f"must leave a press on either side of {len(presses)}")
+    return np.sort(order[:cut]), np.sort(order[cut:])
+
+
+def _known(presses: RealPresses) -> np.ndarray:
+    unknown = int(np.isnan(presses.circles).any(axis=1).sum())
+    if unknown:
+        raise InputError("presses", value=f"{unknown} of {len(presses)} without a circle", rule="must all have a contact circle")
+    return presses.circles

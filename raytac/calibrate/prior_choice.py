@@ -1,4 +1,4 @@
-"""How strongly priors hold a fit, chosen by cross-validation within the presses that are fitted to.
+"""Strength of a fit's priors, chosen by cross-validation within the presses that are fitted to.
 
 Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
 halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a
@@ -23,7 +23,7 @@ from raytac.specs import SensorSpec
 __all__ = ["INNER", "STRENGTHS", "choose_strength"]
 
 INNER = "inner"
-"""What a choice within the presses that are fitted to is called, beside the names of ``STRENGTHS``."""
+"""Name of the choice by cross-validation, beside the names of ``STRENGTHS``."""
 
 STRENGTHS: dict[str, dict[str, float]] = {
     "free": {"prior": 30.0, "ties": 0.0, "rest_weight": 0.3},
@@ -33,7 +33,7 @@ STRENGTHS: dict[str, dict[str, float]] = {
 }
 """Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
 CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
-"""What is chosen from: that LEDs of a side are alike is taken for granted, as sensors are built so."""
+"""Candidates of the choice. LEDs of a side are always taken to be alike, as sensors are built so."""
 USUAL = "tied-dark"
 SAMPLES = (90, 45)
 """Pixels of a press that count here, inside and outside its circle: the choice needs fewer than the fit."""
@@ -62,22 +62,22 @@ def choose_strength(
         rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or name one with --prior"
         raise InputError("presses", value=len(shots.circles), rule=rule)
     few = dataclasses.replace(settings, samples=SAMPLES)
-    held = dataclasses.replace(few, fixed=tuple(SIGMA))
+    all_fixed = dataclasses.replace(few, fixed=tuple(SIGMA))
     errors = {}
     for name, values in candidates.items():
-        own, found = dataclasses.replace(few, **values), []
+        own, results = dataclasses.replace(few, **values), []
         for train, test in _halves(shots.circles):
             fitted, tested = shots.take(train), shots.take(test)
             begin = first_state(sensor, fitted, own, seed)
             state = DirectFit(sensor, fitted, begin, own, factor=FACTOR, seed=seed).solve(begin, STEPS)
             start = FitState(state.p, state.slopes, tested.circles.copy())
-            problem = DirectFit(sensor, tested, start, held, factor=FACTOR, seed=seed)
+            problem = DirectFit(sensor, tested, start, all_fixed, factor=FACTOR, seed=seed)
             off, _ = problem.residuals(problem.solve(start, CIRCLE_STEPS))
-            found.append(float(np.abs(off[problem.inside]).mean()))
+            results.append(float(np.abs(off[problem.inside]).mean()))
             if tick is not None:
-                tick(f"prior {name}", found[-1])
-        errors[name] = np.array(found)
-    means = {name: float(found.mean()) for name, found in errors.items()}
+                tick(f"prior {name}", results[-1])
+        errors[name] = np.array(results)
+    means = {name: float(results.mean()) for name, results in errors.items()}
     best = min(means, key=means.__getitem__)
     if USUAL in errors:
         worse = errors[USUAL] - errors[best]

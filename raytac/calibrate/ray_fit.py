@@ -9,9 +9,8 @@ depend.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,8 @@ from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, 
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.base import casts_shadows
+from raytac.optics.trace.config import RayTraced
 from raytac.specs import SensorSpec
 
 __all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]
@@ -34,7 +34,7 @@ FACTOR = 2
 FIRST, LATER = 100, 30
 """Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
-"""How far starts lie apart: mm, rad, lobe exponent, mm."""
+"""Standard deviation of the starts: mm, rad, lobe exponent, mm."""
 STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
 """Steps [mm] of the slopes by an LED's place and height: shadows' edges are soft, and as wide on the pad."""
 FEWEST = 4
@@ -45,7 +45,7 @@ ENVS = 16
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit found."""
+    """Result of a fit."""
 
     sensor: SensorSpec
     """The sensor with its new lights and response."""
@@ -65,18 +65,19 @@ def brightened(problem: DirectFit, state: FitState) -> FitState:
 
 
 def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, seed: int) -> FitState:
-    """Where a fit begins: the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles."""
+    """Start of a fit: the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles."""
     begin = FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
     return brightened(DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed), begin)
 
 
-def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any]) -> Light:
-    """Light of every LED at power 1 that the ray tracer, with these further ``options``, has over direct light, at ``problem``'s pixels."""
+def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
+    """Light of every LED at power 1 that the ray tracer adds to direct light, at ``problem``'s pixels."""
     sensor, p = problem.sensor, state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
     height, width = problem.shape
-    tracer = RayTracer(lit, resolution=(width, height), outputs=("layers",), layers="led", device=device, **options)
+    by_led = dataclasses.replace(tracing, layers="led")
+    tracer = by_led.build(lit, resolution=(width, height), outputs=("layers",), device=device)
     # A light file gives power by channel, and the coat's albedo with it: at power 1 a layer shows full scales.
     scale = sensor.response.gain * np.array(sensor.response.white_balance)
 
@@ -96,27 +97,27 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, opti
 
 
 def extra_light(
-    problem: DirectFit, state: FitState, grid: PadGrid, device: str, options: Mapping[str, Any], *, slopes: bool = True
+    problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
     """The defect with its slopes by the LEDs' places and heights, where shadows are cast (``slopes``: and wanted).
 
     Every LED has a layer of its own, so that all move in one rendering: eight more give all slopes, by central differences and without
     inter-reflection, which changes slowly.
     """
-    found: dict[int, Light] = {}
-    if slopes and options.get("shadows", problem.sensor.optics.shadows):
-        direct = {**options, "bounce": False}
+    lights: dict[int, Light] = {}
+    if slopes and casts_shadows(problem.sensor, tracing.shadows):
+        direct = dataclasses.replace(tracing, bounce=False)
         for k, step in STEPS.items():
             ends = [state.p.leds.copy(), state.p.leds.copy()]
-            for leds, way in zip(ends, (-step, step), strict=True):
-                leds[:, k] += way
+            for leds, offset in zip(ends, (-step, step), strict=True):
+                leds[:, k] += offset
                 if k == HEIGHT:
                     leds[:, k] = np.maximum(leds[:, k], HEIGHTS[0])  # a height below 0 is that above
             apart = (ends[1][:, k] - ends[0][:, k])[:, None, None]
             states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
             below, above = (defect(problem, moved, grid, device, direct) for moved in states)
-            found[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
-    return ExtraLight(defect(problem, state, grid, device, options), state.p.leds.copy(), found)
+            lights[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
+    return ExtraLight(defect(problem, state, grid, device, tracing), state.p.leds.copy(), lights)
 
 
 def fit_lights(
@@ -129,15 +130,15 @@ def fit_lights(
     starts: int = 3,
     device: str = "auto",
     seed: int = 0,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Fitted:
     """Fit ``sensor``'s LEDs, glow, response, imprint and the circles of ``shots``.
 
     ``start``: where the fit begins; None is the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles.
     ``rounds`` of defect correction follow the fit of direct light; 0 leaves it at that. Direct light is fitted from ``starts`` places, the
-    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``options`` of the ray tracer, such as
-    ``bounce``. ``tick`` is told the stage and the cost after every step.
+    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``tracing``: how rays are
+    traced. ``tick`` is called with the stage and the cost after every step.
 
     Raises:
         InputError: refraction, LEDs of no colour, or fewer values than parameters.
@@ -153,26 +154,26 @@ def fit_lights(
         rule = f"are too few for {unknown} parameters ({known} values): take at least {FEWEST}, and 10 values a parameter"
         raise InputError("presses", value=len(shots.circles), rule=rule)
 
-    def told(stage: str) -> Callable[[FitState, float], None]:
+    def report(stage: str) -> Callable[[FitState, float], None]:
         return lambda _, cost: tick(stage, cost) if tick is not None else None
 
-    rng, found, errors = np.random.default_rng(seed), [], []
+    rng, results, errors = np.random.default_rng(seed), [], []
     for k in range(starts):
         first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
-        here = problem.solve(first, FIRST, told(f"direct light, start {k + 1} of {starts}"))
+        here = problem.solve(first, FIRST, report(f"direct light, start {k + 1} of {starts}"))
         off = problem.residuals(here)
-        found.append((problem.cost(here, off), here))
+        results.append((problem.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
-    _, state = min(found, key=lambda pair: pair[0])
+    _, state = min(results, key=lambda pair: pair[0])
     grid, passed = make_grid(sensor.gelpad, GRID_PITCH), []
-    # A round's cost is known when the next has rendered what it found: the light that it was solved with is of first order only.
+    # A round's cost is known when the next one has rendered its result: the light that it was solved with is of first order only.
     for k in range(rounds):
-        extra = extra_light(problem, state, grid, device, options or {})
+        extra = extra_light(problem, state, grid, device, tracing or RayTraced())
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
         passed.append((problem.cost(state, problem.residuals(state)), state))
-        state = problem.solve(state, LATER, told(f"all light, round {k + 1} of {rounds}"))
+        state = problem.solve(state, LATER, report(f"all light, round {k + 1} of {rounds}"))
     if rounds:
-        extra = extra_light(problem, state, grid, device, options or {}, slopes=False)
+        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=False)
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
     passed.append((problem.cost(state, problem.residuals(state)), state))
     _, state = min(passed, key=lambda pair: pair[0])
@@ -194,16 +195,19 @@ def refine_circles(
     rounds: int = 1,
     device: str = "auto",
     seed: int = 0,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> np.ndarray:
-    """Circles (N, 3) [px] of presses that lights were not fitted to, moved from their labels by the finished lights, which stay."""
-    held = FitSettings(fixed=tuple(SIGMA))
+    """Circles (N, 3) [px] of presses that the lights were not fitted to.
+
+    They are fitted from their labels, with the finished lights fixed.
+    """
+    all_fixed = FitSettings(fixed=tuple(SIGMA))
     own = FitState(state.p, state.slopes, shots.circles.copy())
-    problem = DirectFit(sensor, shots, own, held, factor=FACTOR, seed=seed)
+    problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)
     own, grid = problem.solve(own, 8), make_grid(sensor.gelpad, GRID_PITCH)
     for _ in range(rounds):
-        extra = extra_light(problem, own, grid, device, options or {}, slopes=False)
-        problem = DirectFit(sensor, shots, own, held, factor=FACTOR, extra=extra, seed=seed)
+        extra = extra_light(problem, own, grid, device, tracing or RayTraced(), slopes=False)
+        problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, extra=extra, seed=seed)
         # The prior is the label, not where direct light put the circle: DirectFit takes it from the photographs.
         own = problem.solve(own, 8)
     return own.circles

@@ -76,6 +76,6 @@ def _run(args: Sequence[str]) -> int:
 
 
 def _drop_output() -> None:
-    """Let what is still to be written to standard output go nowhere, so that the interpreter can end without another error."""
+    """Discard the rest of standard output, so that the interpreter ends without another error."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shadow_options import ShadowOptions
+from raytac.cli.shared import ShadowOptions
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.bake import run_bake
 from raytac.specs import load_sensor
@@ -19,7 +19,7 @@ __all__ = ["BakeArgs"]
 
 @dataclass(frozen=True, kw_only=True)
 class BakeArgs(ShadowOptions, CommonOptions):
-    """Calibrate a Taxim table on the ray tracer of a sensor: virtual presses of balls and pins, fitted by slope.
+    """Bake a Taxim table from the ray tracer of a sensor: rendered presses of balls and pins, fitted by slope.
 
     Writes the table as a calibration folder that the package taxim reads too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz,
     params.json, raytac.npz), coverage.png, sheet.png and metrics.json, and keeps it in the cache, from where optics taxim takes it if it is
@@ -30,7 +30,7 @@ class BakeArgs(ShadowOptions, CommonOptions):
     sensor: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SENSOR")] = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     resolution: str | None = None
-    """WIDTHxHEIGHT of the calibration images in pixels, as in 320x240; the sensor's own if not given."""
+    """WIDTHxHEIGHT of the table's images in pixels, as in 320x240; the sensor's own if not given."""
     scenes: str = "sphere,coin,pins"
     """Shipped press scenes or scene files, joined by commas, on which the table is compared with the ray tracer."""
     quick: bool = False

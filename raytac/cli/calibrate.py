@@ -1,4 +1,4 @@
-"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the simulated pad."""
+"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the soft pad."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.real_data import FROM_SCRATCH, INNER, prior_of, read_data
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import FitOptions, SolverOptions
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
@@ -20,52 +19,37 @@ from raytac.specs.press import PADS
 __all__ = ["CalibrateArgs"]
 
 _OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
-_OF_MARKERS = ("pad", "quick", "verbose")
+_OF_MARKERS = ("level", "quick", "verbose")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateArgs(SolverOptions):
-    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the simulated pad.
+class CalibrateArgs(FitOptions, SolverOptions):
+    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the soft pad.
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
     out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
 
-    With `markers`: press the simulated pad, fit FOTS and the force field to how its surface moves. Writes marker_motion.toml (which a
-    sensor file names as marker_motion), errors.md, errors.png and arrows.png (every marker model against surface tracking on presses that
-    the fit did not see) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An error
-    or Ctrl-C leaves these files as they were; presses that are finished stay in presses/, and the same command goes on from there.
+    With `markers`: press the soft pad, and fit FOTS and the force field to the displacement of its surface. Writes marker_motion.toml
+    (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (marker models against surface tracking on presses
+    that the fit did not use) and metrics.json. Without --out the folder is runs/calibrate/markers/SENSOR, with --quick SENSOR-quick. An
+    error or Ctrl-C leaves these files as they were; finished presses stay in presses/, and the same command continues from there.
     """
 
     what: Annotated[str, tyro.conf.Positional]
     """`markers`, or a folder of photographs or a dataPack.npz."""
     model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
-    """What a data set is fitted by; table and network take imprint and circles from a fit of the lights too."""
-    ball_diameter_mm: float | None = None
-    """Needed by a dataPack.npz, which does not say it."""
-    sides: str = FROM_SCRATCH
-    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights, and where
-    these were fitted to photographs that are tested on, errors are not of held-out presses."""
-    split: int = 1
-    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
-    a diffuser light like a row."""
+    """Model that is fitted to a data set; table and network take imprint and circles from a fit of the lights too."""
     holdout: int = 5
-    """Every so manieth press is held out and scored; 0 holds out none."""
+    """Interval of the presses that are held out and scored: 5 is every fifth; 0 holds out none."""
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat while it is fitted; sensor.toml says so, and is rendered so."""
+    """Let the ray tracer cast shadows on the coat while it is fitted; sensor.toml then asks for the same."""
     shadow_table: Literal["none", "raytrace"] = "none"
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
-    starts: int = 3
-    """Places that a fit of direct light starts from; the best goes on."""
-    rounds: int = 3
-    """Rounds with the ray tracer after direct light."""
-    prior: str = INNER
-    """How strongly priors hold the LEDs: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
-    cross-validation between halves of the pad within the presses that are fitted to."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
-    pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
-    """How finely the simulated pad is cut."""
+    level: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
+    """Resolution of the soft pad's mesh."""
     quick: bool = False
     """Few presses: shows that all runs; a poor fit."""
 
@@ -80,11 +64,11 @@ class CalibrateArgs(SolverOptions):
         out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
         try:
             written = run_calibrate_markers(
-                sensor, out, pad=self.pad, quick=self.quick, device=self.device, seed=self.seed, start=start
+                sensor, out, level=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )
         except KeyboardInterrupt:
             print(
-                f"raytac: interrupted; finished presses are kept in {out}, the same command goes on from there", file=sys.stderr
+                f"raytac: interrupted; finished presses are kept in {out}, the same command continues from there", file=sys.stderr
             )
             return 130
         for path in written:
@@ -103,12 +87,8 @@ class CalibrateArgs(SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import run_calibrate_optics
 
-        sensor, presses, shots, doubtful = read_data(
-            Path(self.what), self.sensor, self.ball_diameter_mm, self.sides, self.split, self.device
-        )
+        sensor, presses, shots = self.read(Path(self.what), self.sensor)
         out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
-        for name in doubtful:
-            print(f"the circle of press {name} is doubtful")
         for path in run_calibrate_optics(
             sensor,
             shots,
@@ -119,7 +99,7 @@ class CalibrateArgs(SolverOptions):
             holdout=self.holdout,
             starts=self.starts,
             rounds=self.rounds,
-            prior=prior_of(self.prior),
+            prior=self.chosen_prior,
             shadows=self.shadows,
             shadow_table=self.shadow_table,
             device=self.device,

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.solver_options import SolverOptions
+from raytac.cli.shared import SolverOptions
 from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare.page import write_comparison
 from raytac.report.compare.run import run_comparison
@@ -25,7 +25,7 @@ class CompareArgs(SolverOptions):
     """Render the same gel surfaces with every optical mode, and report error beside time.
 
     Writes report.html (one file), pareto.png, a sheet of images a scene, results.parquet and metrics.json. Interrupted, it keeps what
-    is finished in the folder's rows/ and references/: the same command goes on from there.
+    is finished in the folder's rows/ and references/: the same command continues from there.
     """
 
     sensor: str = "gelsight_mini"
@@ -40,11 +40,11 @@ class CompareArgs(SolverOptions):
     """Timed frames a figure; fewer, at least three, for modes slower than 10 s together."""
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """Also press into the simulated pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Also press into the soft pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
     markers: bool = False
-    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the simulated pad of the level
-    that --pad names, else medium; needs raytac[ipc] and a sensor with marker motion."""
+    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the soft pad of the level
+    that --level names, else medium; needs raytac[ipc] and a sensor with marker motion."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
 
@@ -59,14 +59,14 @@ class CompareArgs(SolverOptions):
             comparison = run_comparison(settings, out)
             written = write_comparison(comparison, out, time.perf_counter() - start)
         except KeyboardInterrupt:
-            print(f"raytac: interrupted; finished rows are kept in {out}, the same command goes on from there", file=sys.stderr)
+            print(f"raytac: interrupted; finished rows are kept in {out}, the same command continues from there", file=sys.stderr)
             return 130
         for path in written:
             print(path)
         return 0
 
     def settings(self) -> CompareSettings:
-        """What the options mean. Raises InputError for names or numbers that cannot be read."""
+        """Settings that the options mean. Raises InputError for names or numbers that cannot be read."""
         scenes = parse_names(self.scenes, "scenes")
         sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
         chosen = CompareSettings(
@@ -78,7 +78,7 @@ class CompareArgs(SolverOptions):
             reference_spp=self.spp,
             frames=self.frames,
             batch=self.batch,
-            pad=self.pad,
+            pad=self.level,
             markers=self.markers,
         )
         return chosen.quickened() if self.quick else chosen

@@ -9,18 +9,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from raytac.checks import check_known
-from raytac.cli.shadow_options import ShadowOptions
-from raytac.cli.solver_options import SolverOptions
-from raytac.errors import InputError
+from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
-from raytac.markers import MARKER_MODELS
-from raytac.optics import INTEGRATORS
+from raytac.markers import MARKERS
+from raytac.optics import INTEGRATORS, OPTICS, OpticsConfig
+from raytac.physics import PHYSICS
 from raytac.report.press import run_press
-from raytac.sensor import OPTICS, TactileSensor, sensor_outputs
-from raytac.specs import PADS, PHYSICS, load_press
-from raytac.specs.press import chosen_physics
+from raytac.sensor import TactileSensor, sensor_outputs
+from raytac.specs import PADS, press_of
 
 __all__ = ["PressArgs"]
 
@@ -35,27 +32,33 @@ class PressArgs(ShadowOptions, SolverOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press scene, such as coin, or path of a scene file."""
+    """Name of a shipped press scene, such as coin; path of a scene file; or an STL, OBJ or PLY file, with --depth."""
+    depth: float | None = None
+    """Depth that a mesh file is pressed in to [mm]; scenes have their own."""
+    scale: float | None = None
+    """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
     scene says if not given, else rigid."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
-    mlp (a network, which a calibration must give)."""
+    mlp (a network, which weights must give). The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None
-    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given. mlp: folder of
-    raytac calibrate DATASET --model mlp."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
-    """How the sensor's markers move: fots, surface (needs physics ipc), superposition or force_field; the sensor must have markers, as
-    gelsight_mini_7x9 has. Writes markers.npz, and images show the dots. None if not given."""
-    integrator: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = "fast"
-    """fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare)."""
+    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
+    weights: Path | None = None
+    """mlp: folder of raytac calibrate DATASET --model mlp."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    """Model that moves the sensor's markers; surface needs physics ipc. The sensor must have markers, as gelsight_mini_7x9 has. Writes
+    markers.npz, and images show the dots. None if not given."""
+    integrator: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = None
+    """raytrace: fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare);
+    fast if not given."""
     spp: int | None = None
-    """fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
+    """raytrace. fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
     outputs: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = None
@@ -64,30 +67,26 @@ class PressArgs(ShadowOptions, SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
-        check_known("optics", self.optics, OPTICS)
-        every = sensor_outputs(self.optics)
+        optics = self._optics()
+        every = sensor_outputs(optics)
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
-        scene = load_press(self.scene)
-        physics = chosen_physics(self.physics, self.pad, scene.physics)
-        if physics == "ipc":
-            self.prepare_solver("physics='ipc'")
+        scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
+        physics = chosen_physics(self.physics, self.level, scene)
+        if physics.is_simulated:
+            self.prepare_solver(f"physics={PHYSICS.name_of(physics)!r}")
         sensor = TactileSensor(
             self.sensor,
             physics=physics,
-            pad=self.pad or scene.pad if physics == "ipc" else self.pad,
-            optics=self.optics,
+            optics=optics,
             outputs=computed,
             resolution=parse_resolution(self.resolution) if self.resolution is not None else None,
-            integrator=self.integrator,
-            spp=self.spp,
             device=self.device,
             seed=self.seed,
             markers=self.markers,
-            optics_options=self._optics_options(),
         )
-        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, physics)
+        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, PHYSICS.name_of(physics))
         for path in run_press(sensor, scene, out, outputs=outputs, start=start, progress=True):
             print(path)
         return 0
@@ -98,11 +97,10 @@ class PressArgs(ShadowOptions, SolverOptions):
             [scene, *([physics] if physics != "rigid" else []), *([self.optics] if self.optics != "raytrace" else [])]
         )
 
-    def _optics_options(self) -> dict[str, Any]:
-        options: dict[str, Any] = self.chosen_shadows(self.optics)
-        if self.calibration is not None:
-            if self.optics not in ("taxim", "mlp"):
-                rule = f"is a setting of optics='taxim' and 'mlp', not of {self.optics!r}"
-                raise InputError("calibration", value=self.calibration, rule=rule)
-            options["calibration"] = self.calibration
-        return {**options, "progress": self.integrator != "fast"} if self.optics == "raytrace" else options
+    def _optics(self) -> OpticsConfig[Any]:
+        """Configuration of the optical mode, with every option that was given as its field."""
+        given = {name: getattr(self, name) for name in ("calibration", "weights", "integrator", "spp")}
+        options = {name: value for name, value in given.items() if value is not None} | self.chosen_shadows()
+        if "progress" in vars(OPTICS.config_class(self.optics)).get("__dataclass_fields__", ()):
+            options["progress"] = True
+        return OPTICS.config(self.optics, **options)

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from raytac.checks import check_known, check_whole
-from raytac.cli.shadow_options import ShadowOptions
+from raytac.checks import check_whole
+from raytac.cli.shared import ShadowOptions, chosen_physics
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
-from raytac.markers import MARKER_MODELS
-from raytac.physics.soft.availability import check_solver, hush_solver
-from raytac.sensor import OPTICS, TactileSensor
+from raytac.markers import MARKERS
+from raytac.optics import OPTICS
+from raytac.physics import PHYSICS, PhysicsConfig
+from raytac.physics.soft.availability import check_solver, quiet_solver
+from raytac.sensor import TactileSensor
 from raytac.sensor.options import sensor_spec
-from raytac.specs import PADS, PHYSICS, PressScene, TaskScene, load_scene
-from raytac.specs.press import chosen_physics
+from raytac.specs import PADS, PressScene, TaskScene, load_scene
 from raytac.specs.task import COUPLINGS
 
 if TYPE_CHECKING:
@@ -43,15 +44,15 @@ class ViewArgs(ShadowOptions):
     """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
     sensor: str | None = None
     """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS) + "}")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
     """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated; needs raytac[ipc]); as the scene says if not given, else
     rigid."""
-    pad: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
-    """How finely a simulated pad is cut, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS) + "}")] = "raytrace"
+    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
     """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKER_MODELS) + "}")] = None
-    """How the sensor's markers move; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
+    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
     coupling: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(COUPLINGS) + "}")] = None
     """Whether what simulated pads feel acts back on a task's robot; as the task says if not given."""
     steps: int | None = None
@@ -78,13 +79,13 @@ class ViewArgs(ShadowOptions):
         check_viewer()
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
-        check_known("optics", self.optics, OPTICS)
+        OPTICS.config(self.optics, **self.chosen_shadows())
         scene = load_scene(self.scene)
-        physics = chosen_physics(self.physics, self.pad, scene.physics)
-        if physics == "ipc":
-            check_solver("physics='ipc'")
+        physics = chosen_physics(self.physics, self.level, scene)
+        if physics.is_simulated:
+            check_solver(f"physics={PHYSICS.name_of(physics)!r}")
             if not self.verbose:
-                hush_solver()
+                quiet_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")
@@ -99,26 +100,23 @@ class ViewArgs(ShadowOptions):
                 print("raytac: viewer closed")
         return 0
 
-    def _press(self, scene: PressScene, physics: str) -> Session:
+    def _press(self, scene: PressScene, physics: PhysicsConfig) -> Session:
         from raytac.view.press_session import PressSession
 
         for name, value in (("coupling", self.coupling), ("steps", self.steps)):
             if value is not None:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
-        pad = self.pad or scene.pad if physics == "ipc" else self.pad
         spec = sensor_spec(self.sensor or "gelsight_mini")
         sensor = TactileSensor(
             spec,
             physics=physics,
-            pad=pad,
             outputs=_OUTPUTS,
             seed=self.seed,
-            optics_options=self.chosen_shadows(self.optics),
             **self._settings(spec),
         )
         return PressSession(sensor, scene)
 
-    def _task(self, scene: TaskScene, physics: str) -> Session:
+    def _task(self, scene: TaskScene, physics: PhysicsConfig) -> Session:
         from raytac.view.world_session import WorldSession
         from raytac.world.world import TactileWorld
 
@@ -129,18 +127,16 @@ class ViewArgs(ShadowOptions):
         world = TactileWorld(
             scene,
             physics=physics,
-            pad=self.pad,
             coupling=self.coupling,
             outputs=_OUTPUTS,
             seed=self.seed,
-            sensor_options={"optics_options": self.chosen_shadows(self.optics)},
             **self._settings(sensor_spec(scene.robot.sensor)),
         )
-        return WorldSession(world, steps=self.steps or (4 if physics == "rigid" and self.markers is None else 1))
+        return WorldSession(world, steps=self.steps or (4 if not physics.is_simulated and self.markers is None else 1))
 
     def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
         return {
-            "optics": self.optics,
+            "optics": OPTICS.config(self.optics, **self.chosen_shadows()),
             "markers": self.markers,
             "resolution": _fitting(sensor.camera.resolution) if self.resolution is None else parse_resolution(self.resolution),
             "device": self.device,

@@ -1,15 +1,15 @@
 from .arrays import ARRAYS as ARRAYS
 from .arrays import COLUMNS as COLUMNS
 from .arrays import DATASET_OUTPUTS as DATASET_OUTPUTS
-from .engines import ENGINES as ENGINES
+from .contact_sheet import contact_sheet as contact_sheet
 from .loader import PressDataset as PressDataset
 from .plan import DatasetPlan as DatasetPlan
 from .plan import Presses as Presses
 from .renderer import RenderJob as RenderJob
 from .renderer import ShardRenderer as ShardRenderer
 from .renderer import ShardResult as ShardResult
+from .run import ENGINES as ENGINES
 from .run import Check as Check
 from .run import RunReport as RunReport
 from .run import render_dataset as render_dataset
 from .run import verify_dataset as verify_dataset
-from .sheet import contact_sheet as contact_sheet

@@ -1,4 +1,4 @@
-"""What a data set keeps of a press: names, types, shapes, units and frames."""
+"""Arrays and columns of a press in a data set: names, types, shapes, units and frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ArrayKind:
     """Output that it comes with, ``markers``, or nothing: always there."""
 
     def is_kept(self, outputs: Collection[str], markers: bool) -> bool:
-        """Whether a sweep with these outputs keeps it."""
+        """True if a sweep with these outputs keeps it."""
         return self.needs == "" or self.needs in outputs or (self.needs == "markers" and markers)
 
 
@@ -104,7 +104,7 @@ COLUMNS: dict[str, Column] = {
     "yaw": Column("float64", "rad", "turn of the object about +z, before the lean"),
     "tilt": Column("float64", "rad", "lean of the object away from +z"),
     "tilt_direction": Column("float64", "rad", "where its upper end leans to, from +x to +y"),
-    "shear_x": Column("float64", "m", "way sideways after the indent, pad frame"),
+    "shear_x": Column("float64", "m", "sideways displacement after the indent, pad frame"),
     "shear_y": Column("float64", "m", "likewise"),
     "twist": Column("float64", "rad", "turn about +z after that"),
     "force_x": Column("float64", "N", f"x {_FORCE}; null without the output wrench, as for the next seven"),
@@ -117,7 +117,7 @@ COLUMNS: dict[str, Column] = {
     "contact_cells": Column(
         "float64",
         "",
-        "width of the contact in cells of a simulated pad; below 6 its force at a depth is too large; null if rigid",
+        "width of the contact in cells of a soft pad; below 6 its force at a depth is too large; null if rigid",
     ),
     "indentation_max": Column("float64", "m", "how far the coat lies below its place at rest, at most"),
     "shard_sha256": Column("string", "", "of the file"),

@@ -85,9 +85,9 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
     }
 
 
-def write_description(folder: Path, found: dict[str, Any]) -> None:
+def write_description(folder: Path, description: dict[str, Any]) -> None:
     """Write ``README.md`` and ``dataset.json``, the latter last."""
-    for name, text in (("README.md", _readme(found)), (FILE, json.dumps(found, indent=1, ensure_ascii=False) + "\n")):
+    for name, text in (("README.md", _readme(description)), (FILE, json.dumps(description, indent=1, ensure_ascii=False) + "\n")):
         write_atomic(folder / name, text.encode())
 
 
@@ -99,32 +99,32 @@ def read_description(folder: Path) -> dict[str, Any]:
     """
     path = Path(folder) / FILE
     try:
-        found = json.loads(read_regular(path))
-        version = found["format_version"]
+        description = json.loads(read_regular(path))
+        version = description["format_version"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("data set", value=folder, rule=f"must be a folder with a {FILE} ({type(error).__name__})") from error
     if version != FORMAT_VERSION:
         raise InputError("data set", value=version, rule=f"must be of format version {FORMAT_VERSION}")
     for key, kind in _KEYS.items():
-        if type(found.get(key)) is not kind:
+        if type(description.get(key)) is not kind:
             raise InputError("data set", value=path, rule=f"must have a key {key!r} of type {kind.__name__}")
-    for name, item in {**found["arrays"], **found["arrays_of_a_shard"]}.items():
+    for name, item in {**description["arrays"], **description["arrays_of_a_shard"]}.items():
         if not isinstance(item, dict) or item.get("dtype") not in _DTYPES or not _is_shape(item.get("shape")):
             rule = f"must declare array {name!r} by a shape and a known dtype"
             raise InputError("data set", value=path, rule=rule, choices=_DTYPES)
-    for name, sensor in found["sensors"].items():
+    for name, sensor in description["sensors"].items():
         shapes = sensor.get("arrays") if isinstance(sensor, dict) else None
-        if not isinstance(shapes, dict) or set(shapes) != set(found["arrays"]) or not all(map(_is_shape, shapes.values())):
+        if not isinstance(shapes, dict) or set(shapes) != set(description["arrays"]) or not all(map(_is_shape, shapes.values())):
             raise InputError("data set", value=path, rule=f"must have the shape of every array for sensor {name!r}")
-    return found
+    return description
 
 
 def _is_shape(shape: object) -> bool:
-    """Whether it is a list of whole numbers >= 0 and names of sizes."""
+    """True for a list of whole numbers >= 0 and names of sizes."""
     return isinstance(shape, list) and all((type(n) is int and n >= 0) or (isinstance(n, str) and n) for n in shape)
 
 
-def _readme(found: dict[str, Any]) -> str:
+def _readme(description: dict[str, Any]) -> str:
     def table(items: dict[str, dict[str, Any]], kind: str) -> list[str]:
         lines = [f"| name | {kind} | unit | meaning |", "|---|---|---|---|"]
         for name, item in items.items():
@@ -133,13 +133,14 @@ def _readme(found: dict[str, Any]) -> str:
         return lines
 
     lines = [
-        f"# {found['name']}",
+        f"# {description['name']}",
         "",
-        f"{found['presses']} simulated presses of {', '.join(found['plan']['objects'])} into {', '.join(found['sensors'])}, by raytac: "
-        f"{found['sound']} sound, {found['failed']} failed, {found['shards']} shards. "
-        + ("Complete." if found["complete"] else "NOT complete: run the same command again."),
+        f"{description['presses']} simulated presses of {', '.join(description['plan']['objects'])} into "
+        f"{', '.join(description['sensors'])}, by raytac: "
+        f"{description['sound']} sound, {description['failed']} failed, {description['shards']} shards. "
+        + ("Complete." if description["complete"] else "NOT complete: run the same command again."),
         "",
-        f"Frame: {found['frame']}.",
+        f"Frame: {description['frame']}.",
         "",
         "- `manifest.parquet`: one row a press, in the order of their numbers; failed ones with their reason.",
         "- `shards/NNNNNN.npz`: arrays of the sound presses of one shard, `numpy.load` reads them; SHA-256 of every file in the manifest.",
@@ -155,22 +156,22 @@ def _readme(found: dict[str, Any]) -> str:
         "",
         "## Arrays of a shard, the press first",
         "",
-        *table(found["arrays"], "type (shape)"),
+        *table(description["arrays"], "type (shape)"),
         "",
         "## Arrays of a shard, once",
         "",
-        *table(found["arrays_of_a_shard"], "type (shape)"),
+        *table(description["arrays_of_a_shard"], "type (shape)"),
         "",
         "H, W: image; Ny, Nx: grid over the pad; M: markers. By sensor:",
         "",
         *(
             f"- `{name}`: " + ", ".join(f"{key} {tuple(shape)}" for key, shape in sensor["arrays"].items())
-            for name, sensor in found["sensors"].items()
+            for name, sensor in description["sensors"].items()
         ),
         "",
         "## Columns of the manifest",
         "",
-        *table(found["columns"], "type"),
+        *table(description["columns"], "type"),
         "",
     ]
     return "\n".join(lines)

@@ -13,8 +13,7 @@ import numpy as np
 from raytac.dataset.arrays import COLUMNS, ArrayKind
 from raytac.dataset.describe import read_description
 from raytac.dataset.manifest import read_manifest
-from raytac.dataset.shard import FOLDER, is_shard_file
-from raytac.dataset.shard_reader import open_shard
+from raytac.dataset.shard import FOLDER, is_shard_file, open_shard
 from raytac.errors import InputError
 
 __all__ = ["PressDataset", "open_shard"]
@@ -94,11 +93,11 @@ class PressDataset:
         """
         i = self._place(i)
         shard, row = self._shards[i], self._rows[i]
-        found = {name: np.array(self._shard(shard)[name][row]) for name in self._arrays}
-        return found | {name: np.asarray(values[i]) for name, values in self._columns.items()}
+        arrays = {name: np.array(self._shard(shard)[name][row]) for name in self._arrays}
+        return arrays | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
-        """What the presses of press ``i``'s shard have in common: grid, height and image at rest. Errors as for ``data[i]``."""
+        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest. Errors as for ``data[i]``."""
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
 
@@ -129,7 +128,7 @@ class PressDataset:
 
 @dataclass(frozen=True)
 class _ShardFile:
-    """What the manifest says of a shard."""
+    """A shard as the manifest lists it."""
 
     sensor: str
     sha256: str
@@ -146,17 +145,17 @@ def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[s
     rows: dict[tuple[str, str, str], list[int]] = {}
     for *key, row in zip(*(table[name].to_pylist() for name in ("shard", "sensor", "shard_sha256", "row")), strict=True):
         rows.setdefault((key[0], key[1], key[2]), []).append(row)
-    found: dict[str, _ShardFile] = {}
+    result: dict[str, _ShardFile] = {}
     for (shard, sensor, sha256), places in rows.items():
         if not is_shard_file(shard):
             raise InputError("data set", value=shard, rule=f"names a shard that is not in {folder / FOLDER}")
         if sensor not in sensors:
             raise InputError("data set", value=sensor, rule=f"is not a sensor of {folder}", choices=tuple(sensors))
-        if shard in found or sorted(places) != list(range(len(places))):
+        if shard in result or sorted(places) != list(range(len(places))):
             rule = "must be of one sensor and one checksum, and its presses in rows 0, 1, … of it"
             raise InputError("data set", value=shard, rule=rule)
-        found[shard] = _ShardFile(sensor, sha256, len(places))
-    return found
+        result[shard] = _ShardFile(sensor, sha256, len(places))
+    return result
 
 
 def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:

@@ -1,4 +1,4 @@
-"""Which presses a data set has: every one drawn from the seed and its own number, whoever renders it and whatever comes before."""
+"""Presses of a data set, each drawn from the seed and its own number alone."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ import numpy as np
 from raytac.dataset.arrays import ARRAYS, DATASET_OUTPUTS, SHARED, ArrayKind
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.surface import PadGrid, grid_pitch, make_grid
-from raytac.markers import MarkerPerturbation
+from raytac.markers import MARKERS, MarkerPerturbation
 from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
+from raytac.physics.registry import scene_physics
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
 
@@ -63,9 +64,9 @@ class Presses:
     @property
     def rotations(self) -> np.ndarray:
         """Turn of the object: yaw about +z, then the lean; wxyz, (N, 4)."""
-        half, lean, way = 0.5 * self.yaw, 0.5 * self.tilt, self.tilt_direction
+        half, lean, azimuth = 0.5 * self.yaw, 0.5 * self.tilt, self.tilt_direction
         # The axis of the lean is +z × direction.
-        axis = np.stack([np.zeros_like(way), -np.sin(way), np.cos(way), np.zeros_like(way)], axis=1)
+        axis = np.stack([np.zeros_like(azimuth), -np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=1)
         a = np.cos(lean)[:, None] * np.array([1.0, 0.0, 0.0, 0.0]) + np.sin(lean)[:, None] * axis
         w, z = np.cos(half), np.sin(half)
         return np.stack(
@@ -85,14 +86,14 @@ class DatasetPlan:
     """
 
     def __init__(self, sweep: SweepSpec) -> None:
-        """Check all that can be told before anything is rendered.
+        """Check all that can be checked before anything is rendered.
 
         Raises:
             InputError: an output that no data set has, a model that the sensor lacks, or randomisation of markers that are not
                 asked for.
             SpecError: a range that no press into one of the sensors can follow; names the file and key.
         """
-        self.sweep = sweep
+        self.sweep, self.physics = sweep, scene_physics(None, sweep)
         for name in sweep.outputs:
             if name not in DATASET_OUTPUTS:
                 raise InputError("outputs", value=name, rule="must be known names", choices=DATASET_OUTPUTS)
@@ -147,7 +148,7 @@ class DatasetPlan:
         def between(ends: tuple[float, float], share: np.ndarray) -> np.ndarray:
             return ends[0] + (ends[1] - ends[0]) * share
 
-        length, way = between(r.shear, u[6]), 2.0 * np.pi * u[7]
+        length, azimuth = between(r.shear, u[6]), 2.0 * np.pi * u[7]
         return Presses(
             index=np.asarray(index, np.int64),
             scene=np.minimum((u[0] * len(self.sweep.objects)).astype(np.int64), len(self.sweep.objects) - 1),
@@ -158,8 +159,8 @@ class DatasetPlan:
             yaw=between(r.yaw, u[4]),
             tilt=between(r.tilt, u[5]),
             tilt_direction=2.0 * np.pi * u[9],
-            shear_x=length * np.cos(way),
-            shear_y=length * np.sin(way),
+            shear_x=length * np.cos(azimuth),
+            shear_y=length * np.sin(azimuth),
             twist=between(r.twist, u[8]),
         )
 
@@ -169,12 +170,10 @@ class DatasetPlan:
         """Keyword arguments of the ``TactileSensor`` that gives what is kept, but for sensor and device."""
         sweep = self.sweep
         return {
-            "physics": sweep.physics,
-            "pad": sweep.pad,
+            "physics": self.physics,
             "optics": sweep.optics,
             "outputs": tuple(name for name in sweep.outputs if name != "contact"),
-            "markers": sweep.markers,
-            "marker_perturbation": replace(self.randomization.markers) if sweep.markers is not None else None,
+            "markers": None if sweep.markers is None else MARKERS.config(sweep.markers, perturbation=self.randomization.markers),
             "resolution": sweep.resolution,
             "pitch": sweep.pitch,
             "num_envs": num_envs,
@@ -205,17 +204,17 @@ class DatasetPlan:
         return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kept.items()}
 
     def press_bytes(self, sensor: SensorSpec) -> int:
-        """What one press into a sensor takes on disk, not compressed, and nothing of what a shard holds once."""
+        """Bytes on disk of one press into a sensor, not compressed, without the arrays that a shard holds once."""
         return _bytes(self.array_shapes(sensor), ARRAYS)
 
     def shard_bytes(self, shard: int) -> int:
-        """What a shard takes on disk, not compressed, but for some kilobytes of headers and rows."""
+        """Bytes on disk of a shard, not compressed, but for some kilobytes of headers and rows."""
         sensor = self.sweep.sensors[self.variant(shard)[0]]
         count = min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
         return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
-        """What all shards but those ``without`` take on disk, as ``shard_bytes``; in a time that does not grow with their number."""
+        """Bytes on disk of all shards but those ``without``, as ``shard_bytes``; the time does not grow with their number."""
         kinds, last = len(self.sweep.sensors), self.shards - 1
         done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
         total = 0
@@ -238,13 +237,13 @@ class DatasetPlan:
             for f in fields(sweep)
             if f.name not in ("sensors", "objects", "source", "ranges", "name")
         }
-        found = {
+        facts = {
             **plain,
             "press": {f.name: list(getattr(sweep.ranges, f.name)) for f in fields(sweep.ranges)},
             "sensors": {s.name: _sensor_digest(s) for s in sweep.sensors},
             "objects": {scene.name: _object_of(scene) for scene in sweep.objects},
         }
-        return json.loads(json.dumps(found, default=dict))
+        return json.loads(json.dumps(facts, default=dict))
 
     @cached_property
     def digest(self) -> str:
@@ -255,7 +254,7 @@ class DatasetPlan:
         dynamics, key = scene.object.dynamics, "object.dynamics"
         if dynamics == "affine":
             raise SpecError("a free body cannot be pressed to a depth", file=scene.source, key=key, value=dynamics)
-        if dynamics == "soft" and (self.sweep.physics != "ipc" or self.sweep.ranges.tilt != (0.0, 0.0)):
+        if dynamics == "soft" and (not self.physics.is_simulated or self.sweep.ranges.tilt != (0.0, 0.0)):
             rule = 'a soft object needs physics = "ipc" and tilt_deg = [0, 0]: it is held at its top'
             raise SpecError(rule, file=scene.source, key=key, value=dynamics)
 
@@ -271,7 +270,10 @@ class DatasetPlan:
                 raise self._error(f"{axis}_mm", ends, rule)
 
     def _check_markers(self, sensor: SensorSpec) -> None:
-        """Refuse shifts and turns of the pattern that take a marker out of the view, now and not at the press that draws them."""
+        """Refuse shifts and turns of the pattern that take a marker out of the view.
+
+        They are refused here, before the press that draws them.
+        """
         largest = self.randomization.markers
         if self.sweep.markers is not None and largest.moves_pattern:
             ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])
@@ -310,6 +312,8 @@ def _object_of(scene: PressScene) -> dict[str, Any]:
         file = Path(str(params["path"]))
         params = {**params, "path": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
     spec = scene.object
+    if spec.heights:
+        params = {**params, "sha256": hashlib.sha256(repr(spec.heights).encode()).hexdigest()}
     return {
         "kind": spec.kind,
         "params": params,

@@ -13,14 +13,12 @@ from raytac.dataset.arrays import ARRAYS
 from raytac.dataset.plan import DatasetPlan, Presses, press_scene_of
 from raytac.errors import AssetError, BackendError, RaytacError
 from raytac.frame import TactileFrame
-from raytac.io.git_state import git_state
+from raytac.io.code_digest import git_state
 from raytac.io.metrics import versions
 from raytac.observe.randomization import CameraDrift
 from raytac.physics import NarrowContactWarning
 from raytac.sensor import TactileSensor
-from raytac.sensor.pad import load_pad
 from raytac.specs import PressScene, SensorSpec
-from raytac.specs.press import PADS
 
 __all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
 
@@ -32,7 +30,7 @@ Row = dict[str, str | int | float | None]
 
 @dataclass(frozen=True)
 class RenderJob:
-    """What every worker of a run is told."""
+    """Work order for every worker of a run."""
 
     plan: DatasetPlan
     device: str = "auto"
@@ -42,7 +40,7 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class ShardResult:
-    """What came of one shard."""
+    """Result of one shard."""
 
     shard: int
     arrays: dict[str, np.ndarray]
@@ -52,7 +50,7 @@ class ShardResult:
     made_by: dict[str, str | int | float]
     """Device, physics and optics, versions and state of the code."""
     worker: str = ""
-    """Who rendered it; goes into no file."""
+    """Name of the worker that rendered it; goes into no file."""
 
 
 @dataclass
@@ -130,7 +128,7 @@ class ShardRenderer:
         sensor = TactileSensor(spec, **plan.sensor_options(batch), device=self.job.device)
         rest = sensor.rest()  # before any press, whose placement of the pattern it would show
         shared = {"grid_x": sensor.grid.x, "grid_y": sensor.grid.y, "rest_height": rest.surface.height[0]}
-        if rest.rgb is not None:
+        if "rgb" in rest.outputs:
             shared["rest_rgb"] = rest.rgb[0]
         drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
         return _Built(sensor, drift, shared)
@@ -138,7 +136,10 @@ class ShardRenderer:
     # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, of which the first are the presses; and the reason of each that failed, else an empty text."""
+        """Frame of B environments, of which the first are the presses, and why each failed.
+
+        The reason is empty for a press that succeeded.
+        """
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():
@@ -156,7 +157,6 @@ class ShardRenderer:
                 refused = np.flatnonzero([bool(reason) for reason in reasons])
                 own["offsets"][refused] = np.nan
                 frame = built.sensor.press(scene, **own)
-        assert frame.failed is not None
         for b in range(len(presses)):
             if frame.failed[b] and not reasons[b]:
                 reasons[b] = _UNSETTLED
@@ -184,11 +184,8 @@ class ShardRenderer:
         """Why a press cannot be, found by trying it alone; empty if it can."""
         own = self._own(press, 1)
         del own["seeds"]
-        level, sweep = self.plan.sweep.pad or PADS[0], self.plan.sweep
         try:
-            pad = load_pad(
-                sensor.spec, scene, physics=sweep.physics, level=level, device=self.job.device, pitch=sensor.pitch, **own
-            )
+            pad = self.plan.physics.build(sensor.spec, scene, pitch=sensor.pitch, num_envs=1, device=self.job.device, **own)
             for _ in pad.run():
                 pass
         except (BackendError, AssetError):
@@ -198,18 +195,20 @@ class ShardRenderer:
         return ""
 
     def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
-        found: dict[str, Any] = {name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")}
+        arrays: dict[str, Any] = {
+            name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")
+        }
         surface = frame.surface
-        found |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
+        arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
         if "contact" in self.plan.sweep.outputs:
-            found["contact"] = surface.contact
-        if frame.rgb is not None:
-            found["rgb"] = self._drifted(built, frame.rgb, presses)
-        if frame.markers is not None:
+            arrays["contact"] = surface.contact
+        if "rgb" in frame.outputs:
+            arrays["rgb"] = self._drifted(built, frame.rgb, presses)
+        if "markers" in frame.outputs:
             m = frame.markers
-            found |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
-            found |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
-        return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in found.items()}
+            arrays |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
+            arrays |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
+        return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in arrays.items()}
 
     def _drifted(self, built: _Built, rgb: np.ndarray, presses: Presses) -> np.ndarray:
         if built.drift is None:
@@ -234,19 +233,19 @@ class ShardRenderer:
 
 def _figures(frame: TactileFrame, b: int) -> Row:
     """Figures of one press for the manifest."""
-    found: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
-    if frame.wrench is not None:
+    row: Row = {"indentation_max": float(frame.surface.indentation[b].max())}
+    if "wrench" in frame.outputs:
         names = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-        found |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
+        row |= dict(zip(names, frame.wrench[b].tolist(), strict=True))
     for name in ("contact_area", "contact_cells"):
-        values = getattr(frame, name)
+        values = getattr(frame, name, None)
         if values is not None and np.isfinite(values[b]):
-            found[name] = float(values[b])
-    return found
+            row[name] = float(values[b])
+    return row
 
 
 def _not_finite(arrays: Mapping[str, np.ndarray]) -> str:
-    """Which array of a press holds a number that is not finite, where it ought to; empty if none."""
+    """Name of an array of a press that holds a number that is not finite and ought to be; empty if none."""
     lost = arrays.get("marker_visible")
     for name, values in arrays.items():
         if values.dtype.kind != "f":

@@ -6,26 +6,24 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from raytac.checks import check_known, check_whole
 from raytac.dataset.describe import FILE, describe, read_description, write_description
-from raytac.dataset.engines import ENGINES, render_here
 from raytac.dataset.manifest import check_pyarrow, write_manifest
 from raytac.dataset.plan import DatasetPlan
-from raytac.dataset.ray_engine import render_on_ray
-from raytac.dataset.renderer import RenderJob
+from raytac.dataset.ray_cluster import render_on_ray
+from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
 from raytac.errors import InputError
-from raytac.io.lock import FolderLock
+from raytac.io.folder import FolderLock
+from raytac.io.progress import Progress
 
-__all__ = ["Check", "RunReport", "render_dataset", "verify_dataset"]
+__all__ = ["ENGINES", "Check", "RunReport", "render_dataset", "render_here", "verify_dataset"]
 
 _SPARE = 1.05
 """The estimated size must fit this many times on the disk."""
@@ -33,7 +31,7 @@ _SPARE = 1.05
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a run did."""
+    """Result of a run."""
 
     folder: Path
     rendered: int
@@ -51,7 +49,7 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Check:
-    """What ``verify_dataset`` found."""
+    """Result of ``verify_dataset``."""
 
     shards: int
     wrong: dict[int, str]
@@ -85,7 +83,7 @@ def render_dataset(
         workers, address: of Ray, see ``render_on_ray``.
         compress: deflate the arrays; they then cannot be mapped into memory.
         progress: a bar of presses on standard error, if that is a terminal.
-        say: is told what is found and done, one line at a time.
+        say: called with one line at a time about what is done.
 
     Raises:
         InputError: a bad argument, a folder with another data set or in use by another run, or a disk without room enough.
@@ -112,7 +110,7 @@ def render_dataset(
                 render_here(job, missing) if engine == "local" else render_on_ray(job, missing, workers=workers, address=address)
             )
             total = sum(len(record.rows) for record in records.values())
-            with tqdm(total=plan.sweep.count, initial=total, unit="press", disable=None if progress else True) as bar:
+            with Progress(desc="render", total=plan.sweep.count, initial=total, unit="press", show=progress) as bar:
                 for result in results:
                     with _write_errors(folder):
                         if first is None:
@@ -140,23 +138,23 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     from raytac.dataset.manifest import FILE as MANIFEST
     from raytac.dataset.shard import sha256_of
 
-    found = read_description(folder)
+    description = read_description(folder)
     manifest = Path(folder) / MANIFEST
-    if found["complete"] and (not manifest.is_file() or sha256_of(manifest) != found["manifest_sha256"]):
+    if description["complete"] and (not manifest.is_file() or sha256_of(manifest) != description["manifest_sha256"]):
         raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to mend it")
-    store = ShardStore(folder, found["plan_sha256"])
+    store = ShardStore(folder, description["plan_sha256"])
     wrong = {}
-    for shard in tqdm(range(found["shards"]), unit="shard", disable=None if progress else True, leave=False):
+    for shard in Progress(range(description["shards"]), desc="verify", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, str):
             wrong[shard] = record
-    return Check(found["shards"], wrong)
+    return Check(description["shards"], wrong)
 
 
 def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
     """Records of the shards that are there and whole."""
     records, there = {}, store.present()
-    for shard in tqdm(there, "checking", unit="shard", disable=None if progress else True, leave=False):
+    for shard in Progress(there, desc="check", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, ShardRecord):
             records[shard] = record
@@ -178,9 +176,9 @@ def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
         return
     if not (folder / FILE).is_file():
         raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
-    found = read_description(folder)
-    if found["plan_sha256"] != plan.digest:
-        changed = _differences(found["plan"], plan.description)
+    description = read_description(folder)
+    if description["plan_sha256"] != plan.digest:
+        changed = _differences(description["plan"], plan.description)
         rule = (
             f"holds another data set, which differs in {', '.join(changed) or 'its version'}: choose another folder, or remove it"
         )
@@ -211,3 +209,14 @@ def _write_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         rule = f"cannot be written ({error.strerror}): shards that are done stay, and the same command goes on with the others"
         raise InputError("out", value=folder, rule=rule) from error
+
+
+ENGINES = ("local", "ray")
+"""Names that ``engine=`` accepts."""
+
+
+def render_here(job: RenderJob, shards: Sequence[int]) -> Iterator[ShardResult]:
+    """Render shards one after the other in this process."""
+    renderer = ShardRenderer(job)
+    for shard in shards:
+        yield renderer.render(shard)

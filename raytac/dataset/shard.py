@@ -1,19 +1,29 @@
-"""Shards on disk: one ``.npz`` of arrays and one ``.json`` of rows each, written whole or not at all, and checked by SHA-256."""
+"""Shards on disk: one ``.npz`` of arrays and one ``.json`` of rows each, checked by SHA-256.
+
+They are written as a whole or not at all.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from dataclasses import dataclass
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
 
+import numpy as np
+
+from raytac.dataset.arrays import ARRAYS, SHARED, ArrayKind
 from raytac.dataset.renderer import Row, ShardResult
+from raytac.errors import InputError
 from raytac.io.arrays import npz_bytes
 from raytac.io.atomic import PARTIAL, open_regular, read_regular, write_atomic
 
-__all__ = ["FOLDER", "ShardRecord", "ShardStore", "is_shard_file", "sha256_of"]
+__all__ = ["FOLDER", "KINDS", "ShardRecord", "ShardStore", "is_shard_file", "open_shard", "sha256_of"]
 
 FOLDER = "shards"
 """Folder of the shards in a data set."""
@@ -22,7 +32,7 @@ _FILE = re.compile(rf"{FOLDER}/[0-9]{{6,12}}\.npz")
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """What is known of a shard that is done."""
+    """Record of a finished shard."""
 
     shard: int
     file: str
@@ -117,7 +127,7 @@ def _rows_digest(rows: list[Row]) -> str:
 
 
 def is_shard_file(name: str) -> bool:
-    """Whether a path is one that a data set gives its shards: in the folder of the shards and nowhere else."""
+    """True for a path that a data set gives its shards: in the folder of the shards and nowhere else."""
     return _FILE.fullmatch(name) is not None
 
 
@@ -127,3 +137,94 @@ def _check_record(record: ShardRecord, file: str) -> None:
     sound = sound and all(isinstance(row, dict) and row.get("status") in ("ok", "failed") for row in record.rows)
     if not sound or record.file not in ("", file):
         raise ValueError("a record needs its own file, rows with a status, and what made it")
+
+
+KINDS: dict[str, ArrayKind] = {**{name: replace(kind, shape=("N", *kind.shape)) for name, kind in ARRAYS.items()}, **SHARED}
+"""Arrays that a shard may hold, with N presses."""
+_HEADER = 30
+"""Bytes of a zip member's local header before its name and extra field."""
+
+
+def open_shard(
+    path: Path,
+    kinds: Mapping[str, ArrayKind] | None = None,
+    *,
+    sizes: Mapping[str, int] | None = None,
+    sha256: str | None = None,
+) -> tuple[dict[str, np.ndarray], bool]:
+    """Arrays of an ``.npz``, mapped into memory if none is compressed, else read; and which of the two.
+
+    Args:
+        path: of the file.
+        kinds: the arrays that it must hold, by name; None: any of ``KINDS``.
+        sizes: numbers that names in their shapes stand for; what is not named may be any, the same in all arrays.
+        sha256: hex digest that the file must have; None is any.
+
+    Raises:
+        InputError: the file cannot be read, differs from its checksum, is no such archive, or holds an array of another name, type,
+            shape or length. Objects, which would be pointers into memory, are of no known type.
+    """
+    try:
+        with open_regular(path) as stream:
+            data = np.memmap(stream, np.uint8, "r")  # one map a shard: an operating system has tens of thousands
+            if sha256 is not None and hashlib.sha256(data.data).hexdigest() != sha256:
+                raise InputError("shard", value=path, rule="differs from its checksum: render again to mend it")
+            with zipfile.ZipFile(stream) as archive:
+                members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+                expected = KINDS if kinds is None else kinds
+                wrong = set(members) - set(expected) if kinds is None else set(members) ^ set(expected)
+                if wrong or len(members) != len(archive.infolist()):
+                    rule = f"must hold the arrays of a data set, each once; it differs in {', '.join(sorted(wrong)) or 'their number'}"
+                    raise InputError("shard", value=path, rule=rule)
+                stored = all(member.compress_type == zipfile.ZIP_STORED for member in members.values())
+                known = dict(sizes or {})
+                arrays = {}
+                for name, member in members.items():
+                    if stored:
+                        start = _start(stream, member)
+                        shape, dtype, order, length = _header(stream, expected[name], known, member.file_size)
+                        # NumPy refuses an array that goes beyond the end of `data`.
+                        arrays[name] = np.ndarray(shape, dtype, data, start + length, order=order)
+                    else:
+                        with archive.open(member) as inflated:
+                            shape, dtype, order, length = _header(inflated, expected[name], known, member.file_size)
+                            values = np.frombuffer(inflated.read(), dtype)
+                        arrays[name] = values.reshape(shape, order=order)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive ends in errors of many types
+        raise InputError("shard", value=path, rule=f"cannot be used ({error})") from error
+    return arrays, stored
+
+
+def _start(stream: IO[bytes], member: zipfile.ZipInfo) -> int:
+    """Offset of a member that is not compressed; the stream stays there."""
+    stream.seek(member.header_offset)
+    header = stream.read(_HEADER)
+    names = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")
+    return stream.seek(member.header_offset + _HEADER + names)
+
+
+def _header(
+    stream: IO[bytes], kind: ArrayKind, sizes: dict[str, int], length: int
+) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"], int]:
+    """Shape, type and order of the ``.npy`` of ``length`` bytes at the stream's place, and the length of its header.
+
+    Sizes that are named for the first time are noted in ``sizes``. Raises ``ValueError`` where it is not of this kind.
+    """
+    begin = stream.tell()
+    version = np.lib.format.read_magic(stream)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+    shape, fortran, dtype = read(stream)
+    expected = tuple(sizes.get(n, n) if isinstance(n, str) else n for n in kind.shape)
+    if dtype != np.dtype(kind.dtype) or dtype.hasobject:
+        raise ValueError(f"an array of type {dtype} where {kind.dtype} is declared")
+    if len(shape) != len(expected) or any(isinstance(n, int) and n != m for n, m in zip(expected, shape, strict=True)):
+        raise ValueError(f"an array of shape {shape} where {expected} is declared")
+    for name, n in zip(kind.shape, shape, strict=True):
+        if isinstance(name, str) and sizes.setdefault(name, n) != n:
+            raise ValueError(f"an array of shape {shape} where {kind.shape} is declared, and {name} is {sizes[name]}")
+    header = stream.tell() - begin
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != length - header:
+        raise ValueError(f"{length - header} bytes for {dtype} of shape {shape}")
+    return shape, dtype, "F" if fortran else "C", header

@@ -1,6 +1,7 @@
 from .balance_pole import BalancePole as BalancePole
 from .balance_pole import BalancePoleEnv as BalancePoleEnv
 from .balance_pole import BalancePoleVectorEnv as BalancePoleVectorEnv
+from .batch import StepResult as StepResult
 from .batch import TaskBatch as TaskBatch
 from .environments import TactileEnv as TactileEnv
 from .environments import TactileVectorEnv as TactileVectorEnv
@@ -19,5 +20,8 @@ from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .sb3 import one_thread as one_thread
 from .scripted import SCRIPTED as SCRIPTED
-from .task import Start as Start
-from .task import Task as Task
+from .task_rules import Motion as Motion
+from .task_rules import Start as Start
+from .task_rules import Task as Task
+from .task_rules import TaskResult as TaskResult
+from .task_rules import TaskState as TaskState

@@ -7,13 +7,14 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, turned
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances
+from raytac.se3 import pose, rotations
 
 __all__ = ["BalancePole", "BalancePoleEnv", "BalancePoleVectorEnv"]
 
 
 class BalancePole(Task):
-    """The numbers of ``BalancePoleEnv``, as code."""
+    """Rules of ``BalancePoleEnv``, as code."""
 
     scene: ClassVar = "balance_pole"
     body: ClassVar = "pole"
@@ -24,54 +25,51 @@ class BalancePole(Task):
     stands_on: ClassVar = "sensor"
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        # It leans about an edge of its foot, which stays a hair above the pad.
+        # The pole leans about an edge of its foot, which stays 0.1 mm above the pad.
         angle, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, np.radians(2.0))
         foot = tool[:3, 3] + [*rng.uniform(-1e-3, 1e-3, 2), 1e-4 + 0.003 * np.sin(tilt)]
-        begin = np.eye(4)
-        begin[:3, :3] = turned(np.array([np.cos(angle), np.sin(angle), 0.0]), tilt)
-        begin[:3, 3] = foot + 0.15 * begin[:3, 2]
-        return Start(tool[:3, 3].copy(), {"pole": begin})
+        rotation = rotations(tilt * np.array([np.cos(angle), np.sin(angle), 0.0]))
+        return Start(tool[:3, 3].copy(), {"pole": pose(rotation, foot + 0.15 * rotation[:, 2])})
 
-    def judge(self, now: Situation) -> Verdict:
-        axis = now.body[:, :3, 2]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        axis = state.body[:, :3, 2]
         tilt = np.arccos(np.clip(axis[:, 2], -1.0, 1.0))
-        foot = now.body[:, :3, 3] - 0.15 * axis
-        terminated = (far(foot, now.tool[:, :3, 3]) > 0.05) | (now.body[:, 2, 3] < 0.4) | (tilt > np.pi / 2)
+        foot = state.body[:, :3, 3] - 0.15 * axis
+        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > np.pi / 2)
         terms = {
             "alive": 1.0 * ~terminated,
             "terminated": -2.0 * terminated,
             "tilt": -np.square(tilt),
-            "tool_speed": -0.01 * np.abs(now.speed).sum(axis=1),
-            "pole_speed": -0.005 * np.abs(now.body_speed[:, 3:]).sum(axis=1),
+            "tool_speed": -0.01 * np.abs(state.speed).sum(axis=1),
+            "pole_speed": -0.005 * np.abs(state.body_speed[:, 3:]).sum(axis=1),
         }
-        return Verdict({**terms, **self.effort(now)}, terminated, ~terminated & (tilt < np.radians(12.0)))
+        return TaskResult({**terms, **self.effort(state)}, terminated, ~terminated & (tilt < np.radians(12.0)))
 
 
 class BalancePoleEnv(TactileEnv):
     r"""Keep a pole upright that stands loosely on a sensor that looks up.
 
     A Panda holds a GelSight Mini (12 x 16 markers) pad up, 0.55 m high; on it stands a pole of 300 mm x 4 mm x 4 mm and 50 g (scene
-    `balance_pole`). Nothing but friction holds its foot, and it falls by itself once it
-    leans by more than about 1°.
+    `balance_pole`). Only friction holds its foot, and without control it falls once it leans by more than about 1°.
 
-    Action, Box(-1, 1, (2,)): what the target of the pad moves along world x and y (2 mm a step at 1); the target leads the pad by at most
+    Action, Box(-1, 1, (2,)): displacement of the pad's target along world x and y (2 mm a step at 1). The target leads the pad by at most
     20 mm along an axis and stays in x 0.35 to 0.55, y ±0.10 m.
 
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 
     Observations, float32:
 
-    - `state` (11,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+    - `state` (11,): tool's position from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
       last action (2);
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
-    - `body` (15,): of the pole, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
+    - `body` (15,): of the pole, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); only with `body_seen=True`: without it the pole is known by touch alone;
-    - `sensor_markers` (192, 2): displacements of the markers / 1 mm, which show where the pole stands. `tactile=` adds or takes
+    - `sensor_markers` (192, 2): displacements of the markers / 1 mm, which show where the pole stands. `tactile=` selects others
       (docs/rl.md);
-    - `sensor_wrench` (6,): force on the pad / 10 N and torque / 0.1 N m. A thin rod that pivots on its foot pushes it aside with
-      3/4 m g θ (for small θ), less what the pad's own acceleration asks for: the last three steps tell the lean.
+    - `sensor_wrench` (6,): force on the pad / 10 N and torque / 0.1 N m. A thin rod that pivots on its foot pushes
+      sideways with 3/4 m g θ (for small θ), less the force of the pad's own acceleration, so that three steps determine the lean.
 
-    Reward, sum of (in `info["reward_terms"]`); all but the last two are Isaac Lab's Cartpole with the tool as the cart:
+    Reward: sum of the terms in `info["reward_terms"]`; all but the last two are Isaac Lab's Cartpole with the tool as the cart.
 
     | term | value |
     | --- | --- |
@@ -83,9 +81,9 @@ class BalancePoleEnv(TactileEnv):
     | `action_rate` | −1e-4 \|a − a₋₁\|² (Isaac Lab's lift task) |
     | `joint_speed` | −1e-4 \|q̇\|² [rad/s] (the same) |
 
-    Start: the pole leans by 0 to 2° in any direction, its foot within ±1 mm of the pad's centre. The goal is where the pad starts.
-    Termination: the foot is more than 50 mm from the pad's centre (TacEx), its middle below 0.4 m or its tilt
-    above 90° (TacEx thesis).
+    Start: the pole leans by 0 to 2° in any direction, its foot within ±1 mm of the pad's centre. The goal is the pad's start.
+    Termination: the foot is more than 50 mm from the pad's centre (TacEx), the pole's centre below 0.4 m or its tilt above 90° (TacEx
+    thesis).
     Truncation: 250 steps (5 s), or the physics fails. Success: not terminated, and the tilt is below 12°.
 
     Version 0: first release.

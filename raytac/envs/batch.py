@@ -1,4 +1,4 @@
-"""``TaskBatch``: B environments of one task, without Gymnasium: actions in, observations, rewards and ends out."""
+"""``TaskBatch``: B environments of one task without Gymnasium, from actions to observations, rewards and ends."""
 
 from __future__ import annotations
 
@@ -11,40 +11,41 @@ from typing import Any
 import numpy as np
 
 from raytac.checks import check_known, check_numbers, check_whole
-from raytac.envs.steering import ACTIONS, Steering
-from raytac.envs.task import Situation, Task
-from raytac.envs.variation import VariationDraws
+from raytac.envs.action_control import ACTIONS, ActionControl
+from raytac.envs.task_rules import Task, TaskState
 from raytac.errors import InputError
 from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
-from raytac.robots.pose import pose_error
-from raytac.se3 import inverse
-from raytac.specs.press import chosen_physics
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import checked_physics, scene_physics
+from raytac.se3 import inverse, pose_error, rotations
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
+from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
 
-__all__ = ["Outcome", "TaskBatch"]
+__all__ = ["StepResult", "TaskBatch", "VariationSampler"]
 
 _LENGTH, _SPEED = 0.1, 1.0
-"""What positions [m] and speeds [m/s, rad/s] in observations are divided by."""
+"""Scales of positions [m] and speeds [m/s, rad/s] in observations."""
 
 _PITCH = 0.4e-3
-"""Spacing of the gel's nodes where no image asks for less [m]."""
+"""Spacing of the gel's nodes where no image needs a finer one [m]."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a step of B environments came to."""
+class StepResult:
+    """Result of a step of B environments; every array has the shape (B,) or (B, …)."""
 
     observation: dict[str, np.ndarray]
     reward: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
     terms: dict[str, np.ndarray]
+    """Terms of the reward by name."""
     success: np.ndarray
     failed: np.ndarray
-    """Environments whose physics broke down: truncated, their reward is 0, their observation the last that was sound."""
+    """Environments whose physics broke down: truncated, with reward 0 and their last sound observation."""
 
 
 class TaskBatch:
@@ -54,6 +55,7 @@ class TaskBatch:
 
     Attributes:
         arrays: shape, type and bounds of every observation, of one environment.
+        start_tool, start_body: poses (4, 4) of the tool and of the task's body in the scene.
         time_s: seconds spent so far in ``physics``, ``observation`` and ``reward``.
     """
 
@@ -62,8 +64,7 @@ class TaskBatch:
         task: Task,
         *,
         num_envs: int = 1,
-        physics: str | None = None,
-        pad: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
         action: str = "pose",
@@ -74,22 +75,21 @@ class TaskBatch:
         scene: str | Path | TaskScene | None = None,
         pitch: float | None = None,
     ) -> None:
-        """Compose the world; episodes begin with ``reset``.
+        """Compose the world; ``reset`` begins the episodes.
 
         Args:
-            task: what is played.
+            task: the task.
             num_envs: number of environments B.
-            physics, pad, device: as of ``TactileWorld``.
-            tactile: what is observed of every sensor: settings, or modalities alone; "task" is as the task has it; None leaves touch out,
-                and nothing of it is computed.
-            body_seen: whether the body's pose and velocity are observed; None is as the task has it.
+            physics, device: as of ``TactileWorld``.
+            tactile: observation of every sensor: settings, or modalities alone; "task" takes those of the task; with None no sensor is
+                read and nothing of it is computed.
+            body_seen: observe the body's pose and velocity; None takes the task's default.
             action: one of ``ACTIONS``.
             randomization: of sensors, cameras, bodies and mounts; None is none.
-            max_episode_steps: after which an episode is truncated; None is as the task has it.
-            seed: of what is drawn once a world, and of streams that no ``reset`` has seeded.
+            max_episode_steps: length at which an episode is truncated; None takes the task's.
+            seed: of what is drawn once for the world, and of random streams that no ``reseed`` has set.
             scene: another task scene with the same names in it: name, path or the scene itself.
-            pitch: spacing of the grid that the gel's surface is computed on [m]; None is 0.4 mm, or that of the
-                images if they are finer.
+            pitch: spacing of the grid of the gel's surface [m]; None is 0.4 mm, or that of the images if they are finer.
 
         Raises:
             InputError: a value out of its choices; as ``TactileWorld``.
@@ -100,43 +100,46 @@ class TaskBatch:
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
-        # Without touch the sensor needs no markers: the force alone is asked of the probe.
-        asked = ObservationSettings(("wrench",)) if settings is None else settings
-        rigid = chosen_physics(physics, pad, loaded.physics) == "rigid"
-        shared = self.randomization  # what is drawn once for all environments
+        # Without touch the probe gives the force alone, so that the sensor needs no markers.
+        probed = ObservationSettings(("wrench",)) if settings is None else settings
+        config = scene_physics(checked_physics(physics), loaded)
+        rigid = not config.is_simulated
+        shared = self.randomization  # drawn once for all environments
         if rigid:
             shared = replace(shared, youngs_modulus=0.0, friction=0.0)
-        probe = TactileObserver(loaded.robot.sensor, asked, num_envs=num_envs, randomization=shared, seed=seed)
+        probe = TactileObserver(loaded.robot.sensor, probed, num_envs=num_envs, randomization=shared, seed=seed)
         loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
         if not rigid:
             loaded = randomised_bodies(loaded, self.randomization, seed)
-        options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed, "sensor_options": {}}
+        options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed}
         if settings is not None:
-            options = probe.world_options()
-        options["sensor_options"] = {**options["sensor_options"], "pitch": _pitch(probe) if pitch is None else pitch}
-        self.world = TactileWorld(loaded, physics=physics, pad=pad, device=device, **options)
-        self._draws = VariationDraws(
+            options = probe.sensor_options()
+        options["pitch"] = _pitch(probe) if pitch is None else pitch
+        self.world = TactileWorld(loaded, physics=config, device=device, **options)
+        self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
         )
         self.observers: dict[str, TactileObserver] = {}
         if settings is not None:
-            quiet = replace(self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0)
+            per_episode = replace(
+                self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0
+            )
             for i, name in enumerate(self.world.sensor_names):
                 self.observers[name] = TactileObserver(
-                    probe.sensor, settings, num_envs=num_envs, randomization=quiet, seed=_own_seed(seed, i)
+                    probe.sensor, settings, num_envs=num_envs, randomization=per_episode, seed=_sensor_seed(seed, i)
                 )
-        self.steering = Steering(self.world, task.motion, action)
+        self.control = ActionControl(self.world, task.motion, action)
         self.body_seen = task.body_seen if body_seen is None else body_seen
         self.arrays = self._arrays()
         state = self.world.state()
-        self._tool = self.steering.tool()
-        self._start_tool, self._start_body = self._tool[0].copy(), state.world_from_body[task.body][0].copy()
+        self._tool = self.control.tool()
+        self.start_tool, self.start_body = self._tool[0].copy(), state.world_from_body[task.body][0].copy()
         self._start_pads = {name: poses[0].copy() for name, poses in state.world_from_pad.items()}
         self._body = state.world_from_body[task.body]
         self._speed, self._body_speed = np.zeros((num_envs, 3)), np.zeros((num_envs, 6))
         self._goal = np.zeros((num_envs, 3))
         self._steps = np.zeros(num_envs, int)
-        self._action = np.zeros((num_envs, self.steering.size))
+        self._action = np.zeros((num_envs, self.control.size))
         self._begun = np.zeros(num_envs, bool)
         self.time_s = {"physics": 0.0, "observation": 0.0, "reward": 0.0}
 
@@ -145,123 +148,163 @@ class TaskBatch:
         """Duration of a step [s]."""
         return self.world.scene.control_timestep
 
+    # --- state, for policies that are written by hand ---------------------------------------------------------------------------
+
+    @property
+    def tool(self) -> np.ndarray:
+        """Poses (B, 4, 4) of the tool after the last step; an environment that failed keeps its last one."""
+        return self._tool.copy()
+
+    @property
+    def body(self) -> np.ndarray:
+        """Poses (B, 4, 4) of the task's body after the last step."""
+        return self._body.copy()
+
+    @property
+    def body_speed(self) -> np.ndarray:
+        """Mean velocity [m/s] and angular velocity [rad/s] of the body over the last step, (B, 6)."""
+        return self._body_speed.copy()
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Goal positions (B, 3) [m]."""
+        return self._goal.copy()
+
+    @property
+    def action(self) -> np.ndarray:
+        """Last actions (B, k); 0 after a reset."""
+        return self._action.copy()
+
+    @property
+    def target(self) -> np.ndarray:
+        """Target poses (B, 4, 4) that the tool follows, with ``action="pose"``."""
+        return self.control.target
+
+    # --- episodes --------------------------------------------------------------------------------------------------------------
+
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Start the streams of cameras, markers, bodies and mounts of environments anew; the next ``reset`` draws from them."""
-        self._draws.reseed(envs, seeds)
+        """Seed the random streams of cameras, markers, bodies and mounts; the next ``reset`` draws from them."""
+        self._variations.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
-            own = [_own_seed(seed, i) for seed in seeds]
-            observer.reseed(envs, own)
+            sensor_seeds = [_sensor_seed(seed, i) for seed in seeds]
+            observer.reseed(envs, sensor_seeds)
             if observer.settings.needs_markers:
-                self.world.sensors[name].marker_tracker.reseed(envs, own)
+                self.world.sensors[name].marker_tracker.reseed(envs, sensor_seeds)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
-        """Begin episodes in environments, each with a generator of its own; observation (B, …) of all of them."""
+        """Begin episodes in environments, each with its own generator; returns the observation (B, …) of all environments."""
         envs = list(envs)
-        drawn = [self.task.start(rng, self._start_tool, self._start_body) for rng in rngs]
-        names = {name for start in drawn for name in start.bodies}
-        bodies = {name: np.stack([start.bodies[name] for start in drawn]) for name in names}
-        variation = None if self._draws.is_none else self._draws.draw(envs)
+        starts = [self.task.start(rng, self.start_tool, self.start_body) for rng in rngs]
+        names = {name for start in starts for name in start.bodies}
+        bodies = {name: np.stack([start.bodies[name] for start in starts]) for name in names}
+        variation = None if self._variations.is_none else self._variations.draw(envs)
         if variation is not None and self.task.stands_on is not None and self.task.stands_on in variation.mounting:
-            # What stands on the pad starts to the pad as it would were that mounted as it is drawn: above a tilted one, tilted too.
-            drawn_pad = self._start_pads[self.task.stands_on]
-            askew = drawn_pad @ variation.mounting[self.task.stands_on] @ inverse(drawn_pad)
-            bodies[self.task.body] = askew @ bodies[self.task.body]
+            # A body that stands on the pad keeps its pose relative to the pad, so it is shifted and tilted with the pad's mounting.
+            nominal = self._start_pads[self.task.stands_on]
+            shift = nominal @ variation.mounting[self.task.stands_on] @ inverse(nominal)
+            bodies[self.task.body] = shift @ bodies[self.task.body]
         state = self.world.reset(envs, bodies=bodies, variation=variation)
-        for b, start in zip(envs, drawn, strict=True):
+        for b, start in zip(envs, starts, strict=True):
             self._goal[b] = start.goal
         self._steps[envs], self._action[envs], self._begun[envs] = 0, 0.0, True
-        self.steering.reset(envs)
+        self.control.reset(envs)
         for observer in self.observers.values():
             observer.reset(envs)
-        self._tool[envs], self._body[envs] = self.steering.tool()[envs], state.world_from_body[self.task.body][envs]
+        self._tool[envs], self._body[envs] = self.control.tool()[envs], state.world_from_body[self.task.body][envs]
         self._speed[envs], self._body_speed[envs] = 0.0, 0.0
         return self._observe(np.isin(np.arange(self.num_envs), envs))
 
-    def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> Outcome:
+    def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> StepResult:
         """One control step of every environment.
 
-        ``unseen`` (B,): environments that are reset next, so that their sensors are not asked and draw no noise.
+        ``unseen`` (B,): environments that are reset next: their sensors are not read and draw no noise.
 
         Raises:
-            InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment), an environment
-                that was never reset, or, with simulated pads and one environment, a motion too fast to be resolved near something (it has
-                failed then; of several environments the one that moves so is in ``failed``, with a ``RuntimeWarning``).
+            InputError: actions of another shape, outside of [−1, 1] or not finite (the message names the environment); an environment
+                that was never reset; with soft pads and one environment, a motion too fast to be resolved near a contact. Of several
+                environments the one that moves so fast is marked in ``failed``, with a ``RuntimeWarning``.
         """
         actions = self._checked(actions)
-        begin = time.perf_counter()
-        state = self.world.step(self.steering.controller(actions))
+        start = time.perf_counter()
+        state = self.world.step(self.control.controller(actions))
         done = time.perf_counter()
-        self.time_s["physics"] += done - begin
+        self.time_s["physics"] += done - start
         failed = state.failed
         sound = ~failed[:, None]
-        tool, body = self.steering.tool(), state.world_from_body[self.task.body]
+        tool, body = self.control.tool(), state.world_from_body[self.task.body]
         dt = self.control_timestep
-        # What has failed stays as it was.
-        tool, body = (np.where(sound[..., None], now, was) for now, was in ((tool, self._tool), (body, self._body)))
-        self._speed, self._body_speed = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, _twist(self._body, body, dt)
+        # An environment that failed keeps its last poses.
+        tool, body = np.where(sound[..., None], tool, self._tool), np.where(sound[..., None], body, self._body)
+        self._speed, self._body_speed = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, pose_error(body, self._body) / dt
         self._tool, self._body = tool, body
         last, self._action = self._action, actions
         self._steps += 1
-        now = Situation(
-            self._tool, self._speed, self._body, self._body_speed, self._goal,
-            {name: np.nan_to_num(w) for name, w in state.wrench.items()},
-            np.where(sound, self.steering.joint_speed(), 0.0), actions, last,
-        )  # fmt: skip
+        task_state = TaskState(
+            tool=self._tool,
+            speed=self._speed,
+            body=self._body,
+            body_speed=self._body_speed,
+            goal=self._goal,
+            wrench={name: np.nan_to_num(wrench) for name, wrench in state.wrench.items()},
+            joint_speed=np.where(sound, self.control.joint_speed(), 0.0),
+            action=actions,
+            last_action=last,
+        )
         judged = time.perf_counter()
         observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
-        failed = self.world.failed  # also what only the surface shows
+        failed = self.world.failed  # includes failures that only the pad's surface shows
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
-        verdict = self.task.judge(now)
-        terms = {name: np.where(failed, 0.0, np.asarray(term, float)) for name, term in verdict.terms.items()}
+        result = self.task.evaluate(task_state)
+        terms = {name: np.where(failed, 0.0, np.asarray(term, float)) for name, term in result.terms.items()}
         reward = np.sum(list(terms.values()), axis=0)
-        terminated = verdict.terminated & ~failed
+        terminated = result.terminated & ~failed
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
         self.time_s["reward"] += time.perf_counter() - judged
-        return Outcome(observation, reward, terminated, truncated, terms, verdict.success & ~failed, failed)
+        return StepResult(observation, reward, terminated, truncated, terms, result.success & ~failed, failed)
 
     # --- observations ----------------------------------------------------------------------------------------------------------
 
     def _arrays(self) -> dict[str, ArraySpec]:
-        sizes = {"state": 9 + len(self.steering.opening_range) // 2 + self.steering.size, "goal": 3}
+        sizes = {"state": 9 + len(self.control.opening_range) // 2 + self.control.size, "goal": 3}
         if self.body_seen:
             sizes["body"] = 15
-        found = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}
+        specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}
         for name, observer in self.observers.items():
-            found |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
-        return found
+            specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
+        return specs
 
     def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of all; the sensors of environments not in ``which`` (B,) are not asked and keep what they gave last."""
+        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading."""
         tool, body, goal = self._tool, self._body, self._goal
-        at, turn = tool[:, :3, 3], pose_error(tool, self._start_tool)[:, 3:]
+        position, turn = tool[:, :3, 3], pose_error(tool, self.start_tool)[:, 3:]
         parts = [
-            (at - self._start_tool[:3, 3]) / _LENGTH,
+            (position - self.start_tool[:3, 3]) / _LENGTH,
             turn,
             self._speed / _SPEED,
-            self.steering.opening() / _LENGTH,
+            self.control.opening() / _LENGTH,
             self._action,
         ]
-        found = {"state": np.concatenate(parts, axis=1), "goal": (goal - at) / _LENGTH}
+        result = {"state": np.concatenate(parts, axis=1), "goal": (goal - position) / _LENGTH}
         if self.body_seen:
             axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)
-            found["body"] = np.concatenate([(body[:, :3, 3] - at) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
-        found = {name: values.astype(np.float32) for name, values in found.items()}
+            result["body"] = np.concatenate([(body[:, :3, 3] - position) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
+        result = {name: values.astype(np.float32) for name, values in result.items()}
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
-        looked = any(observer.settings.needs_frames for observer in self.observers.values())
-        frames = self.world.observe(envs=rows) if looked and which.any() else {}
-        state = self.world.state() if self.observers and not looked else None
+        needs_frames = any(observer.settings.needs_frames for observer in self.observers.values())
+        frames = self.world.observe(envs=rows) if needs_frames and which.any() else {}
+        state = self.world.state() if self.observers and not needs_frames else None
         for name, observer in self.observers.items():
             sensor = self.world.sensors[name] if observer.settings.difference else None
             if state is not None:
-                seen = observer.observe_wrench(state.wrench[name], state.failed, which)
+                values = observer.observe_wrench(state.wrench[name], state.failed, which)
             else:
-                seen = observer.observe(frames[name], sensor, rows) if frames else observer.last()
-            found |= {f"{name}_{modality}": values for modality, values in seen.items()}
-        return found
+                values = observer.observe(frames[name], sensor, rows) if frames else observer.last()
+            result |= {f"{name}_{modality}": array for modality, array in values.items()}
+        return result
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
-        values = check_numbers("actions", actions, (self.num_envs, self.steering.size))
+        values = check_numbers("actions", actions, (self.num_envs, self.control.size))
         wrong = ~np.isfinite(values) | (np.abs(values) > 1.0 + 1e-6)
         if wrong.any():
             env, axis = (int(i) for i in np.argwhere(wrong)[0])
@@ -273,13 +316,13 @@ class TaskBatch:
         return np.clip(values, -1.0, 1.0)
 
 
-def _own_seed(seed: int, sensor: int) -> int:
-    """Of a sensor of an environment. Environments of a vector have seeds in sequence, so a sensor's must not be the next environment's."""
+def _sensor_seed(seed: int, sensor: int) -> int:
+    """Seed of a sensor of an environment; never that of a neighbouring environment, whose seed is the next number."""
     return seed + (sensor << 64)
 
 
 def _pitch(observer: TactileObserver) -> float:
-    """As fine as the images, where there are any, between the sensor's own limit and ``_PITCH``."""
+    """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and ``_PITCH``."""
     if "rgb" not in observer.settings.modalities:
         return _PITCH
     return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
@@ -291,6 +334,66 @@ def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> Obse
     return ObservationSettings((tactile,) if isinstance(tactile, str) else tuple(tactile))
 
 
-def _twist(before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
-    """Velocity and angular velocity (B, 6) between poses (B, 4, 4)."""
-    return pose_error(after, before) / dt
+class VariationSampler:
+    """Seeded variations of B environments, from one random stream an environment: its draws do not depend on B."""
+
+    def __init__(
+        self,
+        scene: TaskScene,
+        sensors: Sequence[str],
+        randomization: Randomization,
+        *,
+        rigid: bool,
+        num_envs: int = 1,
+        seed: int = 0,
+    ) -> None:
+        """Seed the streams; draw nothing yet.
+
+        Args:
+            scene: scene whose bodies vary.
+            sensors: names of the sensors whose mounting varies.
+            randomization: half widths; ``body_mass``, ``body_friction``, ``youngs_modulus``, ``friction``, ``pad_shift`` and ``pad_turn``
+                of it are used.
+            rigid: pads are rigid. Soft pads and the bodies among them are the same in all environments, so that only their mounting is
+                drawn.
+            num_envs: number of environments B.
+            seed: environment b begins with seed + b.
+        """
+        self._randomization, self._sensors = randomization, tuple(sensors)
+        self._bodies_differ, self._gels_differ = rigid and randomization.changes_bodies, rigid and randomization.changes_gel
+        self._masses = [body.name for body in scene.bodies if body.dynamics == "free"]
+        self._frictions = [body.name for body in scene.bodies]
+        self.is_none = not (self._bodies_differ or self._gels_differ or randomization.changes_mounting)
+        """True if nothing varies."""
+        self._streams = [_stream(seed + b) for b in range(num_envs)]
+
+    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
+        """Seed the streams of environments."""
+        for b, seed in zip(envs, seeds, strict=True):
+            self._streams[b] = _stream(seed)
+
+    def draw(self, envs: Sequence[int]) -> Variation:
+        """Draw a variation of the environments named, one row each."""
+        r = self._randomization
+        # The number and order of draws does not depend on the widths, so that a width of 0 changes nothing else.
+        count = len(self._masses) + len(self._frictions) + 8 * len(self._sensors)
+        u = np.array([self._streams[b].uniform(-1.0, 1.0, count) for b in envs]).reshape(len(envs), count)
+        mass, friction, mounting = np.split(u, np.cumsum([len(self._masses), len(self._frictions)]), axis=1)
+        poses = np.repeat(np.eye(4)[None], len(envs) * len(self._sensors), axis=0).reshape(len(envs), -1, 4, 4)
+        mounting, gel = np.split(mounting.reshape(len(envs), -1, 8), [6], axis=2)
+        poses[..., :3, 3] = r.pad_shift * mounting[..., :3]
+        poses[..., :3, :3] = rotations(r.pad_turn * mounting[..., 3:])
+        factors: dict[str, dict[str, np.ndarray]] = {}
+        if self._bodies_differ:
+            factors["mass"] = {name: 1.0 + r.body_mass * mass[:, i] for i, name in enumerate(self._masses)}
+            factors["friction"] = {name: 1.0 + r.body_friction * friction[:, i] for i, name in enumerate(self._frictions)}
+        if self._gels_differ:
+            factors["gel_stiffness"] = {name: 1.0 + r.youngs_modulus * gel[:, i, 0] for i, name in enumerate(self._sensors)}
+            factors["gel_friction"] = {name: 1.0 + r.friction * gel[:, i, 1] for i, name in enumerate(self._sensors)}
+        if r.changes_mounting:
+            factors["mounting"] = {name: poses[:, i] for i, name in enumerate(self._sensors)}
+        return Variation(**factors)
+
+
+def _stream(seed: int) -> np.random.Generator:
+    return np.random.default_rng((seed, 0xB0D1))

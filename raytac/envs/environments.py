@@ -1,8 +1,11 @@
-"""Gymnasium environments over ``TaskBatch``: one, and vectors that step all of theirs at once."""
+"""Gymnasium environments over ``TaskBatch``: single ones, vectors that are stepped as one batch, and their pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import signal
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection
 from typing import Any, ClassVar
 
 import gymnasium
@@ -11,16 +14,18 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from raytac.envs.batch import Outcome, TaskBatch
-from raytac.envs.picture import EnvironmentPicture
-from raytac.envs.task import Task
+from raytac.envs.batch import StepResult, TaskBatch
+from raytac.envs.task_rules import Task
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
 
-__all__ = ["TactileEnv", "TactileVectorEnv"]
+__all__ = ["EnvironmentPicture", "TactileEnv", "TactileVectorEnv", "serve_vector"]
 
 _RENDER_MODES = ("rgb_array",)
+_GAIN = 4.0
+"""Length of a drawn arrow over the marker's displacement."""
+_PAPER, _INK, _DOT = (250, 250, 250), (43, 108, 176), (120, 120, 120)
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
 
 
@@ -42,7 +47,7 @@ def _action_space(size: int) -> gymnasium.spaces.Box:
 class TactileEnv(gymnasium.Env):
     """One environment of a task; subclasses name the task, and their docstring specifies it.
 
-    Keyword arguments are those of ``TaskBatch``, but for ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
+    Keyword arguments are those of ``TaskBatch`` without ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
     reward), ``success`` and ``failed``.
     """
 
@@ -50,20 +55,20 @@ class TactileEnv(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        """``render_mode``: None, or ``rgb_array``. Raises as ``TaskBatch``; ``InputError`` for another render mode."""
+        """Compose the world. ``render_mode`` is None or ``rgb_array``, else an ``InputError``; raises as ``TaskBatch``."""
         self.closed = False
         self.render_mode = _checked_render_mode(render_mode)
         self.batch = TaskBatch(self.task(), num_envs=1, **options)
         self.observation_space = gymnasium_space(self.batch.arrays)
-        self.action_space = _action_space(self.batch.steering.size)
+        self.action_space = _action_space(self.batch.control.size)
         self.metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 1.0 / self.batch.control_timestep}
-        self._seen: dict[str, np.ndarray] | None = None
+        self._observation: dict[str, np.ndarray] | None = None
         self._picture: EnvironmentPicture | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode; a seed makes this and all later ones repeatable, sensors' noise too. ``options`` are not used.
+        """Begin an episode; a seed makes this and all later ones repeatable, with the sensors' noise. ``options`` are ignored.
 
         Raises ``InputError`` after ``close``.
         """
@@ -71,14 +76,17 @@ class TactileEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.batch.reseed([0], [seed])
-        self._seen = self.batch.reset([0], [self.np_random])
-        return _row(self._seen), {}
+        self._observation = self.batch.reset([0], [self.np_random])
+        return _row(self._observation), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite, or after ``close``."""
+        """Take one control step.
+
+        Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite, or after ``close``.
+        """
         _check_open(self.closed)
         out = self.batch.step(np.asarray(action)[None])
-        self._seen = out.observation
+        self._observation = out.observation
         info = {
             "reward_terms": {name: float(term[0]) for name, term in out.terms.items()},
             "success": bool(out.success[0]),
@@ -87,7 +95,7 @@ class TactileEnv(gymnasium.Env):
         return _row(out.observation), float(out.reward[0]), bool(out.terminated[0]), bool(out.truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """8-bit picture (H, W, 3): the scene with the goal in green, and beside it what each sensor observes; None without a render mode.
+        """8-bit picture (H, W, 3) of the scene, the goal in green, and of the sensors beside it; None without a render mode.
 
         Raises:
             InputError: before the first ``reset``.
@@ -96,14 +104,14 @@ class TactileEnv(gymnasium.Env):
         _check_open(self.closed)
         if self.render_mode is None:
             return None
-        if self._seen is None:
+        if self._observation is None:
             raise InputError("environment", value=0, rule="must be reset before it is drawn")
         if self._picture is None:
             self._picture = EnvironmentPicture(self.batch)
-        return self._picture.draw(0, self._seen)
+        return self._picture.draw(0, self._observation)
 
     def close(self) -> None:
-        """Free the renderer, if there is one; the environment can then be neither reset nor stepped nor drawn."""
+        """Free the renderer, if there is one; the environment cannot be used after that."""
         self.closed = True
         if self._picture is not None:
             self._picture.close()
@@ -111,12 +119,12 @@ class TactileEnv(gymnasium.Env):
 
 
 class TactileVectorEnv(gymnasium.vector.VectorEnv):
-    """B environments of a task in one world: MuJoCo's states are stepped together, and each sensor sees all of them in one call.
+    """B environments of a task in one world: stepped together, and read by each sensor in one call.
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
-    ``success``, ``failed``; where environments began anew in the same step also ``final_obs`` and ``final_info`` (arrays of objects), as
-    Gymnasium's own vectors give them. Environment b is seeded with seed + b and does what the single environment of that seed does, noise
-    of cameras and markers included.
+    ``success``, ``failed``; environments that are reset in the same step also have ``final_obs`` and ``final_info`` (arrays of objects), as
+    in Gymnasium's own vectors. Environment b is seeded with seed + b and behaves as the single environment of that seed, noise of cameras
+    and markers included.
     """
 
     task: ClassVar[type[Task]]
@@ -134,8 +142,8 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             num_envs: number of environments B.
-            autoreset_mode: when an environment that has ended begins anew: in the same step, in the next one (whose action it ignores,
-                with reward 0), or only by ``reset``.
+            autoreset_mode: when an environment that has ended is reset: in the same step, in the next one (which ignores its action and
+                gives reward 0), or only by ``reset``.
             render_mode: None, or ``rgb_array``.
             options: of ``TaskBatch``.
 
@@ -151,7 +159,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = num_envs
         self.batch = TaskBatch(self.task(), num_envs=num_envs, **options)
         self.single_observation_space = gymnasium_space(self.batch.arrays)
-        self.single_action_space = _action_space(self.batch.steering.size)
+        self.single_action_space = _action_space(self.batch.control.size)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {
@@ -159,7 +167,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             "render_modes": list(_RENDER_MODES),
             "render_fps": 1.0 / self.batch.control_timestep,
         }
-        self._seen: dict[str, np.ndarray] | None = None
+        self._observation: dict[str, np.ndarray] | None = None
         self._picture: EnvironmentPicture | None = None
         self._rngs = [seeding.np_random(None)[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
@@ -179,16 +187,16 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
             if len(seeds) != self.num_envs:
                 raise InputError("seed", value=len(seeds), rule=f"must be one, or one for each of {self.num_envs} environments")
-            told = [b for b in envs if seeds[b] is not None]
-            for b in told:
+            seeded = [b for b in envs if seeds[b] is not None]
+            for b in seeded:
                 self._rngs[b] = seeding.np_random(int(seeds[b]))[0]  # type: ignore[arg-type]
-            self.batch.reseed(told, [int(seeds[b]) for b in told])  # type: ignore[arg-type]
+            self.batch.reseed(seeded, [int(seeds[b]) for b in seeded])  # type: ignore[arg-type]
         self._ended[envs] = False
-        self._seen = self._again(envs)
-        return self._seen, {}
+        self._observation = self._reset(envs)
+        return self._observation, {}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of all; an action of an environment that begins anew in this step is ignored, whatever it holds.
+        """Take one control step of all environments; the action of one that is reset in this step is ignored, whatever it holds.
 
         Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
@@ -203,7 +211,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
         success, failed = out.success.copy(), out.failed.copy()
         if len(late):
-            observation = self._again(late)
+            observation = self._reset(late)
             for values in (reward, terminated, truncated, success, failed, *terms.values()):
                 values[late] = 0
         infos = _infos(self.num_envs, {"reward_terms": terms, "success": success, "failed": failed})
@@ -211,9 +219,9 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
             ended = np.flatnonzero(self._ended)
             infos |= self._final(out, ended)
-            observation = self._again(ended)
+            observation = self._reset(ended)
             self._ended[:] = False
-        self._seen = observation
+        self._observation = observation
         return observation, reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -221,11 +229,11 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         _check_open(self.closed)
         if self.render_mode is None:
             return None
-        if self._seen is None:
+        if self._observation is None:
             raise InputError("environment", value=0, rule="must be reset before it is drawn")
         if self._picture is None:
             self._picture = EnvironmentPicture(self.batch)
-        return tuple(self._picture.draw(b, self._seen) for b in range(self.num_envs))
+        return tuple(self._picture.draw(b, self._observation) for b in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderer, if there is one."""
@@ -233,18 +241,124 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
             self._picture.close()
             self._picture = None
 
-    def _again(self, envs: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
+    def _reset(self, envs: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
         return self.batch.reset([int(b) for b in envs], [self._rngs[b] for b in envs])
 
-    def _final(self, out: Outcome, ended: np.ndarray) -> dict[str, Any]:
-        last, told = np.full(self.num_envs, None, object), np.zeros(self.num_envs, bool)
+    def _final(self, out: StepResult, ended: np.ndarray) -> dict[str, Any]:
+        last, has_ended = np.full(self.num_envs, None, object), np.zeros(self.num_envs, bool)
         for b in ended:
             last[b] = {name: values[b].copy() for name, values in out.observation.items()}
-        told[ended] = True
-        terms = {name: np.where(told, term, 0.0) for name, term in out.terms.items()}
-        final = {"reward_terms": terms, "success": out.success & told, "failed": out.failed & told}
+        has_ended[ended] = True
+        terms = {name: np.where(has_ended, term, 0.0) for name, term in out.terms.items()}
+        final = {"reward_terms": terms, "success": out.success & has_ended, "failed": out.failed & has_ended}
         info = _infos(self.num_envs, final)
-        return {"final_obs": last, "_final_obs": told, "final_info": info, "_final_info": told.copy()}
+        return {"final_obs": last, "_final_obs": has_ended, "final_info": info, "_final_info": has_ended.copy()}
+
+
+def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
+    """Make a vector in this process and reply to commands until the pipe is closed; no learner's library is imported.
+
+    A command is ``("reset", seeds)`` or ``("step", actions)``. A reply is (success, return value or error, traceback). The first reply is
+    sent without a command: observation and action space of one environment. Ctrl-C is left to the caller.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        env = kind(num_envs, **options)
+        pipe.send((True, (env.single_observation_space, env.single_action_space), ""))
+    except Exception as error:
+        pipe.send((False, error, traceback.format_exc()))
+        return
+    commands: dict[str, Callable[[Any], Any]] = {"reset": lambda seeds: env.reset(seed=seeds), "step": env.step}
+    while True:
+        try:
+            command, value = pipe.recv()
+        except (EOFError, ConnectionResetError):
+            return
+        try:
+            reply = True, commands[command](value), ""
+        except Exception as error:
+            reply = False, error, traceback.format_exc()
+        try:
+            pipe.send(reply)
+        except (BrokenPipeError, ConnectionResetError):
+            return
+
+
+class EnvironmentPicture:
+    """Pictures of a batch: the scene, and beside it what each sensor observes.
+
+    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, pad frame with x to the right and y up.
+    """
+
+    def __init__(self, batch: TaskBatch, *, height: int = 240) -> None:
+        """Open a renderer of the scene for pictures of a ``height`` [px]. Raises as ``SceneCamera``."""
+        from raytac.world.scene_camera import SceneCamera
+
+        self._batch, self._height = batch, height
+        # Near enough to see a pad of two centimetres, far enough that tool and body, a long pole too, stay in view.
+        tool, body = batch.start_tool[:3, 3], batch.start_body[:3, 3]
+        distance = 0.45 + 1.5 * float(np.linalg.norm(tool - body))
+        self._camera = SceneCamera(
+            batch.world, resolution=(4 * height // 3, height), distance=distance, lookat=0.5 * (tool + body)
+        )
+
+    def draw(self, env: int, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """8-bit picture (H, W, 3) of an environment, the goal in green; ``observation`` (B, …) is the batch's last one."""
+        columns = [self._camera.draw(env, [self._batch.goal[env]])]
+        for name in self._batch.observers:
+            panels = []
+            if f"{name}_rgb" in observation:
+                panels.append(_enlarged(observation[f"{name}_rgb"][env][..., -3:], self._height))
+            if f"{name}_markers" in observation:
+                panels.append(self._markers(name, env, observation[f"{name}_markers"][env]))
+            if panels:
+                columns.append(_column(panels, self._height))
+        return np.concatenate(columns, axis=1)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._camera.close()
+
+    def _markers(self, name: str, env: int, values: np.ndarray) -> np.ndarray:
+        from PIL import Image, ImageDraw
+
+        sensor = self._batch.world.sensors[name]
+        rest = sensor.marker_tracker.pattern.rest
+        rest = rest[env if len(rest) > 1 else 0][:, :2]
+        scale = self._batch.observers[name].settings.scale("markers")
+        displacement = values.reshape(-1, *rest.shape)[-1] * np.asarray(scale)  # the last of a stack [m]
+        size = np.array(sensor.spec.gelpad.size[:2])
+        factor = self._height / float(size.max())
+        width, height = (int(n) for n in np.ceil(factor * size))
+        image = Image.new("RGB", (width, height), _PAPER)
+        draw = ImageDraw.Draw(image)
+
+        def pixel(point: np.ndarray) -> tuple[float, float]:
+            return width / 2 + factor * float(point[0]), height / 2 - factor * float(point[1])
+
+        for start, arrow in zip(rest, displacement, strict=True):
+            x, y = pixel(start)
+            draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_DOT)
+            draw.line([(x, y), pixel(start + _GAIN * arrow)], fill=_INK, width=2)
+        return np.asarray(image)
+
+
+def _enlarged(image: np.ndarray, height: int) -> np.ndarray:
+    from PIL import Image
+
+    width = max(1, round(height * image.shape[1] / image.shape[0]))
+    return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _column(panels: list[np.ndarray], height: int) -> np.ndarray:
+    """Panels of equal width one above the other, scaled to ``height`` [px]."""
+    from PIL import Image
+
+    width = max(panel.shape[1] for panel in panels)
+    sized = [Image.fromarray(p).resize((width, max(1, round(p.shape[0] * width / p.shape[1])))) for p in panels]
+    stacked = np.concatenate([np.asarray(image) for image in sized])
+    width = max(1, round(width * height / len(stacked)))
+    return np.asarray(Image.fromarray(stacked).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -252,9 +366,9 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
-    """With the masks beside every entry by which Gymnasium's vectors tell which environments have it."""
-    found: dict[str, Any] = {}
+    """Entries with the masks that Gymnasium's vectors put beside them: the environments that have the entry."""
+    result: dict[str, Any] = {}
     for name, value in values.items():
-        found[name] = _infos(num_envs, value) if isinstance(value, dict) else value
-        found[f"_{name}"] = np.ones(num_envs, bool)
-    return found
+        result[name] = _infos(num_envs, value) if isinstance(value, dict) else value
+        result[f"_{name}"] = np.ones(num_envs, bool)
+    return result

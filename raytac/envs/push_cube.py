@@ -7,13 +7,14 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed, turned
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.se3 import pose, rotations
 
 __all__ = ["PushCube", "PushCubeEnv", "PushCubeVectorEnv"]
 
 
 class PushCube(Task):
-    """The numbers of ``PushCubeEnv``, as code."""
+    """Rules of ``PushCubeEnv``, as code."""
 
     scene: ClassVar = "push_cube"
     body: ClassVar = "cube"
@@ -22,26 +23,25 @@ class PushCube(Task):
     body_seen: ClassVar = True
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        at = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
-        begin = placed(body, at)
-        begin[:3, :3] = turned(np.array([0.0, 0.0, 1.0]), rng.uniform(-0.3, 0.3)) @ body[:3, :3]
+        position = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
+        rotation = rotations(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])) @ body[:3, :3]
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.10)
-        goal = at + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
-        return Start(goal, {"cube": begin})
+        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Start(goal, {"cube": pose(rotation, position)})
 
-    def judge(self, now: Situation) -> Verdict:
-        cube = now.body[:, :3, 3]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        cube = state.body[:, :3, 3]
         top = cube + np.array([0.0, 0.0, 0.02])
-        reach, rest = far(now.tool[:, :3, 3], top), far(cube[:, :2], now.goal[:, :2])
-        force = -now.wrench["sensor"][:, 2]
+        reach, distance = distances(state.tool[:, :3, 3], top), distances(cube[:, :2], state.goal[:, :2])
+        force = -state.wrench["sensor"][:, 2]
         terms = {
             "reaching": near(reach, 0.1),
             "touching": 1.0 * ((force > 0.5) & (force < 10.0)),
-            "target": 4.0 * near(rest, 0.1),
-            "target_fine": 4.0 * near(rest, 0.02),
+            "target": 4.0 * near(distance, 0.1),
+            "target_fine": 4.0 * near(distance, 0.02),
         }
-        terminated = far(now.tool[:, :3, 3], cube) > 1.0
-        return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.01)
+        terminated = distances(state.tool[:, :3, 3], cube) > 1.0
+        return TaskResult({**terms, **self.effort(state)}, terminated, distance < 0.01)
 
 
 class PushCubeEnv(TactileEnv):
@@ -50,32 +50,32 @@ class PushCubeEnv(TactileEnv):
     A Panda carries a GelSight Mini (9 x 11 markers) pad down over a cube of 40 mm and 50 g on a table (scene `push_cube`). The pad must
     press hard enough to hold the cube by friction and softly enough to let it slide.
 
-    Action, Box(-1, 1, (3,)): what the target of the pad moves along world x, y (3 mm a step at 1) and z (1 mm); the target leads the pad
+    Action, Box(-1, 1, (3,)): displacement of the pad's target along world x, y (3 mm a step at 1) and z (1 mm). The target leads the pad
     by at most 6 mm along an axis and stays in x 0.25 to 0.65, y ±0.25, z 0.035 to 0.10 m.
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 
     Observations, float32:
 
-    - `state` (12,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+    - `state` (12,): tool's position from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
       last action (3);
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
-    - `body` (15,): of the cube, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
+    - `body` (15,): of the cube, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); there unless `body_seen=False`;
-    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` adds or takes (docs/rl.md).
+    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
-    Reward, sum of (in `info["reward_terms"]`); d distances in m, a the action, q̇ joint speeds in rad/s:
+    Reward: sum of the terms in `info["reward_terms"]`; d distances in m, a the action, q̇ joint speeds in rad/s.
 
     | term | value | source |
     | --- | --- | --- |
-    | `reaching` | 1 − tanh(d(pad, middle of the cube's top) / 0.1) | form of the TacEx thesis, width of Isaac Lab's lift task |
+    | `reaching` | 1 − tanh(d(pad, centre of the cube's top) / 0.1) | form of the TacEx thesis, width of Isaac Lab's lift task |
     | `touching` | 1 if the pad is pressed with 0.5 to 10 N | form of TacEx's ball rolling; constants ours |
     | `target` | 4 (1 − tanh(d_xy(cube, goal) / 0.1)) | form of the TacEx thesis; constants ours |
     | `target_fine` | 4 (1 − tanh(d_xy(cube, goal) / 0.02)) | ours |
     | `action_rate` | −1e-4 \|a − a₋₁\|² | Isaac Lab's lift task |
     | `joint_speed` | −1e-4 \|q̇\|² | the same |
 
-    Start: the pad 2 mm above the middle of the cube's place, which is drawn within ±10 mm along x and y and turned by up to ±0.3 rad; the
-    goal lies 30 to 100 mm from it in any direction.
+    Start: the pad is 2 mm above the centre of the cube's position in the scene. The cube is shifted by up to ±10 mm along x and y and
+    turned by up to ±0.3 rad; the goal lies 30 to 100 mm from it in any direction.
     Termination: the pad is more than 1 m from the cube (TacEx thesis). Truncation: 150 steps (3 s), or the physics fails.
     Success: the cube is within 10 mm of the goal.
 

@@ -7,13 +7,14 @@ from typing import ClassVar
 import numpy as np
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task import Motion, Situation, Start, Task, Verdict, far, near, placed
+from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.se3 import pose
 
 __all__ = ["RollBall", "RollBallEnv", "RollBallVectorEnv"]
 
 
 class RollBall(Task):
-    """The numbers of ``RollBallEnv``, as code."""
+    """Rules of ``RollBallEnv``, as code."""
 
     scene: ClassVar = "roll_ball"
     body: ClassVar = "ball"
@@ -22,64 +23,65 @@ class RollBall(Task):
     body_seen: ClassVar = False
 
     def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        at = body[:3, 3] + [*rng.uniform(-2e-3, 2e-3, 2), 0.0]
+        position = body[:3, 3] + [*rng.uniform(-2e-3, 2e-3, 2), 0.0]
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(5e-3, 10e-3)
-        return Start(at + distance * np.array([np.cos(angle), np.sin(angle), 0.0]), {"ball": placed(body, at)})
+        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Start(goal, {"ball": pose(body[:3, :3], position)})
 
-    def judge(self, now: Situation) -> Verdict:
-        ball, pad = now.body[:, :3, 3], now.tool[:, :3, 3]
-        aside, rest = far(ball[:, :2], pad[:, :2]), far(ball[:, :2], now.goal[:, :2])
-        force = -now.wrench["sensor"][:, 2]
+    def evaluate(self, state: TaskState) -> TaskResult:
+        ball, pad = state.body[:, :3, 3], state.tool[:, :3, 3]
+        aside, distance = distances(ball[:, :2], pad[:, :2]), distances(ball[:, :2], state.goal[:, :2])
+        force = -state.wrench["sensor"][:, 2]
         touching = (force > 0.05) & (force < 5.0)
         terms = {
             "touching": 0.25 * touching,
             "aside": -0.05 * np.square(100.0 * aside),
             "lost_height": -15.0 * (ball[:, 2] > 0.025),
-            "goal_wide": 0.75 * near(rest, 0.6),
-            "goal": 1.25 * near(rest, 0.2),
-            "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(rest / 0.08))),
-            "reached": 5.0 * ((rest < 0.002) & touching),
+            "goal_wide": 0.75 * near(distance, 0.6),
+            "goal": 1.25 * near(distance, 0.2),
+            "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(distance / 0.08))),
+            "reached": 5.0 * ((distance < 0.002) & touching),
         }
-        off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (rest > 0.75)
+        off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
         terminated = off | (aside > 0.015) | (pad[:, 2] < 0.002)
-        return Verdict({**terms, **self.effort(now)}, terminated, rest < 0.002)
+        return TaskResult({**terms, **self.effort(state)}, terminated, distance < 0.002)
 
 
 class RollBallEnv(TactileEnv):
     r"""Roll a ball between a pad and a table to a goal.
 
     A Panda carries a GelSight Mini (9 x 11 markers) pad down over a steel ball of 5 mm radius (scene `roll_ball`). The ball moves half as
-    far as the pad and is seen by touch alone: TacEx's own tuned task.
+    far as the pad and is known by touch alone, as in TacEx's tuned task.
 
-    Action, Box(-1, 1, (3,)): what the target of the pad moves along world x, y (2 mm a step at 1) and z (1 mm); the target leads the pad
+    Action, Box(-1, 1, (3,)): displacement of the pad's target along world x, y (2 mm a step at 1) and z (1 mm). The target leads the pad
     by at most 4 mm along an axis and stays in x 0.40 to 0.50, y ±0.05, z 0.007 to 0.02 m.
     `action="joints"`: see docs/rl.md. A step is 20 ms.
 
     Observations, float32:
 
-    - `state` (12,): tool's place from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
+    - `state` (12,): tool's position from its start / 0.1 m (3), its rotation vector from the start [rad] (3), its velocity [m/s] (3),
       last action (3);
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
-    - `body` (15,): of the ball, place from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
+    - `body` (15,): of the ball, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); only with `body_seen=True`;
-    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` adds or takes (docs/rl.md).
+    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
-    Reward, sum of (in `info["reward_terms"]`), TacEx's ball rolling with its constants where nothing else is said; d = d_xy(ball, goal),
-    touching: the pad is pressed with 0.05 to 5 N (TacEx: a depth of 0.5 to 4 mm):
+    Reward: sum of the terms in `info["reward_terms"]`, those of TacEx's ball rolling, with its constants unless a difference is given.
+    d = d_xy(ball, goal). Touching: the pad is pressed with 0.05 to 5 N (TacEx: a depth of 0.5 to 4 mm).
 
     | term | value |
     | --- | --- |
     | `touching` | 0.25 if touching |
     | `aside` | −0.05 (d_xy(ball, pad) in cm)² |
-    | `lost_height` | −15 if the ball's middle is above 25 mm |
+    | `lost_height` | −15 if the ball's centre is above 25 mm |
     | `goal_wide`, `goal`, `goal_narrow` | 0.75 (1 − tanh(d / 0.6)), 1.25 (1 − tanh(d / 0.2)), 1.75 (1 − tanh²(d / 0.08)) |
     | `reached` | 5 if d < 2 mm (TacEx: 5 mm, for goals half a metre away) and touching |
     | `action_rate`, `joint_speed` | −1e-4 \|a − a₋₁\|², −1e-4 \|q̇\|² |
 
     TacEx's penalty of a tilted pad is left out, since no action tilts it.
 
-    Start: the pad 0.95 mm above the ball's place in the scene, the ball within ±2 mm of it along x and y; the goal 5 to 10 mm from the ball
-    in any direction, so that one stroke of the pad reaches it (TacEx draws goals over half a metre).
+    Start: the pad is 0.95 mm above the ball's position in the scene, the ball within ±2 mm of it along x and y. The goal is 5 to 10 mm from
+    the ball in any direction, so that one stroke of the pad reaches it (TacEx draws goals over half a metre).
     Termination (TacEx): the ball's x is not in 0.2 to 0.8 m, |y| > 0.4 m, d > 0.75 m, d_xy(ball, pad) > 15 mm, or the pad is below 2 mm.
     Truncation: 150 steps (3 s), or the physics fails. Success: d < 2 mm.
 

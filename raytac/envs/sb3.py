@@ -1,4 +1,4 @@
-"""Environments for stable-baselines3, which this module imports: a vector of ours as its ``VecEnv``, and several of them in processes."""
+"""Environments for stable-baselines3: a vector of ours as its ``VecEnv``, and several of them in processes."""
 
 # pyright: reportMissingImports=false
 # (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
@@ -16,8 +16,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from raytac.envs.environments import TactileVectorEnv
-from raytac.envs.serving import serve
+from raytac.envs.environments import TactileVectorEnv, serve_vector
 from raytac.errors import InputError
 
 __all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
@@ -25,12 +24,15 @@ __all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Observations = dict[str, np.ndarray]
-Answer = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
+Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Processes started within have one thread of BLAS: small matrices gain nothing from more, and many processes share the cores."""
+    """Give processes that start within one thread of BLAS each: small matrices gain nothing from more.
+
+    Many processes share the cores.
+    """
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
     try:
@@ -44,13 +46,13 @@ def one_thread() -> Iterator[None]:
 
 
 class _DictVecEnv(VecEnv):
-    """What both have in common: attributes by name, and no wrappers within."""
+    """Common part of both: attributes by name, and no wrappers."""
 
     def close(self) -> None:
-        """Nothing is held but memory."""
+        """Free nothing: there is only memory."""
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """The attribute of the vector, once for every environment asked for."""
+        """Attribute of the vector, repeated for every environment of ``indices``."""
         return [self._attribute(attr_name)] * len(list(self._get_indices(indices)))
 
     def _attribute(self, name: str) -> Any:
@@ -59,15 +61,15 @@ class _DictVecEnv(VecEnv):
         raise AttributeError(name)
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Refused: environments of one world share everything."""
+        """Raise ``InputError``: environments of one world share everything."""
         raise InputError("attr_name", value=attr_name, rule="cannot be set: environments of a vector share their world")
 
     def env_method(self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **kwargs: Any) -> list[Any]:
-        """Refused: environments of one world have no methods of their own."""
+        """Raise ``InputError``: environments of one world have no methods of their own."""
         raise InputError("method_name", value=method_name, rule="cannot be called: environments of a vector share their world")
 
     def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """None is."""
+        """False for every environment."""
         return [False] * len(list(self._get_indices(indices)))
 
 
@@ -75,12 +77,12 @@ class TactileVecEnv(_DictVecEnv):
     """A ``TactileVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
 
     ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. One that
-    ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not count on what would have come after.
+    ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not expect a return from beyond it.
     ``seed(s)`` before ``reset`` seeds environment b with s + b.
     """
 
     def __init__(self, env: TactileVectorEnv) -> None:
-        """Raises ``InputError`` for a vector that does not begin episodes anew in the same step, as a ``VecEnv`` must."""
+        """Wrap ``env``. Raises ``InputError`` for a vector that does not reset environments in the step in which they end."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
             raise InputError("autoreset_mode", value=mode.value, rule="must be 'SameStep' for stable-baselines3")
@@ -89,7 +91,7 @@ class TactileVecEnv(_DictVecEnv):
         self._actions = np.zeros((env.num_envs, *env.single_action_space.shape))  # type: ignore[misc]
 
     def reset(self) -> Observations:
-        """Begin episodes in all; those that ``seed`` has told a seed begin with it."""
+        """Begin episodes in all environments, with the seeds that ``seed`` has set."""
         observation, _ = self.env.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
@@ -99,16 +101,15 @@ class TactileVecEnv(_DictVecEnv):
         """Keep the actions for ``step_wait``."""
         self._actions = actions
 
-    def step_wait(self) -> Answer:
-        """Raises ``InputError`` for actions that are not finite or out of bounds; it names the environment."""
-        return _answer(*self.env.step(self._actions))
+    def step_wait(self) -> Step:
+        """Step with the actions kept. Raises ``InputError``, naming the environment, for one that is not finite or out of bounds."""
+        return _vec_env_step(*self.env.step(self._actions))
 
 
 class ProcessVecEnv(_DictVecEnv):
-    """``processes`` vectors side by side, each in a process with a world of its own: one ``VecEnv`` of all their environments.
+    """One ``VecEnv`` of ``processes`` vectors, each in a process with a world of its own.
 
-    Physics runs on one core a world, so this is how a machine of many cores is used. Ctrl-C reaches
-    the caller alone, and workers end with it.
+    The physics of a world runs on one core, so this uses a machine of many cores. Ctrl-C reaches the caller alone, and workers end with it.
     """
 
     def __init__(self, kind: type[TactileVectorEnv], *, num_envs: int, processes: int, seed: int = 0, **options: Any) -> None:
@@ -118,8 +119,8 @@ class ProcessVecEnv(_DictVecEnv):
             kind: the task's vector, such as ``PushCubeVectorEnv``.
             num_envs: number of environments in all, the same number in each process.
             processes: number of processes.
-            seed: of what is drawn once a world; process k has seed + k num_envs / processes, so that an environment's streams, until
-                ``seed`` gives it others, are those of its place among all and no two have the same.
+            seed: of what is drawn once for a world. Process k has seed + k num_envs / processes, so that no two environments have the same
+                random stream.
             options: of ``TaskBatch``; they must pickle.
 
         Raises:
@@ -135,12 +136,12 @@ class ProcessVecEnv(_DictVecEnv):
             for k in range(processes):
                 mine, theirs = context.Pipe()
                 arguments = theirs, kind, each, {**options, "seed": seed + k * each}
-                worker = context.Process(target=serve, args=arguments, daemon=True, name=f"raytac-envs-{k}")
+                worker = context.Process(target=serve_vector, args=arguments, daemon=True, name=f"raytac-envs-{k}")
                 worker.start()
                 theirs.close()
                 self._workers.append((worker, mine))
         self._each = each
-        spaces = self._answers()
+        spaces = self._replies()
         super().__init__(num_envs, *spaces[0])
 
     def reset(self) -> Observations:
@@ -149,10 +150,10 @@ class ProcessVecEnv(_DictVecEnv):
             pipe.send(("reset", self._seeds[k * self._each : (k + 1) * self._each]))
         self._reset_seeds()
         self._reset_options()
-        return _joined([observation for observation, _ in self._answers()])
+        return _joined([observation for observation, _ in self._replies()])
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Set all processes going. Raises ``InputError`` for actions that are not finite; it names the environment."""
+        """Start the step in all processes. Raises ``InputError``, naming the environment, for actions that are not finite."""
         actions = np.asarray(actions)
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0, 0])
@@ -160,9 +161,10 @@ class ProcessVecEnv(_DictVecEnv):
         for (_, pipe), rows in zip(self._workers, np.split(actions, len(self._workers)), strict=True):
             pipe.send(("step", rows))
 
-    def step_wait(self) -> Answer:
-        """Raises as ``TactileVecEnv.step_wait``; the message names the process and which environments it has."""
-        observations, rewards, dones, infos = zip(*(_answer(*told) for told in self._answers()), strict=True)
+    def step_wait(self) -> Step:
+        """Wait for the step. Raises as ``TactileVecEnv.step_wait``; the message names the process and its environments."""
+        steps = [_vec_env_step(*reply) for reply in self._replies()]
+        observations, rewards, dones, infos = zip(*steps, strict=True)
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
 
     def close(self) -> None:
@@ -174,34 +176,34 @@ class ProcessVecEnv(_DictVecEnv):
                 worker.terminate()
         self._workers = []
 
-    def _answers(self) -> list[Any]:
-        """One answer of every process; all are read before an error is raised, so that none is taken for a later one's."""
-        answers = []
+    def _replies(self) -> list[Any]:
+        """One reply of every process. All are read before an error is raised, so that none is mistaken for a later one."""
+        replies = []
         for k, (worker, pipe) in enumerate(self._workers):
             try:
-                answers.append(pipe.recv())
+                replies.append(pipe.recv())
             except (EOFError, ConnectionResetError):
-                answers.append((False, RuntimeError(f"process {k} ended by itself, exit code {worker.exitcode}"), ""))
-        for k, (fine, value, where) in enumerate(answers):
+                replies.append((False, RuntimeError(f"process {k} ended by itself, exit code {worker.exitcode}"), ""))
+        for k, (fine, value, where) in enumerate(replies):
             if not fine:
                 name = f"environments {k * self._each} to {(k + 1) * self._each - 1}, in process {k}"
                 value.add_note(f"raised by {name}:\n{where}")
                 raise value
-        return [value for _, value, _ in answers]
+        return [value for _, value, _ in replies]
 
 
 def _joined(parts: Sequence[Observations]) -> Observations:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _answer(
-    observation: Observations, reward: np.ndarray, terminated: np.ndarray, truncated: np.ndarray, told: dict[str, Any]
-) -> Answer:
-    """A vector's step as a ``VecEnv`` tells it."""
+def _vec_env_step(
+    observation: Observations, reward: np.ndarray, terminated: np.ndarray, truncated: np.ndarray, info: dict[str, Any]
+) -> Step:
+    """Step of a Gymnasium vector in the form of a ``VecEnv``."""
     infos: list[dict[str, Any]] = [
         {"success": bool(success), "failed": bool(failed), "TimeLimit.truncated": bool(cut and not failed)}
-        for success, failed, cut in zip(told["success"], told["failed"], truncated, strict=True)
+        for success, failed, cut in zip(info["success"], info["failed"], truncated, strict=True)
     ]
     for b in np.flatnonzero(terminated | truncated):
-        infos[b]["terminal_observation"] = told["final_obs"][b]
+        infos[b]["terminal_observation"] = info["final_obs"][b]
     return observation, reward.astype(np.float32), terminated | truncated, infos

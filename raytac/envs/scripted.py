@@ -1,4 +1,4 @@
-"""Policies by hand, from the state that the batch knows: they show that a task can be done, and what that earns."""
+"""Policies written by hand from the state of the batch: they show that a task can be done, and the return that this gives."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from raytac.envs.batch import TaskBatch
 __all__ = ["SCRIPTED", "balance_pole", "lift_cube", "push_cube", "roll_ball"]
 
 GAINS = np.array([-5.2, -5.0, -32.4, -4.6])
-"""Of x, ẋ, θ, θ̇."""
+"""Feedback gains of x, ẋ, θ, θ̇ (see ``balance_pole``)."""
 
 
 def push_cube(batch: TaskBatch) -> np.ndarray:
-    """Press with some 5 N, then go where the cube is missed, 2 mm a step at most."""
-    tool, cube, goal = batch._tool[:, :3, 3], batch._body[:, :3, 3], batch._goal
+    """Press with some 5 N, then move along the cube's error, 2 mm a step at most."""
+    cube = batch.body[:, :3, 3]
     force = -batch.world.state().wrench["sensor"][:, 2]
     pressed = force > 0.5
-    missing = np.where(pressed[:, None], goal - cube, 0.0)
-    action = np.zeros((len(tool), 3))
-    action[:, :2] = np.clip(missing[:, :2] / 0.012, -0.67, 0.67)
+    error = np.where(pressed[:, None], batch.goal - cube, 0.0)
+    action = np.zeros((len(cube), 3))
+    action[:, :2] = np.clip(error[:, :2] / 0.012, -0.67, 0.67)
     action[:, 2] = np.clip(0.05 * (force - 6.0), -0.4, 0.3)
     return action
 
 
 def roll_ball(batch: TaskBatch) -> np.ndarray:
     """Press with about 0.5 N and move the pad twice as far as the ball has to go."""
-    ball, goal = batch._body[:, :3, 3], batch._goal
+    ball, goal = batch.body[:, :3, 3], batch.goal
     force = -batch.world.state().wrench["sensor"][:, 2]
     action = np.zeros((len(ball), 3))
     action[:, :2] = np.where((force > 0.1)[:, None], np.clip((goal - ball)[:, :2] / 4e-3, -0.4, 0.4), 0.0)
@@ -39,25 +39,25 @@ def roll_ball(batch: TaskBatch) -> np.ndarray:
 
 def balance_pole(batch: TaskBatch) -> np.ndarray:
     """A linear quadratic regulator of a pole on a cart: state x, ẋ, θ, θ̇, input ẍ; thin rod, θ̈ = 3g/2L θ − 3/2L ẍ."""
-    axis, spin = batch._body[:, :3, 2], batch._body_speed[:, 3:]
+    axis, spin = batch.body[:, :3, 2], batch.body_speed[:, 3:]
     lean, rate = axis[:, :2], np.stack([spin[:, 1], -spin[:, 0]], axis=1)
-    commanded = batch._action[:, :2] * 2e-3 / batch.control_timestep
-    away = batch.steering._target[:, :2, 3] - batch._start_tool[:2, 3]
-    push = np.einsum("k,kbi->bi", GAINS, np.stack([away, commanded, lean, rate]))
+    commanded = batch.action[:, :2] * 2e-3 / batch.control_timestep
+    position = batch.target[:, :2, 3] - batch.start_tool[:2, 3]
+    push = np.einsum("k,kbi->bi", GAINS, np.stack([position, commanded, lean, rate]))
     return np.clip((commanded - push * batch.control_timestep) * batch.control_timestep / 2e-3, -1.0, 1.0)
 
 
 def lift_cube(batch: TaskBatch) -> np.ndarray:
-    """Over the cube, down, close, to the goal."""
-    tool, cube, goal = batch._tool[:, :3, 3], batch._body[:, :3, 3], batch._goal
+    """Move over the cube, go down, close, carry it to the goal."""
+    tool, cube, goal = batch.tool[:, :3, 3], batch.body[:, :3, 3], batch.goal
     force = np.minimum(*(-batch.world.state().wrench[name][:, 2] for name in ("left", "right")))
     off = cube - tool
-    over, held = np.linalg.norm(off[:, :2], axis=1) < 4e-3, force > 4.0
+    over, grasped = np.linalg.norm(off[:, :2], axis=1) < 4e-3, force > 4.0
     down = tool[:, 2] < cube[:, 2] + 3e-3
-    target = np.where(held[:, None], goal - cube, np.where(over[:, None], off, off * [1.0, 1.0, 0.0]))
+    target = np.where(grasped[:, None], goal - cube, np.where(over[:, None], off, off * [1.0, 1.0, 0.0]))
     action = np.zeros((len(tool), 4))
-    action[:, :3] = np.clip(target / 5e-3, -1.0, 1.0) * np.where(held, 0.4, 1.0)[:, None]
-    action[:, 3] = np.where(held, np.where(force > 12.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
+    action[:, :3] = np.clip(target / 5e-3, -1.0, 1.0) * np.where(grasped, 0.4, 1.0)[:, None]
+    action[:, 3] = np.where(grasped, np.where(force > 12.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
     return action
 
 

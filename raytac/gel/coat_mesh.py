@@ -1,8 +1,9 @@
-"""The coat as a triangle mesh that moves with the gel: what a simulated pad knows of its skin besides the height."""
+"""The coat as a triangle mesh: a soft pad's surface at rest and deformed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -41,14 +42,25 @@ class CoatMesh:
         """Rows and columns of vertices (ny, nx)."""
         return len(self.lines_y), len(self.lines_x)
 
+    @cached_property
+    def face_areas(self) -> np.ndarray:
+        """Area of each face at rest [m²], shape (F,)."""
+        a, b, c = (self.rest[self.faces[:, k]] for k in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    @cached_property
+    def vertex_areas(self) -> np.ndarray:
+        """A third of the areas of the faces around each vertex [m²], shape (V,)."""
+        return np.bincount(self.faces.ravel(), np.repeat(self.face_areas / 3.0, 3), len(self.rest))
+
 
 @dataclass(frozen=True, repr=False)
 class DeformedCoat:
-    """The coat of B pads at one instant; ``GelSurface.coat`` holds it wherever the physics simulates the gel, None elsewhere."""
+    """The coat of B pads at one instant: ``GelSurface.coat`` of a soft pad."""
 
     mesh: CoatMesh
     positions: np.ndarray
-    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (the barrier's stand-off is taken out)."""
+    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (see ``SoftReader``)."""
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 3 or self.positions.shape[1:] != self.mesh.rest.shape:
@@ -59,5 +71,5 @@ class DeformedCoat:
 
     @property
     def displacement(self) -> np.ndarray:
-        """Way of every vertex from rest [m], shape (B, V, 3)."""
+        """Displacement of every vertex from rest [m], shape (B, V, 3)."""
         return self.positions - self.mesh.rest[None]

@@ -1,4 +1,4 @@
-"""Connected components of contact masks, by runs: few NumPy calls for all environments, then plain Python over some dozens of runs."""
+"""Connected components of contact masks, by runs of True along the rows."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def find_edges(mask: np.ndarray) -> np.ndarray:
-    """The runs of ``find_runs`` by where each begins and has ended, (2 R,), in order; a place is row · (Nx + 1) + column."""
+    """Beginnings and ends of all runs, (2 R,), in order, as row · (Nx + 1) + column."""
     batch, ny, nx = mask.shape
-    # One False before every row, so that edges are in turn where a run begins and where it has ended.
+    # One False before every row, so that beginnings and ends alternate.
     padded = np.zeros(batch * ny * (nx + 1) + 1, dtype=bool)
     padded[:-1].reshape(batch * ny, nx + 1)[:, 1:] = mask.reshape(batch * ny, nx)
     return np.flatnonzero(padded[1:] != padded[:-1])
 
 
 def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> list[int]:
-    """For every run of ``find_runs``, as lists, the number of the first run of its 8-connected piece.
+    """Number of the first run of the 8-connected piece of every run of ``find_runs``.
 
     Union-find (Rosenfeld and Pfaltz 1966): a run is joined to those of the row above, in the same mask of ``ny`` rows, that it touches
     at a side or a corner.

@@ -1,4 +1,4 @@
-"""Gaussian smoothing of grids with lengths in metres: exact discrete Gaussians as matrix products."""
+"""Gaussian smoothing of grids: exact discrete Gaussians as matrix products."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def gaussian_matrix(nodes: int, width: float) -> np.ndarray:
 
 
 def fast_gaussian_matrix(nodes: int, width: float) -> np.ndarray:
-    """``gaussian_matrix`` as ``GaussianBlur`` has it, float32: without what lies below its tail threshold."""
+    """``gaussian_matrix`` as ``GaussianBlur`` applies it: float32, tails cut off."""
     if width < _LOW_RANK_FROM:
         return _band(nodes, width)[0].astype(np.float32)
     synthesis, analysis = _cosine_basis(nodes, width, tail=_TAIL)
@@ -35,7 +35,7 @@ def fast_gaussian_matrix(nodes: int, width: float) -> np.ndarray:
 
 
 class GaussianBlur:
-    """Separable Gaussian on (Ny, Nx) float32 arrays with a standard deviation in metres; built once for a grid."""
+    """Separable Gaussian of a standard deviation in metres on (Ny, Nx) float32 arrays."""
 
     def __init__(self, shape: tuple[int, int], pitch: tuple[float, float], sigma: float) -> None:
         """``shape`` (Ny, Nx); ``pitch`` (x, y) [m]; ``sigma`` [m] > 0."""
@@ -62,7 +62,7 @@ _Operator = tuple[np.ndarray, np.ndarray] | list[tuple[slice, slice, np.ndarray]
 
 
 def _operator(nodes: int, width: float) -> _Operator:
-    """Either (synthesis, analysis) factors of low rank, or dense blocks (rows, columns, weights) along the diagonal band."""
+    """Low-rank factors (synthesis, analysis) or dense blocks (rows, columns, weights) of a band."""
     if width >= _LOW_RANK_FROM:
         synthesis, analysis = _cosine_basis(nodes, width, tail=_TAIL)
         return synthesis.astype(np.float32), analysis.astype(np.float32)
@@ -77,7 +77,7 @@ def _operator(nodes: int, width: float) -> _Operator:
 
 
 def _band(nodes: int, width: float) -> tuple[np.ndarray, int]:
-    """The matrix (nodes, nodes), and how far from its diagonal it is not 0."""
+    """The matrix (nodes, nodes), and its half bandwidth."""
     kernel = _kernel(width)
     reach = min(len(kernel) // 2, nodes - 1)
     kernel = kernel[len(kernel) // 2 - reach : len(kernel) // 2 + reach + 1]
@@ -90,21 +90,21 @@ def _band(nodes: int, width: float) -> tuple[np.ndarray, int]:
 
 
 def _piece(operator: _Operator, kept: slice) -> _Operator:
-    """What an operator does from the nodes ``kept`` to the same nodes."""
+    """Restriction of an operator to the nodes ``kept``."""
     if isinstance(operator, tuple):
         return operator[0][kept], operator[1][:, kept]
     pieces: _Operator = []
     for rows, columns, weights in operator:
         first, last = max(rows.start, kept.start), min(rows.stop, kept.stop)
-        left, right = max(columns.start, kept.start), min(columns.stop, kept.stop)
-        if first < last and left < right:
-            part = weights[first - rows.start : last - rows.start, left - columns.start : right - columns.start]
-            pieces.append((slice(first - kept.start, last - kept.start), slice(left - kept.start, right - kept.start), part))
+        begin, end = max(columns.start, kept.start), min(columns.stop, kept.stop)
+        if first < last and begin < end:
+            part = weights[first - rows.start : last - rows.start, begin - columns.start : end - columns.start]
+            pieces.append((slice(first - kept.start, last - kept.start), slice(begin - kept.start, end - kept.start), part))
     return pieces
 
 
 def _cosine_basis(nodes: int, width: float, tail: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Synthesis (nodes, rank), which includes the gain, and analysis (rank, nodes), for gains of at least ``tail``."""
+    """Synthesis (nodes, rank) with gain, and analysis (rank, nodes), for gains >= ``tail``."""
     k = np.arange(nodes)
     gain = np.exp(width**2 * (np.cos(np.pi * k / (nodes - 1)) - 1.0))
     kept = k[gain >= tail]
@@ -115,7 +115,7 @@ def _cosine_basis(nodes: int, width: float, tail: float = 0.0) -> tuple[np.ndarr
 
 
 def _kernel(width: float) -> np.ndarray:
-    """Weights of the discrete Gaussian on an endless line, centred, cut below the tail threshold."""
+    """Centred weights of the discrete Gaussian on an infinite line, tails cut off."""
     half = int(np.ceil(8.0 * width)) + 12
     period = 2 * half + 1
     frequency = 2.0 * np.pi * np.arange(period) / period

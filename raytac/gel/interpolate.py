@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["SplineAxis", "hat_matrix", "sampled"]
+__all__ = ["SplineAxis", "cell_lengths", "hat_matrix", "sampled"]
 
 
 class SplineAxis:
-    """The cubic spline of least bending through values at n lines: C², and straight beyond its ends' curvature ("natural").
+    """The natural cubic spline through values at n lines: C², with zero curvature at both ends.
 
     With M the second derivatives at the lines, the spline in the cell between lines i and i + 1 of length h is
-    a y_i + b y_{i+1} + ((a³ − a) M_i + (b³ − b) M_{i+1}) h²/6, a = (t_{i+1} − t)/h, b = 1 − a; that its slope is continuous makes M a
+    a y_i + b y_{i+1} + ((a³ − a) M_i + (b³ − b) M_{i+1}) h²/6, a = (t_{i+1} − t)/h, b = 1 − a. Continuity of the slope makes M a
     linear function of y (a tridiagonal system; de Boor, A Practical Guide to Splines, chapter IV).
     """
 
@@ -40,7 +40,7 @@ class SplineAxis:
         return cell, np.stack([a, b, (a**3 - a) * h**2 / 6.0, (b**3 - b) * h**2 / 6.0])
 
     def matrix(self, t: np.ndarray) -> np.ndarray:
-        """What takes the values at the lines to those at ``t`` [m]: shape (P, n)."""
+        """Matrix from values at the lines to values at ``t`` [m], shape (P, n)."""
         cell, (a, b, c, d) = self.weights(t)
         rows = np.arange(len(cell))
         out = c[:, None] * self.bending[cell] + d[:, None] * self.bending[cell + 1]
@@ -49,8 +49,13 @@ class SplineAxis:
         return out
 
 
+def cell_lengths(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Length of the cell between ``lines`` (n,) around each place ``t`` (P,), shape (P,)."""
+    return np.diff(lines)[np.clip(np.searchsorted(lines, t, side="right") - 1, 0, len(lines) - 2)]
+
+
 def hat_matrix(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Linear interpolation from ``lines`` (n,) to ``t`` (P,), shape (P, n): rows are >= 0 and sum to 1."""
+    """Matrix (P, n) of linear interpolation from ``lines`` (n,) to ``t`` (P,); rows sum to 1."""
     cell, (a, b, _, _) = SplineAxis(lines).weights(t)
     out = np.zeros((len(cell), len(lines)))
     rows = np.arange(len(cell))
@@ -59,9 +64,9 @@ def hat_matrix(lines: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def sampled(field: np.ndarray, x: np.ndarray, y: np.ndarray, at_x: np.ndarray, at_y: np.ndarray) -> np.ndarray:
-    """Fields (…, Ny, Nx) over even lines ``x``, ``y`` at places (V,), bilinear, carried on beyond the edges as they are there; (…, V).
+    """Bilinear interpolation of fields (…, Ny, Nx) on regular lines at places (V,); (…, V).
 
-    NaN at a place that is NaN.
+    Beyond the edges the value at the edge is taken. A place that is NaN gives NaN.
     """
     parts = []
     for line, at in ((x, at_x), (y, at_y)):

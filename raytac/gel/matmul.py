@@ -12,7 +12,7 @@ far more on a busy machine; below it, the result does not depend on the number o
 
 
 def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32, in pieces along the longer free side small enough to stay on the calling thread."""
+    """a @ b, float32, in pieces small enough to stay on the calling thread."""
     rows, inner = a.shape
     columns = b.shape[1]
     if rows * inner * columns <= _ONE_THREAD:

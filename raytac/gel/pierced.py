@@ -1,4 +1,4 @@
-"""Gel that would lie below its bonded face: a state that no pad can have."""
+"""Gel surfaces that would lie below the bonded face, which is impossible."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROUNDING = 1e-8
 
 
 def without_pierced(surface: GelSurface, gelpad: GelpadSpec) -> GelSurface:
-    """The surface, with NaN and no contact where an environment's gel lies below the bonded face anywhere."""
+    """The surface, with NaN and no contact where an environment's gel is below its bonded face."""
     pierced = surface.height.min(axis=(1, 2)) < -gelpad.thickness - _ROUNDING
     if not pierced.any():
         return surface

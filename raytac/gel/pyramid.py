@@ -20,21 +20,21 @@ CONTACT_RULES = ("unilateral", "threshold")
 CONTACT_SCALE = 0.4
 """Share of the deepest overlap from which a node counts as in full contact."""
 _FINEST = 0.2
-"""Gaussians narrower than this share of the pitch move nothing that the grid can hold and are skipped."""
+"""Gaussians narrower than this share of the pitch are skipped: the grid cannot resolve their effect."""
 _ROUNDING = 1e-5
-"""Share of the deepest overlap that w may exceed u by in a contact: above what float32 gathers in the pyramid, far below a shape."""
+"""Excess of w over u in contact, as a share of the deepest overlap: above the pyramid's rounding in float32, far below any shape."""
 _REACH = 4.8
-"""Standard deviations of all Gaussians together beyond which a contact moves nothing: Φ(−4.8) is 10⁻⁶ of its depth."""
+"""Standard deviations of all Gaussians together beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
 
 
 class ElasticSurround:
-    """From the overlap of object and resting gel to the deformed surface (after Si & Yuan, RA-L 2022, section III).
+    """Deformed surface from the overlap of object and resting gel (Si & Yuan, RA-L 2022, III).
 
     With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every width
     of the pyramid, wide to narrow, w ← Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface
-    is rest − w. How the contact is re-imposed is the ``contact_rule``:
+    is rest − w. The ``contact_rule`` says how the contact is re-imposed:
 
-    - ``"unilateral"`` (default): w ← max(w, u⁺). The gel never reaches into the object and leaves it where the Gaussians hold it deeper;
+    - ``"unilateral"`` (default): w ← max(w, u⁺). The gel never reaches into the object and leaves it where the Gaussians keep it deeper;
       the contact is where w = u, up to 10⁻⁵ of the deepest overlap (float32). Everything stays continuous.
     - ``"threshold"``: Taxim's own, w = u⁺ on the full contact C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief,
       tears the surface along the border of C on steep walls (dots in the image) and lets the gel reach into the object outside C.
@@ -99,22 +99,22 @@ class ElasticSurround:
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
     def _displacement(self, overlap: np.ndarray, deepest: float, touched: Piece, window: Piece) -> tuple[np.ndarray, np.ndarray]:
-        """w [m] on the window, and the contact where the object has touched the resting gel; ``overlap`` is that there."""
+        """w [m] on the window, and the contact on ``touched``, for the ``overlap`` there."""
         pressed = np.maximum(overlap, 0.0)
         full = overlap > self.contact_scale * deepest
-        field, moved = self._field(pressed, touched, window), pressed
+        field, w = self._field(pressed, touched, window), pressed
         for _ in self._pyramid:
-            moved = field.smooth()
-            moved = np.maximum(moved, pressed) if self.contact_rule == "unilateral" else np.where(full, pressed, moved)
-            field.impose(moved)
-        # Where the overlap is constant the Gaussians keep it, up to rounding: without slack, rounding would decide the contact. The
-        # deepest node is always within it, since no Gaussian exceeds the maximum.
+            w = field.smooth()
+            w = np.maximum(w, pressed) if self.contact_rule == "unilateral" else np.where(full, pressed, w)
+            field.impose(w)
+        # Where the overlap is constant the Gaussians keep it up to rounding, which must not decide the contact: hence the slack. The
+        # deepest node is always in contact, since no Gaussian exceeds the maximum.
         slack = np.float32(max(_ROUNDING * float(deepest), float(np.finfo(np.float32).tiny)))
-        contact = (overlap > 0.0) & (moved <= pressed + slack) if self.contact_rule == "unilateral" else full
+        contact = (overlap > 0.0) & (w <= pressed + slack) if self.contact_rule == "unilateral" else full
         return field.over(window), contact
 
     def _field(self, pressed: np.ndarray, touched: Piece, window: Piece) -> SmoothedField:
-        """The cheaper way for this contact: locally, if it is narrower than what it moves on either side."""
+        """The cheaper method: local, if the contact is narrower than the reach of the Gaussians."""
         widths = (pitch * (line.stop - line.start) for line, pitch in zip(touched, reversed(self.grid.pitch), strict=True))
         if self._composed.fits and max(widths) <= self._reach:
             return LocalField(pressed, touched, self._composed, len(self._pyramid), self._final is not None, _REACH)

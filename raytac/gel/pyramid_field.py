@@ -1,4 +1,4 @@
-"""A field that is smoothed by one Gaussian after the other and, in between, set anew where an object touches: two ways, one result."""
+"""Smoothing by successive Gaussians with the contact re-imposed: two equivalent methods."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LARGEST = 512
 
 
 class SmoothedField(Protocol):
-    """A field that is 0 outside of a piece ``touched`` at the start, on which it may be set anew after every Gaussian."""
+    """A field, 0 at first outside a piece ``touched``, which is set again after every Gaussian."""
 
     def smooth(self) -> np.ndarray:
         """Apply the next Gaussian; returns the field on ``touched``."""
@@ -31,7 +31,7 @@ class SmoothedField(Protocol):
         ...
 
     def over(self, window: Piece) -> np.ndarray:
-        """The field on the window that was given at the start, with the last Gaussian if there is one."""
+        """The field on the initial window, with the last Gaussian if there is one."""
         ...
 
 
@@ -60,9 +60,9 @@ class WholeField:
 
 
 class ComposedGaussians:
-    """Every run of a row of Gaussians as matrices on one grid; made when a small contact first asks for them.
+    """Products of successive Gaussians as matrices on one grid, made at the first small contact.
 
-    Discrete Gaussians one after the other are one of the sum of their variances, also where they are mirrored (see ``gaussian_matrix``).
+    Successive discrete Gaussians are one of the sum of their variances, also with mirrored borders (see ``gaussian_matrix``).
     """
 
     def __init__(self, shape: tuple[int, int], pitch: tuple[float, float], sigmas: Sequence[float]) -> None:
@@ -72,7 +72,7 @@ class ComposedGaussians:
 
     @property
     def fits(self) -> bool:
-        """Whether the matrices are small enough to be kept."""
+        """True if the matrices are small enough to be cached."""
         return max(self.shape) <= _LARGEST
 
     def sigma(self, first: int, last: int) -> float:
@@ -80,7 +80,7 @@ class ComposedGaussians:
         return float(np.sqrt(self._squares[first : last + 1].sum()))
 
     def apply(self, first: int, last: int, values: np.ndarray, touched: Piece, piece: Piece) -> np.ndarray:
-        """What the Gaussians from ``first`` to ``last`` make on ``piece`` of a field that is ``values`` on ``touched`` and 0 elsewhere."""
+        """Field on ``piece`` after the Gaussians ``first`` to ``last`` of ``values`` on ``touched``."""
         if (first, last) not in self._matrices:
             sigma = self.sigma(first, last)
             self._matrices[first, last] = tuple(  # type: ignore[assignment]
@@ -91,35 +91,35 @@ class ComposedGaussians:
 
 
 class LocalField:
-    """The field as what was laid onto ``touched`` and when, each spread by the Gaussians that came after; for small contacts.
+    """The field as a sum of increments on ``touched``, each smoothed by all later Gaussians.
 
-    Only setting it anew is not linear, and that is done on ``touched`` alone: so the field is followed there, and the last time over the
-    window. With m nodes along a side of ``touched`` and n Gaussians that is about n² m³ multiply-adds, whatever the window.
+    Only the re-imposed contact is not linear, and it acts on ``touched`` alone. So the field is computed there, and at the end over the
+    window. With m nodes along a side of ``touched`` and n Gaussians this takes about n² m³ multiply-adds, whatever the window.
     """
 
     def __init__(
         self, values: np.ndarray, touched: Piece, gaussians: ComposedGaussians, count: int, final: bool, reach: float
     ) -> None:
-        """``count`` Gaussians to be imposed on, and one more if ``final``; ``reach``: standard deviations beyond which nothing is left."""
+        """``count`` Gaussians before an imposition, and one more if ``final``; ``reach``: standard deviations at which they end."""
         self._gaussians, self._touched = gaussians, touched
         self._last, self._reach = count - 1 + final, reach
-        self._laid, self._present = [values], values
+        self._increments, self._present = [values], values
 
     def smooth(self) -> np.ndarray:
-        last = len(self._laid) - 1
+        last = len(self._increments) - 1
         total = np.zeros_like(self._present)
-        for first, values in enumerate(self._laid):
+        for first, values in enumerate(self._increments):
             total += self._gaussians.apply(first, last, values, self._touched, self._touched)
         self._present = total
         return total
 
     def impose(self, values: np.ndarray) -> None:
-        self._laid.append(values - self._present)
+        self._increments.append(values - self._present)
         self._present = values
 
     def over(self, window: Piece) -> np.ndarray:
         total = np.zeros([line.stop - line.start for line in window], np.float32)
-        for first, values in enumerate(self._laid):
+        for first, values in enumerate(self._increments):
             if first > self._last:  # no Gaussian comes after it
                 total[_within(self._touched, window)] += values
                 continue
@@ -131,7 +131,7 @@ class LocalField:
 
 
 def around(piece: Piece, margin: float, pitch: tuple[float, float], within: Piece) -> Piece:
-    """A piece and what is ``margin`` [m] around it, as far as it lies ``within`` another."""
+    """A piece with a ``margin`` [m] around it, clipped to the piece ``within``."""
     rows, columns = (
         slice(max(line.start - nodes, whole.start), min(line.stop + nodes, whole.stop))
         for line, nodes, whole in zip(piece, (int(np.ceil(margin / p)) for p in reversed(pitch)), within, strict=True)
@@ -140,6 +140,6 @@ def around(piece: Piece, margin: float, pitch: tuple[float, float], within: Piec
 
 
 def _within(piece: Piece, window: Piece) -> Piece:
-    """Where a piece of the grid is in the window."""
+    """A piece of the grid in the window's own rows and columns."""
     rows, columns = (slice(line.start - whole.start, line.stop - whole.start) for line, whole in zip(piece, window, strict=True))
     return rows, columns

@@ -1,7 +1,8 @@
-"""The deformed coat surface: the one thing that physics hands to optics, markers and force outputs."""
+"""The deformed gel surface, which physics passes to optics, markers and force outputs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -29,10 +30,11 @@ __all__ = [
 ]
 
 
-def summary(record: Any) -> str:
-    """A dataclass on one line: arrays by type and shape instead of their values, and without the fields that are None or empty."""
+def summary(record: Any, names: Sequence[str] | None = None) -> str:
+    """A dataclass on one line: arrays by type and shape, without empty fields; ``names``: fields that are shown, None for all."""
     shown = []
-    for name, value in ((f.name, getattr(record, f.name)) for f in fields(record)):
+    for name in [f.name for f in fields(record)] if names is None else names:
+        value = getattr(record, name)
         if isinstance(value, dict):
             value = {key: _brief(v) for key, v in value.items()}
             text = "{" + ", ".join(f"{key}: {v}" for key, v in value.items()) + "}" if value else ""
@@ -128,18 +130,18 @@ class GelSurface:
 
     @property
     def indentation(self) -> np.ndarray:
-        """Indentation depth rest − height [m], shape (B, Ny, Nx); negative where the gel bulges outwards."""
+        """Depth rest − height [m], (B, Ny, Nx); negative where the gel bulges outwards."""
         return self.grid.rest[None] - self.height
 
 
 def rounded_envs(envs: list[int], batch: int) -> list[int]:
-    """The same with the last of them named again, up to a power of two or ``batch``: kernels are recorded for each number of rows."""
+    """``envs`` padded with its last entry to a power of two: kernels are recorded by row count."""
     count = min(1 << max(len(envs) - 1, 0).bit_length(), batch)
     return [*envs, *envs[-1:] * (count - len(envs))]
 
 
 def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
-    """Numbers of the environments that a mask (B,) or a list names, in its order; None names all.
+    """Environment numbers of a mask (B,) or a list, in its order; None names all.
 
     Raises:
         InputError: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
@@ -166,13 +168,13 @@ COARSEST_PITCH = 0.1e-3
 
 
 MOST_CELLS = 8192
-"""Most cells of the pad's grid along an axis, as many as an image can have pixels."""
+"""Most cells of the pad's grid along an axis: the most pixels of an image."""
 _SAME = 1e-6
-"""Difference within which a grid is of a pad [m]."""
+"""Tolerance of a grid's edges and rest heights [m]."""
 
 
 def grid_pitch(pixel: tuple[float, float]) -> float:
-    """Spacing [m] of the nodes for an image whose pixels cover ``pixel`` (x, y) [m] of the pad: as fine as the image."""
+    """Node spacing [m] for an image whose pixels cover ``pixel`` (x, y) [m] of the pad."""
     return min(COARSEST_PITCH, *pixel)
 
 
@@ -186,11 +188,11 @@ def rest_height(gelpad: GelpadSpec, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
-    """Raise ``InputError`` unless ``grid`` spans this gelpad, to a micrometre, and rests on its dome."""
+    """Raise ``InputError`` unless ``grid`` spans this gelpad and rests on its dome."""
     ends = [float(nodes[k]) for nodes in (grid.x, grid.y) for k in (0, -1)]
-    own = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
-    if not np.allclose(ends, own, rtol=0.0, atol=_SAME):
-        rule = f"must be a grid of this sensor's pad, x and y from {own} m"
+    expected = [sign * 0.5 * size for size in gelpad.size for sign in (-1.0, 1.0)]
+    if not np.allclose(ends, expected, rtol=0.0, atol=_SAME):
+        rule = f"must be a grid of this sensor's pad, x and y from {expected} m"
         raise InputError("surface.grid", value=ends, rule=rule)
     off = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
     if not off <= _SAME:

@@ -1,4 +1,4 @@
-"""Traction on the coat: force per area over the pad's grid, of a simulated pad and of one that only knows its total."""
+"""Traction on the coat's grid, from vertex forces or from a total force."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["CoatTraction", "cell_areas", "foundation_traction"]
 
 
 def cell_areas(grid: PadGrid) -> np.ndarray:
-    """Area that each node stands for [m²], shape (Ny, Nx): a cell, half of one at the edges, a quarter in the corners."""
+    """Area of each node [m²], (Ny, Nx): a cell, half of one at edges, a quarter in corners."""
     along = [np.full(n, pitch) for n, pitch in zip(reversed(grid.shape), grid.pitch, strict=True)]
     for line in along:
         line[[0, -1]] *= 0.5
@@ -20,13 +20,13 @@ def cell_areas(grid: PadGrid) -> np.ndarray:
 
 
 class CoatTraction:
-    """Traction of forces on a coat's vertices, over a grid, linear on each of the coat's triangles.
+    """Traction of forces on a coat's vertices, over a grid, linear on each triangle.
 
-    Contact with facets loads neighbouring vertices unevenly, those in the middle of eight triangles more than those of four, by about
-    15 % against their areas. One pass takes each vertex's traction to its triangles (the mean of their corners) and back (the mean by
-    area); it keeps the sum and costs one cell of sharpness. Then a vertex's traction is its force over the integral of its hat
-    function on the grid, so that the sum of traction × ``cell_areas`` is the total force exactly. It is per area of the coat at rest
-    and at the place that the coat has at rest (the first Piola-Kirchhoff traction): it moves with the material.
+    Contact with facets loads neighbouring vertices unevenly: vertices of eight triangles more than those of four, by about 15 % against
+    their areas. One pass averages each vertex's traction over its triangles and back by area; it keeps the sum and costs one cell of
+    resolution. A vertex's traction is then its force over the integral of its hat function on the grid, so that the sum of
+    traction × ``cell_areas`` is the total force exactly. It is per area of the coat at rest, at the rest position (the first
+    Piola-Kirchhoff traction).
     """
 
     def __init__(self, mesh: CoatMesh, grid: PadGrid) -> None:
@@ -40,19 +40,16 @@ class CoatTraction:
             raise InputError("pitch", value=grid.pitch, rule=rule)
         self._shape = grid.shape
         self._faces = mesh.faces
-        corners = mesh.rest[mesh.faces]
-        face_area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        self._third = face_area[:, None, None] / 3.0
-        self._lumped = np.bincount(mesh.faces.ravel(), np.repeat(face_area / 3.0, 3), len(mesh.rest))[:, None]
+        self._third, self._lumped = mesh.face_areas[:, None, None] / 3.0, mesh.vertex_areas[:, None]
 
     def __call__(self, forces: np.ndarray) -> np.ndarray:
         """Traction [Pa], shape (B, Ny, Nx, 3), float32, of forces [N], shape (B, V, 3)."""
-        at_vertices = np.stack([self._evened(f) for f in forces]) / self._area[:, None]
+        at_vertices = np.stack([self._smoothed(f) for f in forces]) / self._area[:, None]
         spread = sum(at_vertices[:, self._corner[:, k]] * self._weight[:, k, None] for k in range(3))
         return np.asarray(spread, np.float32).reshape(len(forces), *self._shape, 3)
 
-    def _evened(self, forces: np.ndarray) -> np.ndarray:
-        """Forces (V, 3) after the pass over the triangles; their sum is the same."""
+    def _smoothed(self, forces: np.ndarray) -> np.ndarray:
+        """Forces (V, 3) after one averaging pass over the triangles, with the same sum."""
         at_faces = (forces / self._lumped)[self._faces].mean(axis=1, keepdims=True) * self._third
         out = np.zeros_like(forces)
         np.add.at(out, self._faces, np.broadcast_to(at_faces, (len(self._faces), 3, 3)))
@@ -60,7 +57,7 @@ class CoatTraction:
 
 
 def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the triangle that each node lies in at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
+    """Triangle around each node at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
     rows, columns = mesh.shape
     x, y = (a.ravel() for a in np.meshgrid(grid.x, grid.y))
     column = np.clip(np.searchsorted(mesh.lines_x, x, side="right") - 1, 0, columns - 2)
@@ -85,12 +82,11 @@ def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray
 
 
 def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Traction [Pa], shape (B, Ny, Nx, 3), of a contact of which only the total is known, as that of an elastic foundation.
+    """Traction [Pa], (B, Ny, Nx, 3), of a total force, distributed as by an elastic foundation.
 
-    The normal traction is in proportion to the indentation where ``surface.contact`` (K. L. Johnson, Contact Mechanics, section 4.3);
-    the tangential force is shared as the normal one is, and the twist about the contact's centre likewise, growing with the distance
-    from it. Where the pressure really is, a load law does not know: the sum of traction × ``cell_areas`` is exact, the distribution is a
-    model. A contact that is narrower than a cell, which the nodes cannot twist, shows no twist.
+    The normal traction is proportional to the indentation in contact (K. L. Johnson, Contact Mechanics, section 4.3). The tangential
+    force is distributed like the normal one, and the twist likewise times the distance from the contact's centre. The sum of
+    traction × ``cell_areas`` is exact; the distribution is a model. A contact narrower than a cell has no twist.
 
     Args:
         surface: gives contact and indentation.
@@ -98,7 +94,7 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
         twist: torque about +z through the contact's centre [N m], shape (B,).
     """
     grid, area = surface.grid, cell_areas(surface.grid)
-    cell = (grid.pitch[0] ** 2 + grid.pitch[1] ** 2) / 12.0  # mean square distance of a cell's area from its middle
+    cell = (grid.pitch[0] ** 2 + grid.pitch[1] ** 2) / 12.0  # mean square distance of a cell's area from its centre
     out = np.zeros((*surface.height.shape, 3), np.float32)
     for b in range(surface.batch):
         share = np.where(surface.contact[b], np.maximum(surface.indentation[b], 0.0), 0.0)

@@ -1,7 +1,9 @@
 from .arrays import npz_bytes as npz_bytes
 from .atomic import write_atomic as write_atomic
+from .folder import FolderLock as FolderLock
 from .folder import result_folder as result_folder
-from .lock import FolderLock as FolderLock
+from .images import write_png as write_png
+from .images import write_sheet as write_sheet
 from .metrics import VERSIONED as VERSIONED
 from .metrics import Metric as Metric
 from .metrics import read_metrics as read_metrics
@@ -10,7 +12,7 @@ from .metrics import write_metrics as write_metrics
 from .options import CommonOptions as CommonOptions
 from .options import parse_names as parse_names
 from .options import parse_resolution as parse_resolution
-from .png import write_png as write_png
+from .progress import Progress as Progress
 from .seal import SealError as SealError
 from .seal import read_sealed as read_sealed
 from .seal import write_sealed as write_sealed

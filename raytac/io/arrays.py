@@ -22,7 +22,10 @@ def npy_bytes(array: np.ndarray) -> bytes:
 
 
 def npz_bytes(arrays: Mapping[str, np.ndarray], *, compress: bool = False) -> bytes:
-    """An ``.npz`` for ``numpy.load``; equal arrays give equal bytes, which ``numpy.savez`` does not promise: it writes the time of day."""
+    """Contents of an ``.npz`` for ``numpy.load``; equal arrays give equal bytes.
+
+    ``numpy.savez`` does not promise that: it writes the time of day.
+    """
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, values in arrays.items():

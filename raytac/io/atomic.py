@@ -1,4 +1,7 @@
-"""Whole files: written so that nobody sees half of one, also after the power failed, and read only where they are regular files."""
+"""Whole files: written so that nobody sees half of one, even after a power failure.
+
+They are read only where they are regular files.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,10 @@ __all__ = ["cache_folder", "cache_root", "keep_cached", "read_cached", "warn_not
 
 
 def cache_root() -> Path | None:
-    """``RAYTAC_CACHE`` if set, else ``raytac`` in ``XDG_CACHE_HOME`` or in ``~/.cache``; None for a user without a home folder."""
+    """Folder of the cache; None for a user without a home folder.
+
+    It is ``RAYTAC_CACHE`` if set, else ``raytac`` in ``XDG_CACHE_HOME`` or in ``~/.cache``.
+    """
     if chosen := os.environ.get("RAYTAC_CACHE"):
         return Path(chosen)
     try:
@@ -31,7 +34,7 @@ def cache_folder(kind: str) -> Path | None:
 
 
 def read_cached(path: Path | None) -> bytes | None:
-    """What ``keep_cached`` kept; None if there is none, or, with a warning, if it is damaged."""
+    """Contents that ``keep_cached`` kept; None if there are none or, with a warning, if they are damaged."""
     if path is None:
         return None
     try:
@@ -62,7 +65,10 @@ def warn_unusable(path: Path, error: Exception) -> None:
 
 
 def warn_not_kept(path: Path | None, error: Exception) -> None:
-    """Tell that an entry is used now and not kept; the same words for all entries of a folder, so that they are shown once."""
+    """Warn that an entry is used now and not kept.
+
+    The text is the same for all entries of a folder, so that it is shown once.
+    """
     where = "the cache" if path is None else f"the cache {path.parent}"
     reason = getattr(error, "strerror", None) or error
     text = f"{where} cannot be written ({reason}): what is made is not kept; RAYTAC_CACHE names another folder"

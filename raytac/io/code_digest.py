@@ -1,14 +1,20 @@
-"""A digest of the source code that a result depends on, so that a kept result is never taken for one of other code."""
+"""Digest of the source code that a result depends on, and the commit that runs.
+
+A cached result is used only by the code that computed it.
+"""
 
 from __future__ import annotations
 
 import ast
 import hashlib
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
-__all__ = ["code_digest", "module_sources"]
+__all__ = ["code_digest", "git_state", "module_sources"]
 
 WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
 """Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
@@ -19,27 +25,36 @@ def module_sources(roots: Iterable[str]) -> dict[str, Path]:
 
     Roots that do not exist are left out. Imports are read from the sources; nothing is run except the ``__init__`` of packages.
     """
-    found: dict[str, Path] = {}
+    sources: dict[str, Path] = {}
     waiting = list(roots)
     while waiting:
         name = waiting.pop()
-        if name in found:
+        if name in sources:
             continue
-        try:
-            spec = importlib.util.find_spec(name)
-        except ModuleNotFoundError:
-            spec = None
-        if spec is None or spec.origin is None:
+        source = _source(name)
+        if source is None:
             continue
-        found[name] = Path(spec.origin)
-        for node in ast.walk(ast.parse(found[name].read_bytes())):
+        sources[name] = source
+        for node in ast.walk(ast.parse(sources[name].read_bytes())):
             imported: list[str] = []
             if isinstance(node, ast.Import):
                 imported = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module:
                 imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             waiting += [name for name in imported if (name + ".").startswith(tuple(package + "." for package in WITHIN))]
-    return found
+    return sources
+
+
+def _source(name: str) -> Path | None:
+    """File of a module, of the running script too; None if there is none."""
+    if name == "__main__":
+        script = getattr(sys.modules[name], "__file__", None)
+        return None if script is None else Path(script)
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        return None
+    return None if spec is None or spec.origin is None else Path(spec.origin)
 
 
 def code_digest(*roots: str) -> str:
@@ -48,3 +63,26 @@ def code_digest(*roots: str) -> str:
     for name, path in sorted(module_sources(roots).items()):
         digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
+
+
+@cache
+def git_state() -> dict[str, str | int]:
+    """``git.commit``, and ``git.changed``: the number of tracked files of the package that differ.
+
+    Empty for an installed package.
+    """
+    package = Path(str(sys.modules["raytac"].__file__)).parent
+    try:
+        if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+            return {}  # the package lies in a checkout of something else, such as a project with its .venv
+        commit, changed = _git(package, "rev-parse", "HEAD"), _git(package, "status", "--porcelain", "--untracked-files=no", ".")
+    except (OSError, subprocess.TimeoutExpired):
+        return {}
+    if commit is None or changed is None:
+        return {}
+    return {"git.commit": commit, "git.changed": len(changed.splitlines())}
+
+
+def _git(folder: Path, *command: str) -> str | None:
+    done = subprocess.run(["git", "-C", str(folder), *command], capture_output=True, text=True, check=False, timeout=20)
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,18 +1,21 @@
-"""Write a folder of results so that an interrupt or a full disk leaves nothing half-written."""
+"""Folders of results: written as a whole or not at all, and locked while a run adds to them."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import TracebackType
 
 from raytac.errors import InputError, RaytacError
 
-__all__ = ["DISK_ERRORS", "result_folder"]
+__all__ = ["DISK_ERRORS", "LOCK", "FolderLock", "result_folder"]
 
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """Numbers of the errors of a disk, or of what standard output goes to."""
@@ -20,7 +23,9 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 @contextmanager
 def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
-    """Give a temporary folder; when the block ends well, move its files into ``out``, else delete them and leave ``out`` as it was.
+    """A temporary folder, whose files move into ``out`` when the block ends well.
+
+    Otherwise they are deleted, and ``out`` stays as it was.
 
     A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run
     that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` goes first and
@@ -62,7 +67,7 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
 
 
 def _is_of_folder(error: OSError, folders: Iterable[Path]) -> bool:
-    """Whether the file that the error names lies in one of the folders; if it names none, whether it is one of a disk."""
+    """True if the error names a file in one of the folders, or names none and is an error of the disk."""
     if not isinstance(error.filename, str | bytes | os.PathLike):  # none, or the number of an open file
         return error.errno in DISK_ERRORS
     place = Path(os.path.abspath(os.fsdecode(error.filename)))
@@ -76,7 +81,10 @@ def _check_no_folders(out: Path, names: Iterable[str]) -> None:
 
 
 def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
-    """Put the files of ``work`` into ``out``; if one cannot be put there, all that was there before goes back from ``old``."""
+    """Move the files of ``work`` into ``out``.
+
+    If one cannot be moved, all that was there before goes back from ``old``.
+    """
     written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
     try:
         for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):
@@ -91,3 +99,80 @@ def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
         for path in sorted(old.iterdir(), key=lambda path: path.name == "metrics.json"):
             os.replace(path, out / path.name)
         raise
+
+
+LOCK = ".lock"
+"""File in a folder that is locked; it is empty and stays."""
+_KIND = "must be a file that can be written, and no link: it is the lock of the folder"
+
+
+class FolderLock:
+    """Lock of a folder, which is made if need be.
+
+    It lasts until ``release``, the end of a ``with`` block, or the end of the process.
+
+    Only runs that ask for the lock are kept out. Where the folder did not exist and nothing is written to it, it is removed again.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Take the lock.
+
+        Raises:
+            InputError: another run has it, the folder cannot be written, or ``.lock`` in it is a link or no file.
+        """
+        folder = Path(folder)
+        self._folder, self._made = folder, not folder.exists()
+        self._handle = -1
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # A link is not followed, a pipe not waited for, and nothing is emptied: the file may not be ours.
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            handle = os.open(folder / LOCK, flags, 0o666)
+        except OSError as error:
+            if os.path.lexists(folder / LOCK):
+                raise InputError("out", value=folder / LOCK, rule=f"{_KIND} ({error.strerror})") from error
+            rule = f"must be a folder that can be written ({error.strerror})"
+            raise InputError("out", value=folder, rule=rule) from error
+        try:
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
+                raise InputError("out", value=folder / LOCK, rule=_KIND)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not self._is_there(handle):  # the run that had the lock has just removed the folder that it made
+                raise BlockingIOError
+        except BlockingIOError as error:
+            os.close(handle)
+            raise InputError("out", value=folder, rule="is in use by another run") from error
+        except OSError as error:
+            os.close(handle)
+            raise InputError("out", value=folder, rule=f"cannot be locked ({error.strerror})") from error
+        except InputError:
+            os.close(handle)
+            raise
+        self._handle = handle
+
+    def release(self) -> None:
+        """Let others in; a second call does nothing."""
+        if self._handle < 0:
+            return
+        handle, self._handle = self._handle, -1
+        try:
+            # Only while the lock in it is ours: another run may have made a folder of that name after ours was removed.
+            if self._made and self._is_there(handle) and os.listdir(self._folder) == [LOCK]:
+                (self._folder / LOCK).unlink()
+                self._folder.rmdir()
+        except OSError:  # the folder was removed or cannot be changed: an empty one that stays harms nobody
+            pass
+        finally:
+            os.close(handle)
+
+    def __enter__(self) -> FolderLock:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.release()
+
+    def _is_there(self, handle: int) -> bool:
+        try:
+            return os.path.samestat(os.fstat(handle), os.lstat(self._folder / LOCK))
+        except (FileNotFoundError, NotADirectoryError):
+            return False

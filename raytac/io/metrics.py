@@ -1,4 +1,7 @@
-"""``metrics.json``: one flat object of dotted keys to numbers or strings, beside all that a command or experiment writes."""
+"""``metrics.json``: one flat object of dotted keys to numbers or strings.
+
+Every command and experiment writes one.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,15 @@ _KEY = re.compile(r"[A-Za-z0-9_\-]+(\.[A-Za-z0-9_\-]+)*")
 
 def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
     """``versions.python`` and ``versions.<distribution>`` of what is installed; what is not is left out."""
-    found = {"versions.python": platform.python_version()}
+    result = {"versions.python": platform.python_version()}
     for name in distributions:
         try:
-            found[f"versions.{name}"] = importlib.metadata.version(name)
+            result[f"versions.{name}"] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    if "versions.raytac" not in found:  # a plain checkout that was never installed
-        found["versions.raytac"] = sys.modules["raytac"].__version__
-    return found
+    if "versions.raytac" not in result:  # a plain checkout that was never installed
+        result["versions.raytac"] = sys.modules["raytac"].__version__
+    return result
 
 
 def check_metrics(values: Mapping[str, object]) -> dict[str, Metric]:

@@ -21,7 +21,7 @@ class CommonOptions:
     out: Path | None = None
     """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""
     device: DeviceName = "auto"
-    """Where to compute; auto is CUDA if it works, else the CPU."""
+    """Device to compute on; auto is CUDA if it works, else the CPU."""
     seed: int = 0
     """Seed of every random number; the same seed gives the same result. In [0, 2^32)."""
 

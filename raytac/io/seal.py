@@ -31,7 +31,7 @@ def write_sealed(path: Path, data: bytes) -> None:
 
 
 def read_sealed(path: Path) -> bytes:
-    """What ``write_sealed`` wrote.
+    """Contents that ``write_sealed`` wrote.
 
     Raises:
         SealError: the contents differ from their digest.

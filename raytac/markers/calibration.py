@@ -1,4 +1,4 @@
-"""Fit the constants of FOTS and of the force field to surface tracking on simulated presses, and tell every model's error."""
+"""Fit of FOTS and of the force field to surface tracking on simulated presses, and the error of every model."""
 
 from __future__ import annotations
 
@@ -7,34 +7,36 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import PadGrid, rest_height
 from raytac.markers.calibration_presses import LOADS, PressFrame
 from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
+from raytac.markers.force_field import contact_at
 from raytac.markers.pattern import marker_centres
-from raytac.markers.surface import SurfaceMarkers
-from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
+from raytac.markers.registry import models_without_coat
+from raytac.markers.surface import SurfaceModel
+from raytac.markers.tracker import MarkerTracker
 from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
-if TYPE_CHECKING:
-    from raytac.markers.fots_kernel import FotsConstants
+__all__ = ["ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
 
-__all__ = ["PUBLISHED", "ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
-
-PUBLISHED = "fots_published"
-"""Name in tables of errors of ``fots`` without the sensor's ``punch``: Gaussians with one λ for all contacts, as published."""
 PROBE_PITCH = 1e-3
 """Spacing of the markers that errors are averaged over [m]: a grid over the view, whatever the sensor's own pattern."""
 _MARGIN = 0.4e-3
-"""Distance of the outermost probe from the edge of the view, at least [m]."""
+"""Least distance of the outermost probe from the edge of the view [m], so that none leaves it at rest."""
+_GAIN = 1e9
+"""First guess of FOTS' gain [1/m³]; the search works on its logarithm."""
+_LAMBDA = 2.5e5
+"""First guess of every λ of FOTS [1/m²]: a Gaussian that falls to 1/e within 2 mm."""
+_REACH = 5e-3
+"""First guess of the punch's ℓ [m], of the order of the pad's thickness."""
 
 
 def probe_sensor(sensor: SensorSpec) -> SensorSpec:
-    """The sensor with a dense, regular pattern over its view, so that a fit does not depend on where dots happen to be."""
+    """The sensor with a dense, regular pattern over its view, so that a fit does not depend on its own pattern."""
     camera = sensor.camera
     sizes, centre = [], []
     for axis in range(2):
@@ -50,8 +52,8 @@ class ProbeData:
     """Frames of many presses under the probes: N frames under load, P probes.
 
     ``markers`` [m], (P, 2); ``truth`` [m], (N, P, 2): by surface tracking; ``loads``: kind of each frame; ``depth`` [m], (N, ny, nx), and
-    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: of all frames, as if they were N environments;
-    ``force``: (penetration (N, P), wall (N, P, 2), way (N, P, 2)) that the force field reads.
+    ``boxes`` (N, 4): as in ``ContactSamples``; ``contacts``: of all frames, as if they were N environments; ``force``: penetration (N, P),
+    normal (N, P, 2) and shear (N, P, 2) that the force field reads.
     """
 
     cells: ContactCells
@@ -66,14 +68,13 @@ class ProbeData:
     @classmethod
     def of(cls, sensor: SensorSpec, frames: Sequence[PressFrame]) -> ProbeData:
         """Follow every press from its start; ``frames`` hold whole presses, in order."""
-        from raytac.gel.surface import rest_height
-        from raytac.markers.sampling import height_and_slope, object_way
-
         xy = marker_centres(probe_sensor(sensor).markers)
         rest = np.concatenate([xy, rest_height(sensor.gelpad, xy[:, 0], xy[:, 1])[:, None]], axis=1)[None]
         cells = ContactCells.over(frames[0].surface.grid)
-        tracking = SurfaceMarkers()
-        rows: list[tuple] = []
+        tracking = SurfaceModel()
+        loads: list[str] = []
+        tables: list[np.ndarray] = []
+        rows: list[tuple[np.ndarray, ...]] = []
         for _, group in groupby(frames, key=lambda frame: frame.press.name):
             tracker = ContactTracker(1)
             for frame in group:
@@ -82,23 +83,15 @@ class ProbeData:
                 if frame.load not in LOADS:
                     continue
                 truth = tracking.displacement(rest, frame.surface, None, None)[..., :2]
-                height, slope, touched = height_and_slope(frame.surface, rest[..., :2])
-                penetration = np.where(touched, np.maximum(rest[..., 2] - height, 0), 0)
-                wall = slope / np.sqrt(1 + (slope**2).sum(axis=-1, keepdims=True))
-                way = object_way(contacts, rest[..., :2])
-                rows.append((truth[0], frame.load, samples.depth[0], samples.boxes[0], contacts, penetration[0], wall[0], way[0]))
-        most = max(row[4].table.shape[1] for row in rows)
-        tables = [np.pad(row[4].table[0], ((0, most - row[4].table.shape[1]), (0, 0))) for row in rows]
-        return cls(
-            cells=cells,
-            markers=xy,
-            truth=np.stack([row[0] for row in rows]),
-            loads=np.array([row[1] for row in rows]),
-            depth=np.stack([row[2] for row in rows]),
-            boxes=np.stack([row[3] for row in rows]),
-            contacts=Contacts(np.stack(tables)),
-            force=(np.stack([r[5] for r in rows]), np.stack([r[6] for r in rows]), np.stack([r[7] for r in rows])),
-        )
+                rows.append(
+                    (truth[0], samples.depth[0], samples.boxes[0], *(a[0] for a in contact_at(rest, frame.surface, contacts)))
+                )
+                loads.append(frame.load)
+                tables.append(contacts.table[0])
+        most = max(len(table) for table in tables)
+        padded = [np.pad(table, ((0, most - len(table)), (0, 0))) for table in tables]
+        truth, depth, boxes, *force = (np.stack(column) for column in zip(*rows, strict=True))
+        return cls(cells, xy, truth, np.array(loads), depth, boxes, Contacts(np.stack(padded)), (force[0], force[1], force[2]))
 
 
 def pattern_search(
@@ -125,102 +118,82 @@ def pattern_search(
 
 
 def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
-    """Constants that make FOTS and the force field closest to surface tracking: least mean distance, each kind of load weighing alike.
+    """Constants that bring FOTS and the force field closest to surface tracking: least mean distance, each kind of load weighted alike.
 
-    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation kept; these once as
-    published and once as a punch (``PunchSpec``), whose three constants shear and twist share. A cap is no more than the largest motion
-    in the data: beyond it nobody knows.
+    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation fixed. Shear and twist
+    are fitted once as published and once as a punch (``PunchSpec``), whose three constants they share. A cap is no more than the largest
+    motion in the data, since no larger one was measured.
     """
-    from raytac.markers.fots_kernel import TWIST_SLIP, FotsConstants, FotsKernel
+    from raytac.markers.fots import TWIST_SLIP, FotsKernel
 
     kernel = FotsKernel(data.cells.x, data.cells.y, device=device)
 
-    def error(constants: FotsConstants, rows: np.ndarray) -> float:
+    def error(motion: MarkerMotionSpec, rows: np.ndarray) -> float:
         markers = np.broadcast_to(data.markers, (len(rows), *data.markers.shape))
-        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], data.contacts.table[rows], constants)
+        moved = kernel.displacement(markers, data.depth[rows], data.boxes[rows], data.contacts.table[rows], motion)
         return float(np.linalg.norm(moved - data.truth[rows], axis=-1).mean())
 
-    def rows_of(load: str) -> np.ndarray:
-        return np.flatnonzero(data.loads == load)
-
+    normal, sheared, twisted = (np.flatnonzero(data.loads == load) for load in ("normal", "shear", "twist"))
     contacts = data.contacts
     shear_most = float(np.linalg.norm(contacts.shear, axis=-1).max())
     twist_most = float(np.abs(contacts.twist).max())
-    found = FotsConstants(1e9, 2.5e5, 2.5e5, max(shear_most, 1e-6), 2.5e5, max(twist_most, 1e-6))
-    starts = (found.dilate_gain, found.dilate_lambda)
+    gain, stiffness, friction = _fit_force_field(data)
+    caps = max(shear_most, 1e-6), max(twist_most, 1e-6)
+    motion = MarkerMotionSpec(_GAIN, _LAMBDA, _LAMBDA, caps[0], _LAMBDA, caps[1], gain, stiffness, friction, provenance="")
 
-    def dilation(x: np.ndarray) -> FotsConstants:
-        return replace(found, dilate_gain=starts[0] * math.exp(x[0]), dilate_lambda=starts[1] * math.exp(x[1]))
+    def dilated(x: np.ndarray) -> MarkerMotionSpec:
+        return replace(motion, dilate_gain=_GAIN * math.exp(x[0]), dilate_lambda=_LAMBDA * math.exp(x[1]))
 
-    normal = rows_of("normal")
-    # Gain and λ trade off along a valley; a coarse look over λ finds its deepest place first.
-    tries = [
-        pattern_search(lambda x, at=at: error(dilation(np.array([x[0], at])), normal), np.zeros(1)) for at in (-1.0, 0.0, 1.0)
-    ]
-    best = min(range(3), key=lambda k: tries[k][1])
-    x, _ = pattern_search(lambda x: error(dilation(x), normal), np.array([tries[best][0][0], (-1.0, 0.0, 1.0)[best]]))
-    found = dilation(x)
-    for load, name, most in (("shear", "shear", shear_most), ("twist", "twist", twist_most)):
-        rows = rows_of(load)
+    # Gain and λ trade off along a valley. A coarse search over λ selects where the fine one starts.
+    starts = (-1.0, 0.0, 1.0)
+    gains = [pattern_search(lambda x, at=at: error(dilated(np.array([x[0], at])), normal), np.zeros(1)) for at in starts]
+    best = min(range(3), key=lambda k: gains[k][1])
+    x, _ = pattern_search(lambda x: error(dilated(x), normal), np.array([gains[best][0][0], starts[best]]))
+    motion = dilated(x)
+    for name, rows, most in (("shear", sheared, shear_most), ("twist", twisted, twist_most)):
         if len(rows) == 0:
             continue
 
-        def dragged(x: np.ndarray, name: str = name, most: float = most, kept: FotsConstants = found) -> FotsConstants:
-            return replace(kept, **{f"{name}_lambda": 2.5e5 * math.exp(x[0]), f"{name}_max": most * _share(x[1])})
+        def dragged(x: np.ndarray, name: str = name, most: float = most, base: MarkerMotionSpec = motion) -> MarkerMotionSpec:
+            return replace(base, **{f"{name}_lambda": _LAMBDA * math.exp(x[0]), f"{name}_max": most * _logistic(x[1])})
 
         x, _ = pattern_search(lambda x, rows=rows, dragged=dragged: error(dragged(x), rows), np.array([0.0, 2.0]))
-        found = dragged(x)
+        motion = dragged(x)
     edge = contacts.radius
-    way = np.maximum(np.linalg.norm(contacts.shear, axis=-1), edge * np.abs(contacts.twist) / TWIST_SLIP)
-    slip_most = float((way[contacts.active] / (contacts.depth * edge)[contacts.active]).max())
-    dragged_rows = [rows for rows in (rows_of("shear"), rows_of("twist")) if len(rows)]
+    at_edge = np.maximum(np.linalg.norm(contacts.shear, axis=-1), edge * np.abs(contacts.twist) / TWIST_SLIP)
+    slip_most = float((at_edge[contacts.active] / (contacts.depth * edge)[contacts.active]).max())
+    dragged_rows = [rows for rows in (sheared, twisted) if len(rows)]
+    if not dragged_rows:
+        return motion
 
-    def as_punch(x: np.ndarray) -> FotsConstants:
-        return replace(found, punch=PunchSpec(_share(x[0]), 5e-3 * math.exp(x[1]), slip_most * _share(x[2])))
+    def punched(x: np.ndarray) -> MarkerMotionSpec:
+        return replace(motion, punch=PunchSpec(_logistic(x[0]), _REACH * math.exp(x[1]), slip_most * _logistic(x[2])))
 
-    if dragged_rows:
+    def cost(x: np.ndarray) -> float:
+        return sum(error(punched(x), rows) for rows in dragged_rows)
 
-        def cost(x: np.ndarray) -> float:
-            return sum(error(as_punch(x), rows) for rows in dragged_rows)
-
-        # Where nothing slips, slip does not matter: a coarse look finds where it begins to.
-        slips = np.linspace(-5.0, 3.0, 9)
-        begin = min(slips, key=lambda at: cost(np.array([0.0, 0.0, at])))
-        x, _ = pattern_search(cost, np.array([0.0, 0.0, begin]))
-        found = as_punch(x)
-    gain, stiffness, friction = _fit_force_field(data)
-    return MarkerMotionSpec(
-        dilate_gain=found.dilate_gain,
-        dilate_lambda=found.dilate_lambda,
-        shear_lambda=found.shear_lambda,
-        shear_max=found.shear_max,
-        twist_lambda=found.twist_lambda,
-        twist_max=found.twist_max,
-        field_gain=gain,
-        field_shear=stiffness,
-        field_friction=friction,
-        punch=found.punch,
-        provenance="",
-    )
+    # The cost does not depend on slip where nothing slips. A coarse search selects where it begins to.
+    begin = min(np.linspace(-5.0, 3.0, 9), key=lambda at: cost(np.array([0.0, 0.0, at])))
+    x, _ = pattern_search(cost, np.array([0.0, 0.0, begin]))
+    return punched(x)
 
 
-def _share(x: float) -> float:
-    """A number in (0, 1) for any x."""
+def _logistic(x: float) -> float:
     return 1.0 / (1.0 + math.exp(-x))
 
 
 def _fit_force_field(data: ProbeData) -> tuple[float, float, float]:
     """(gain, k_t / k_n, friction) of the force field."""
-    depth, wall, way = data.force
-    length = np.linalg.norm(way, axis=-1)
-    along = way / np.maximum(length, 1e-12)[..., None]
+    depth, normal, shear = data.force
+    length = np.linalg.norm(shear, axis=-1)
+    direction = shear / np.maximum(length, 1e-12)[..., None]
     weight = np.array([1.0 / np.sum(data.loads == load) for load in data.loads])
     weight /= weight.sum()
 
     def cost(x: np.ndarray) -> float:
         gain, stiffness, friction = np.exp(x)
-        held = np.minimum(stiffness * length, friction * depth)
-        moved = gain * (depth[..., None] * wall + held[..., None] * along)
+        tangential = np.minimum(stiffness * length, friction * depth)
+        moved = gain * (depth[..., None] * normal + tangential[..., None] * direction)
         return float(weight @ np.linalg.norm(moved - data.truth, axis=-1).mean(axis=-1))
 
     x, _ = pattern_search(cost, np.zeros(3))
@@ -252,30 +225,28 @@ def model_errors(
     frames: Sequence[PressFrame],
     grid: PadGrid,
     *,
-    models: Sequence[str] = MARKER_MODELS,
+    models: Sequence[str] | None = None,
     device: str = "auto",
 ) -> tuple[list[ModelError], dict[str, float]]:
     """Errors of every model by kind of load, and the median time of a frame of every model [ms] at the probes.
 
-    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: of ``MARKER_MODELS`` or
-    ``PUBLISHED``.
+    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: names of ``MARKERS``; None is all
+    that need no coat.
     """
+    models = models_without_coat() if models is None else models
     probed = probe_sensor(sensor)
-    motion = sensor.marker_motion
-    published = probed if motion is None else replace(probed, marker_motion=replace(motion, punch=None))
     moved: dict[str, list[np.ndarray]] = {}
     pixels: dict[str, list[np.ndarray]] = {}
     times: dict[str, list[float]] = {}
     loads = [frame.load for frame in frames if frame.load in LOADS]
     for model in dict.fromkeys(("surface", *models)):
-        as_published = model == PUBLISHED
-        tracker = MarkerTracker(published if as_published else probed, "fots" if as_published else model, grid, device=device)
+        tracker = MarkerTracker(probed, model, grid, device=device)
         for _, group in groupby(frames, key=lambda frame: frame.press.name):
             tracker.reset()
             for frame in group:
-                begun = time.perf_counter()
+                start = time.perf_counter()
                 markers = tracker.update(frame.surface)
-                times.setdefault(model, []).append(1e3 * (time.perf_counter() - begun))
+                times.setdefault(model, []).append(1e3 * (time.perf_counter() - start))
                 if frame.load in LOADS:
                     moved.setdefault(model, []).append(markers.displacement[0])
                     pixels.setdefault(model, []).append(markers.displacement_px[0])
@@ -283,8 +254,8 @@ def model_errors(
     size = np.linalg.norm(truth, axis=-1)
     errors = []
     for model in models:
-        off = np.linalg.norm(np.stack(moved[model]) - truth, axis=-1)
-        off_px = np.linalg.norm(np.stack(pixels[model]) - truth_px, axis=-1)
+        error = np.linalg.norm(np.stack(moved[model]) - truth, axis=-1)
+        error_px = np.linalg.norm(np.stack(pixels[model]) - truth_px, axis=-1)
         for load in LOADS:
             rows = np.array([one == load for one in loads])
             if not rows.any():
@@ -295,10 +266,10 @@ def model_errors(
                     model=model,
                     load=load,
                     frames=int(rows.sum()),
-                    mean=float(off[rows].mean()),
-                    p95=float(np.percentile(off[rows], 95)),
-                    moved=float(off[rows][far].mean()) if far.any() else float("nan"),
-                    mean_px=float(off_px[rows].mean()),
+                    mean=float(error[rows].mean()),
+                    p95=float(np.percentile(error[rows], 95)),
+                    moved=float(error[rows][far].mean()) if far.any() else float("nan"),
+                    mean_px=float(error_px[rows].mean()),
                     size=float(size[rows].mean()),
                 )
             )

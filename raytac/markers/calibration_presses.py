@@ -1,4 +1,4 @@
-"""Presses of the simulated pad that marker models are fitted to and tested on: normal, then sheared, twisted, or both at once."""
+"""Presses of the soft pad that marker models are fitted to and tested on: normal, then sheared, twisted, or both at once."""
 
 from __future__ import annotations
 
@@ -29,25 +29,28 @@ __all__ = [
 LOADS = ("normal", "shear", "twist", "combined")
 """Kinds of load that errors are given for."""
 _PITCH = 0.1e-3
+"""Spacing of the pad's grid [m], as that of a sensor at its own resolution."""
 _STEPS = 4
-"""States a stage; of a press with shear and twist, steps of either, in turn."""
+"""States a stage; of a press with shear and twist, steps of each, in turn."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """One trajectory: an object at a place, pressed to ``depth`` [m], then sheared by ``shear`` [m], twisted by ``twist`` [rad], or both:
-    a step of one, a step of the other, and so on.
-    """
+    """One trajectory: an object is pressed, then sheared or twisted; or both, a step of one and a step of the other in turn."""
 
     name: str
     kind: str
     params: dict[str, float | int | str]
     place: tuple[float, float]
+    """Position of the object on the pad [m]."""
     depth: float
+    """Depth of the indentation [m]."""
     shear: tuple[float, float] = (0.0, 0.0)
+    """Shear after the indentation [m]."""
     twist: float = 0.0
+    """Twist after the indentation [rad]."""
     turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Quaternion (w, x, y, z) that turns the object before it is pressed."""
+    """Quaternion (w, x, y, z) that rotates the object before the press."""
 
     @property
     def is_combined(self) -> bool:
@@ -120,7 +123,7 @@ FIT = (
     *_presses("ball4-slides", "sphere", {"radius": 4e-3}, (0.0, 0.0), 0.3e-3, (0.9e-3, 0.6e-3), 45.0),
     *_presses("punch3-slides", "cylinder", {"radius": 3e-3, "length": 6e-3}, (1.0e-3, 0.0), 0.2e-3, (-0.8e-3, 0.8e-3), 40.0),
 )
-"""Presses that models are fitted to; the last ones so light that they slide, else no cap could be known."""
+"""Presses that models are fitted to; the last ones slide, since they are light: without them no cap could be fitted."""
 HELD_OUT = (
     *_presses("ball6", "sphere", {"radius": 6e-3}, (-2.5e-3, 1.5e-3), 0.9e-3, (0.5e-3, -0.6e-3), 25.0),
     *_presses("punch2", "cylinder", {"radius": 2e-3, "length": 6e-3}, (3.0e-3, -1.5e-3), 0.8e-3, (-0.8e-3, 0.0), -30.0),
@@ -135,39 +138,36 @@ HELD_OUT = (
     _both("punch2-both", "cylinder", {"radius": 2e-3, "length": 6e-3}, (2.0e-3, -1.0e-3), 0.3e-3, (0.2e-3, 0.7e-3), 45.0),
     _both("cone-both", "cone", {"radius": 4e-3, "height": 3e-3, "tip_radius": 1.5e-3}, (-2.0e-3, 1.0e-3), 0.4e-3, (0.4e-3, -0.5e-3), -35.0),
 )  # fmt: skip
-"""Presses that no fit sees: other objects, other places, other directions; a bar that lies, a ball that slides, and shear with twist."""
+"""Presses that no fit uses: other objects, places and directions; a lying bar, a ball that slides, and shear with twist."""
 QUICK_FIT, QUICK_HELD_OUT = FIT[:2], HELD_OUT[:2]
-"""Few presses, to see that all runs."""
+"""Few presses, for a quick run that shows that everything works."""
 
 
 @dataclass(frozen=True)
 class PressFrame:
-    """One state of a press.
-
-    ``surface`` is what the rigid pad makes of the object at this pose, which is what models of heights are used on, with the ``coat`` of
-    the simulated pad at the same state, which ``surface`` tracking uses.
-    """
+    """One state of a press."""
 
     press: Press
     load: str
     """One of ``LOADS``; ``start`` before the touch."""
     surface: GelSurface
+    """Surface of the rigid pad at the object's pose, for models of heights, with the ``coat`` of the soft pad in the same state."""
 
 
 @dataclass(frozen=True)
 class PressStates:
-    """What the simulated pad says of one press, in N states: all that takes long to find out."""
+    """Result of the soft pad for one press, in N states: all that takes long to compute."""
 
     loads: tuple[str, ...]
     """Kind of load of each state, as in ``PressFrame``."""
     poses: np.ndarray
     """``pad_from_object``, shape (N, 4, 4)."""
     coat: DeformedCoat
-    """The coat, its states in place of environments."""
+    """Coat, with states in place of environments."""
 
 
-def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = "cpu") -> PressStates:
-    """Run a press on the simulated pad of level ``pad``.
+def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str = "cpu") -> PressStates:
+    """Run a press on the soft pad of a ``level``.
 
     Raises:
         BackendError: the solver is not installed.
@@ -176,16 +176,16 @@ def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = 
     """
     from raytac.physics.soft.availability import check_solver
 
-    check_solver("a press on the simulated pad")
+    check_solver("a press on the soft pad")
     from raytac.physics.soft.pad import SoftPad
 
-    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, pad=pad, device=device)
+    soft = SoftPad(sensor, press.scene(), pitch=_PITCH, level=level, device=device)
     loads, poses, coats = [], [], []
     names = {"indent": "normal"} | ({"shear": "combined", "twist": "combined"} if press.is_combined else {})
     for state in soft.run(steps_per_stage=1 if press.is_combined else _STEPS):
         if state.failed.any():
             raise RaytacError(f"the press {press} did not settle")
-        coat = soft.surface(state).coat
+        coat = state.surface.coat
         assert coat is not None
         loads.append(names.get(state.kind, state.kind))
         poses.append(np.asarray(state.pad_from_object)[0])
@@ -194,7 +194,7 @@ def simulate_press(sensor: SensorSpec, press: Press, *, pad: str, device: str = 
 
 
 def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
-    """The states of a press, in order, with what the rigid pad makes of the object at the same poses.
+    """States of a press, in order, with the rigid pad's surface at the same poses.
 
     Raises:
         SpecError: the press does not fit this sensor.

@@ -1,4 +1,4 @@
-"""Separate contacts of every pad, and how far the object has dragged and turned each since it first touched."""
+"""Separate contacts of every pad, and the drag and the turn of the object at each since first touch."""
 
 from __future__ import annotations
 
@@ -10,21 +10,38 @@ from typing import NamedTuple
 
 import numpy as np
 
+from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.gel.components import find_edges, join_runs
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
 
-__all__ = ["CELL", "ContactCells", "ContactSamples", "ContactTracker", "Contacts", "contact_boxes"]
+__all__ = ["ContactCells", "ContactSamples", "ContactSettings", "ContactTracker", "Contacts", "contact_boxes"]
 
-CELL = 0.4e-3
-"""Largest cell over which a contact is averaged [m], unless the pad's grid is coarser; narrower gaps do not part two contacts."""
-_REACH = 1e-3
-"""How far a contact may be from where the object's motion would have carried it, beyond its own radius, and still be the same [m]."""
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Sampling of contacts, and tracking from one surface to the next."""
+
+    cell: float = 0.4e-3
+    """Largest side of a cell that a contact is averaged over [m], unless the pad's grid is coarser.
+
+    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size.
+    """
+    reach: float = 1e-3
+    """Distance from where the object's motion carries an earlier contact, beyond its radius, up to which a contact is that one [m].
+
+    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down.
+    """
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (is_number(value) and 0.0 < value < math.inf):
+                raise InputError(name, value=value, rule="must be finite and > 0 [m]")
 
 
 @dataclass(frozen=True)
 class ContactCells:
-    """The pad's face in cells of whole grid nodes."""
+    """Cells of whole grid nodes that cover the pad's face."""
 
     grid: PadGrid
     nodes: tuple[int, int]
@@ -35,8 +52,10 @@ class ContactCells:
     """Centres of the rows [m], shape (ny,)."""
 
     @classmethod
-    def over(cls, grid: PadGrid) -> ContactCells:
-        nodes = tuple(max(1, int(CELL / pitch + 1e-9)) for pitch in grid.pitch)
+    def over(cls, grid: PadGrid, settings: ContactSettings | None = None) -> ContactCells:
+        """Cells of a grid; ``settings``: None is the default ones."""
+        size = (settings or ContactSettings()).cell
+        nodes = tuple(max(1, int(size / pitch + 1e-9)) for pitch in grid.pitch)
         x, y = (
             first + pitch * (count * np.arange(-(-len(line) // count)) + 0.5 * (count - 1))
             for first, pitch, count, line in zip((grid.x[0], grid.y[0]), grid.pitch, nodes, (grid.x, grid.y), strict=True)
@@ -84,14 +103,14 @@ class ContactCells:
         r0, r1, c0, c1 = r0 // ky, -(-r1 // ky), c0 // kx, -(-c1 // kx)
         part = np.s_[:, r0 * ky : r1 * ky, c0 * kx : c1 * kx]
         touched = mask[part]
-        found = self._rest[part[1:]] - surface.height[part]
-        np.maximum(found, 0, out=found)
-        if not math.isfinite(found.sum()):
-            touched = touched & np.all(np.isfinite(found), axis=(1, 2))[:, None, None]
-            found = np.where(touched, found, np.float32(0))
-        np.multiply(found, touched, out=found)
+        indentation = self._rest[part[1:]] - surface.height[part]
+        np.maximum(indentation, 0, out=indentation)
+        if not math.isfinite(indentation.sum()):
+            touched = touched & np.all(np.isfinite(indentation), axis=(1, 2))[:, None, None]
+            indentation = np.where(touched, indentation, np.float32(0))
+        np.multiply(indentation, touched, out=indentation)
         cells = np.s_[:, r0:r1, c0:c1]
-        depth[cells] = self._pooled(np.add, found, r1 - r0, c1 - c0) / np.float32(kx * ky)
+        depth[cells] = self._pooled(np.add, indentation, r1 - r0, c1 - c0) / np.float32(kx * ky)
         contact[cells] = self._pooled(np.logical_or, touched, r1 - r0, c1 - c0)
         return ContactSamples(self, depth, contact, (r0, r1, c0, c1))
 
@@ -107,19 +126,19 @@ class ContactCells:
 
 @dataclass(frozen=True)
 class ContactSamples:
-    """Contact of B pads by cell: ``depth`` [m], (B, ny, nx), float32: mean of max(rest − height, 0) where the object touches, 0 where it
-    does not; ``contact`` (B, ny, nx), bool: whether it touches the cell at all; ``box``: rows [r0, r1) and columns [c0, c1) outside of
-    which no environment has contact.
-    """
+    """Contact of B pads by cell."""
 
     cells: ContactCells
     depth: np.ndarray
+    """Mean of max(rest − height, 0) where the object touches, 0 where it does not [m], (B, ny, nx), float32."""
     contact: np.ndarray
+    """True where the object touches the cell at all, (B, ny, nx), bool."""
     box: tuple[int, int, int, int]
+    """Rows [r0, r1) and columns [c0, c1) outside of which no environment has contact."""
 
     @property
     def boxes(self) -> np.ndarray:
-        """Columns [c0, c1) and rows [r0, r1) that hold the contact of each environment, (B, 4), uint32; all 0 without contact."""
+        """Columns [c0, c1) and rows [r0, r1) that contain the contact of each environment, (B, 4), uint32; all 0 without contact."""
         if len(self.contact) > 1:
             return contact_boxes(self.contact)
         r0, r1, c0, c1 = self.box
@@ -127,8 +146,8 @@ class ContactSamples:
 
 
 def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Rows [r0, r1) and columns [c0, c1) that hold what is True in a mask (Ny, Nx); all 0 if nothing is."""
-    # Bytes are searched, from either end, several times faster than an array is reduced.
+    """Rows [r0, r1) and columns [c0, c1) that contain the True values of a mask (Ny, Nx); all 0 if there are none."""
+    # A search in bytes, from either end, is several times faster than a reduction of the array.
     flat, width = mask.tobytes(), mask.shape[1]
     first = flat.find(1)
     if first < 0:
@@ -148,17 +167,17 @@ def contact_boxes(contact: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Contacts:
-    """Up to K contacts of each of B pads; rows that are not ``active`` hold zeros.
+    """Up to K contacts of each of B pads; rows that are not ``active`` are zero.
 
-    ``table`` (B, K, 12) holds them as columns: ``active``, ``centre`` (2), ``shear`` (2), ``twist``, ``ellipse`` (3), ``depth``,
-    ``radius`` and the height z of the pressed gel.
+    ``table`` (B, K, 12) has the columns ``active``, ``centre`` (2), ``shear`` (2), ``twist``, ``ellipse`` (3), ``depth``, ``radius`` and
+    the height z of the pressed gel.
     """
 
     table: np.ndarray
 
     @property
     def active(self) -> np.ndarray:
-        """Which rows are contacts, (B, K), bool."""
+        """True for rows that are contacts, (B, K), bool."""
         return self.table[..., 0] > 0
 
     @property
@@ -168,20 +187,19 @@ class Contacts:
 
     @property
     def shear(self) -> np.ndarray:
-        """Tangential way of the object at the contact since first touch [m], (B, K, 2)."""
+        """Tangential displacement of the object at the contact since first touch [m], (B, K, 2)."""
         return self.table[..., 3:5]
 
     @property
     def twist(self) -> np.ndarray:
-        """Turn of the object about +z since first touch [rad], (B, K)."""
+        """Rotation of the object about +z since first touch [rad], (B, K)."""
         return self.table[..., 5]
 
     @property
     def ellipse(self) -> np.ndarray:
-        """T_xx, T_xy, T_yy of xᵀ T⁻¹ x = 1 [m²], (B, K, 3).
+        """T_xx, T_xy, T_yy of the ellipse xᵀ T⁻¹ x = 1 [m²], (B, K, 3).
 
-        The ellipse of the contact's area whose axes have the directions and the ratio of the cells' second moments; a disc has
-        T = radius² 1.
+        It has the contact's area, and its axes have the directions and the ratio of the cells' second moments. A disc has T = radius² 1.
         """
         return self.table[..., 6:9]
 
@@ -192,10 +210,10 @@ class Contacts:
 
     @property
     def radius(self) -> np.ndarray:
-        """Of a disc with the area of all cells that the contact touches [m], (B, K).
+        """Radius of a disc with the area of all cells that the contact touches [m], (B, K).
 
-        That is more than the contact's own: for a disc of radius R by cells whose nodes span a × b, on average
-        π radius² = π R² + 2 R (a + b) + a b (Steiner), about R + (a + b)/π, so 0.2 mm for cells of 0.4 mm.
+        It is larger than the contact's own: for a disc of radius R and cells whose nodes span a × b, on average
+        π radius² = π R² + 2 R (a + b) + a b (Steiner), about R + (a + b)/π; 0.2 mm more for cells of 0.4 mm.
         """
         return self.table[..., 10]
 
@@ -222,22 +240,22 @@ _NO_CONTACT = (0.0,) * 12
 
 
 class ContactTracker:
-    """Finds the contacts of each surface in turn and sums up the object's motion at each of them.
+    """Detects the contacts of each surface in turn and sums up the object's motion at each of them.
 
-    A contact is a connected piece of the contact. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
-    frame); a contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's turn about z to its twist: the way of the
-    object's material where it touches, so that rolling, in which that stands still, adds none. A contact is the same as one before if it
-    lies where D carries that one, to within its radius and 1 mm; otherwise it is new and starts from zero. Without contact the
-    history is gone.
+    A contact is a connected component of the contact mask. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
+    frame). A contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's rotation about z to its twist. This is the motion
+    of the object's material where it touches, which is zero in rolling. A contact is an earlier one if it lies where D carries that one,
+    to within its radius and ``ContactSettings.reach``; otherwise it is new and starts from zero. Without contact the history is dropped.
     """
 
-    def __init__(self, batch: int) -> None:
-        self.batch = batch
+    def __init__(self, batch: int, settings: ContactSettings | None = None) -> None:
+        """For ``batch`` environments; ``settings``: None is the default ones."""
+        self.batch, self._reach = batch, (settings or ContactSettings()).reach
         self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
         self._pose: list[_Pose | None] = [None] * batch
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Forget the history of environments: a mask (B,), a list, or None for all.
+        """Drop the history of environments: a mask (B,), a list, or None for all.
 
         Raises:
             InputError: an environment that does not exist, or a mask of the wrong length.
@@ -249,7 +267,7 @@ class ContactTracker:
     def update(self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None) -> Contacts:
         """Contacts of ``surface``, whose ``samples`` are given; call once for every surface, in order.
 
-        ``envs``: which environment each of its rows is of; None is all.
+        ``envs``: environment of each row of the surface; None is all.
 
         Raises:
             InputError: a surface of another number of environments.
@@ -257,26 +275,40 @@ class ContactTracker:
         chosen = range(self.batch) if envs is None else envs
         if surface.batch != len(chosen):
             raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")
-        pose = surface.pad_from_object
-        now: list[_Pose | None] = [None] * len(chosen) if pose is None else np.asarray(pose).tolist()
+        matrices = surface.pad_from_object
+        poses: list[_Pose | None] = [None] * len(chosen) if matrices is None else np.asarray(matrices).tolist()
         history = [(self._contacts[b], self._pose[b]) for b in chosen]
         contacts = [
-            _followed(found, before, _motion(last, at)) if found and before else found
-            for found, (before, last), at in zip(_find(samples), history, now, strict=True)
+            self._continued(now, before, _motion(last, pose)) if now and before else now
+            for now, (before, last), pose in zip(_detect(samples), history, poses, strict=True)
         ]
-        for b, found, at in zip(chosen, contacts, now, strict=True):
-            self._contacts[b], self._pose[b] = found, at
+        for b, now, pose in zip(chosen, contacts, poses, strict=True):
+            self._contacts[b], self._pose[b] = now, pose
         count = max(1, max(map(len, contacts)))
-        return Contacts(np.array([[(1.0, *c) for c in found] + [_NO_CONTACT] * (count - len(found)) for found in contacts]))
+        return Contacts(np.array([[(1.0, *c) for c in now] + [_NO_CONTACT] * (count - len(now)) for now in contacts]))
+
+    def _continued(self, contacts: list[_Contact], before: list[_Contact], motion: tuple[float, ...]) -> list[_Contact]:
+        """Contacts with the histories of those ``before`` that the motion carries to them."""
+        xx, xy, xz, x, yx, yy, yz, y, angle = motion
+        carried = [(c, xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y) for c in before]
+        result = []
+        for now in contacts:
+            at = now.x, now.y
+            c, cx, cy = min(carried, key=lambda one: math.dist(at, one[1:]))
+            if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + self._reach:
+                result.append(_Contact(*at, c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + angle, *now[5:]))
+            else:
+                result.append(now)
+        return result
 
 
 def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:
-    """D = T_now T_before⁻¹: its rows of x and y, (xx, xy, xz, x, yx, yy, yz, y), and its turn about z; no motion if a pose is not known."""
+    """D = T_now T_before⁻¹: rows of x and y, (xx, xy, xz, x, yx, yy, yz, y), and rotation about z; the identity if a pose is unknown."""
     if before is not None and now is not None:
         xx, xy, xz = (_dot(now[0], row) for row in before[:3])
         yx, yy, yz = (_dot(now[1], row) for row in before[:3])
-        at = [row[3] for row in before[:3]]
-        x, y = now[0][3] - _dot((xx, xy, xz), at), now[1][3] - _dot((yx, yy, yz), at)
+        origin = [row[3] for row in before[:3]]
+        x, y = now[0][3] - _dot((xx, xy, xz), origin), now[1][3] - _dot((yx, yy, yz), origin)
         motion = xx, xy, xz, x, yx, yy, yz, y, math.atan2(yx - xy, xx + yy)
         if math.isfinite(sum(motion)):
             return motion
@@ -287,40 +319,25 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _followed(found: list[_Contact], before: list[_Contact], motion: tuple[float, ...]) -> list[_Contact]:
-    """``found`` with the histories of those contacts before that the motion carries to them."""
-    xx, xy, xz, x, yx, yy, yz, y, turn = motion
-    carried = [(c, xx * c.x + xy * c.y + xz * c.z + x, yx * c.x + yy * c.y + yz * c.z + y) for c in before]
-    followed = []
-    for now in found:
-        at = now.x, now.y
-        c, cx, cy = min(carried, key=lambda one: math.dist(at, one[1:]))
-        if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + _REACH:
-            followed.append(_Contact(*at, c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + turn, *now[5:]))
-        else:
-            followed.append(now)
-    return followed
-
-
-def _find(samples: ContactSamples) -> list[list[_Contact]]:
-    """The contacts of every environment, in order of their first row, without history."""
+def _detect(samples: ContactSamples) -> list[list[_Contact]]:
+    """Contacts of every environment, in order of their first row, without history."""
     cells, (r0, r1, c0, c1) = samples.cells, samples.box
-    found: list[list[_Contact]] = [[] for _ in range(len(samples.contact))]
+    contacts: list[list[_Contact]] = [[] for _ in range(len(samples.contact))]
     if r1 == r0:
-        return found
+        return contacts
     edges = find_edges(samples.contact[:, r0:r1, c0:c1])
     if len(edges) == 0:
-        return found
+        return contacts
     ny, nx = r1 - r0, c1 - c0
-    # Indentation and its moment along x, each run's by one sum. A touch of no depth still has a place: the floor keeps its weights from
-    # all being zero.
-    weights = np.zeros((2, len(found) * ny, nx + 1))
+    # Indentation and its moment along x, summed over each run at once. The floor keeps the weights of a touch of no depth from all
+    # being zero.
+    weights = np.zeros((2, len(contacts) * ny, nx + 1))
     np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9, out=weights[0, :, :nx])
     np.multiply(weights[0, :, :nx], cells.x[c0:c1], out=weights[1, :, :nx])
     total, along = np.add.reduceat(weights.reshape(2, -1), edges, axis=1)[:, ::2].tolist()
     rows, columns = (part.tolist() for part in np.divmod(edges, nx + 1))
     rows, starts, stops, y = rows[::2], columns[::2], columns[1::2], cells.y[r0:r1].tolist()
-    # Second moments are taken about the box's corner, in cells: whole numbers, so that nothing cancels.
+    # Second moments are taken about the box's corner in cells: of whole numbers, nothing cancels.
     pieces: dict[int, list[float]] = {}
     for number, row, start, stop, w, wx in zip(
         join_runs(rows, starts, stops, ny), rows, starts, stops, total, along, strict=True
@@ -348,5 +365,5 @@ def _find(samples: ContactSamples) -> list[list[_Contact]]:
         at, depth = (wx / w, wy / w), w / count
         z = cells.rest_at(*at) - depth
         one = _Contact(*at, 0.0, 0.0, 0.0, scale * xx, scale * xy, scale * yy, depth, math.sqrt(area), z)
-        found[rows[number] // ny].append(one)
-    return found
+        contacts[rows[number] // ny].append(one)
+    return contacts

@@ -6,8 +6,8 @@ with markers after normalising it; here one fitted gain does that, so that it ca
 
     Δd = g (δ n_xy + min(k ‖s‖, μ δ) s / ‖s‖)
 
-with the penetration δ, the object's outward normal n, and s the way of the object's material at the marker since first touch. A marker
-outside the contact does not move at all, which is what the model is known for.
+with the penetration δ, the object's outward normal n, and s the displacement of the object's material at the marker since first touch. A
+marker outside the contact does not move at all, which is what the model is known for.
 """
 
 from __future__ import annotations
@@ -16,23 +16,27 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface
 from raytac.markers.contacts import Contacts, ContactSamples
-from raytac.markers.fots import marker_motion_of
-from raytac.markers.sampling import height_and_slope, object_way
-from raytac.specs.sensor import SensorSpec
+from raytac.markers.sampling import height_and_slope, object_displacement
+from raytac.specs.marker_motion import MarkerMotionSpec
 
-__all__ = ["ForceFieldMarkers"]
+__all__ = ["ForceFieldModel", "contact_at"]
 
 
-class ForceFieldMarkers:
-    """The model ``force_field``; constants from the sensor's marker motion."""
+def contact_at(rest: np.ndarray, surface: GelSurface, contacts: Contacts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Penetration δ (B, M) [m], n_xy (B, M, 2) and the object's displacement s (B, M, 2) [m] at markers at ``rest`` (B, M, 3) [m]."""
+    height, slope, touched = height_and_slope(surface, rest[..., :2])
+    depth = np.where(touched, np.maximum(rest[..., 2] - height, 0.0), 0.0)
+    normal = slope / np.sqrt(1.0 + (slope**2).sum(axis=-1, keepdims=True))
+    return depth, normal, object_displacement(contacts, rest[..., :2])
 
-    name = "force_field"
+
+class ForceFieldModel:
+    """Model of ``ForceField``."""
+
     needs_contacts = True
     device = "cpu"
 
-    def __init__(self, sensor: SensorSpec) -> None:
-        """Raises ``InputError`` if the sensor has no marker motion."""
-        motion = marker_motion_of(sensor)
+    def __init__(self, motion: MarkerMotionSpec) -> None:
         self.gain, self.shear, self.friction = motion.field_gain, motion.field_shear, motion.field_friction
 
     def displacement(
@@ -40,10 +44,7 @@ class ForceFieldMarkers:
     ) -> np.ndarray:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert contacts is not None
-        height, slope, touched = height_and_slope(surface, rest[..., :2])
-        depth = np.where(touched, np.maximum(rest[..., 2] - height, 0.0), 0.0)
-        wall = slope / np.sqrt(1.0 + (slope**2).sum(axis=-1, keepdims=True))
-        way = object_way(contacts, rest[..., :2])
-        length = np.linalg.norm(way, axis=-1)
-        held = np.minimum(self.shear * length, self.friction * depth) / np.maximum(length, 1e-12)
-        return self.gain * (depth[..., None] * wall + held[..., None] * way)
+        depth, normal, shear = contact_at(rest, surface, contacts)
+        length = np.linalg.norm(shear, axis=-1)
+        share = np.minimum(self.shear * length, self.friction * depth) / np.maximum(length, 1e-12)
+        return self.gain * (depth[..., None] * normal + share[..., None] * shear)

@@ -1,4 +1,4 @@
-"""The dots on the coat at rest: where they are, and that the camera sees them."""
+"""Dots on the coat: their positions at rest, which the camera must see, and the ink that they print on the surface."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.surface import rest_height
+from raytac.gel.surface import PadGrid, rest_height
 from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
-__all__ = ["MarkerPattern", "camera_of", "marker_centres"]
+__all__ = ["MarkerPattern", "camera_of", "dot_ink", "marker_centres"]
 
 
 def marker_centres(spec: MarkerSpec) -> np.ndarray:
@@ -32,16 +32,15 @@ def camera_of(sensor: SensorSpec, resolution: tuple[int, int] | None = None) -> 
 
 @dataclass(frozen=True)
 class MarkerPattern:
-    """Dots at rest, the same in B environments or shifted in each.
-
-    ``rest`` [m], shape (1 or B, M, 3), pad frame, on the surface at rest; ``pixel`` [px], shape (1 or B, M, 2): where ``camera``
-    shows them. ``radius`` [m]: of a dot.
-    """
+    """Dots at rest, the same in B environments or shifted in each."""
 
     rest: np.ndarray
+    """Positions on the surface at rest, pad frame [m], shape (1 or B, M, 3)."""
     pixel: np.ndarray
+    """Projections of ``rest`` by ``camera`` [px], shape (1 or B, M, 2)."""
     camera: Pinhole
     radius: float
+    """Radius of a dot [m]."""
 
     @classmethod
     def of(
@@ -52,7 +51,7 @@ class MarkerPattern:
         shift: np.ndarray | None = None,
         turn: np.ndarray | None = None,
     ) -> MarkerPattern:
-        """Place the sensor's dots, moved by ``shift`` (B, 2) [m] and turned by ``turn`` (B,) [rad] about the pad's centre if given.
+        """Place the sensor's dots, turned by ``turn`` (B,) [rad] about the pad's centre, then moved by ``shift`` (B, 2) [m].
 
         Raises:
             InputError: the sensor has no markers, or a shift takes one off the pad or out of the view.
@@ -63,7 +62,7 @@ class MarkerPattern:
             rule = "has no markers; give it a pattern ([markers] in its file), or take a sensor that has one, such as gelsight_mini_7x9"
             raise InputError("sensor", value=sensor.name, rule=rule)
         xy = marker_centres(spec)[None]
-        moved = shift is not None or turn is not None
+        is_moved = shift is not None or turn is not None
         if turn is not None:
             c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
             xy = np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
@@ -83,8 +82,10 @@ class MarkerPattern:
             at = tuple(round(float(v), 1) for v in pixel[b, m])
             width, height = camera.resolution
             rule = f"marker (row {row}, column {column}) lies outside the view: at pixel {at} of an image of {width} x {height}"
-            if moved:
-                raise InputError("shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its place in mm)")
+            if is_moved:
+                raise InputError(
+                    "shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its position in mm)"
+                )
             raise SpecError(rule, file=sensor.source, key="markers.pitch_mm", value=[1e3 * p for p in spec.pitch])
         return cls(rest, pixel, camera, spec.radius)
 
@@ -102,3 +103,39 @@ class MarkerPattern:
         if len(self.rest) not in (1, batch):
             raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
         return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))
+
+
+def dot_ink(grid: PadGrid, centres: np.ndarray, radius: float) -> np.ndarray:
+    """Coverage by round dots, shape (B, Ny, Nx), float32 in [0, 1].
+
+    ``centres`` [m], (B, M, 2) or (B, M, 3), pad frame: present positions of the dots; ``radius`` [m]. A dot stays round: the strain inside
+    it is neglected. Its edge is one grid spacing wide, so that images interpolate it without steps. Centres that are not finite print no
+    dot.
+    """
+    dx, dy = grid.pitch
+    ny, nx = grid.shape
+    batch = len(centres)
+    ink = np.zeros((batch, ny, nx), dtype=np.float32)
+    env, marker = np.nonzero(np.isfinite(centres[..., :2]).all(axis=-1))
+    x, y = centres[env, marker, 0], centres[env, marker, 1]
+    kx, ky = int(np.ceil(radius / dx)) + 1, int(np.ceil(radius / dy)) + 1
+    column, row = np.rint((x - grid.x[0]) / dx).astype(int), np.rint((y - grid.y[0]) / dy).astype(int)
+    columns, rows = column[:, None] + np.arange(-kx, kx + 1), row[:, None] + np.arange(-ky, ky + 1)
+    # Single precision is enough for distances within a dot.
+    ex = (grid.x[0] + columns * dx - x[:, None]).astype(np.float32)
+    ey = (grid.y[0] + rows * dy - y[:, None]).astype(np.float32)
+    share = np.sqrt((ex * ex)[:, None, :] + (ey * ey)[:, :, None])
+    share *= np.float32(-1.0 / max(dx, dy))
+    share += np.float32(radius / max(dx, dy) + 0.5)
+    np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+    node = ((env * ny)[:, None] + rows)[:, :, None] * nx + columns[:, None, :]
+    if len(env) and (rows.min() < 0 or rows.max() >= ny or columns.min() < 0 or columns.max() >= nx):
+        on_pad = ((rows >= 0) & (rows < ny))[:, :, None] & ((columns >= 0) & (columns < nx))[:, None, :]
+        node, share = node[on_pad], share[on_pad]
+    node, share, flat = node.reshape(-1), share.reshape(-1), ink.reshape(-1)
+    # The greatest share of each node. Dots seldom overlap, so one round is enough, in a tenth of the time of ``np.maximum.at``.
+    while len(node):
+        flat[node] = share
+        more = share > flat[node]
+        node, share = node[more], share[more]
+    return ink

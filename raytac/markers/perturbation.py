@@ -1,4 +1,4 @@
-"""What a real marker tracker adds: noise of the found centres, lost dots, and a gel that was not put in straight. All seeded."""
+"""Perturbations of a real marker tracker: noise of detected centres, lost dots, and a gel that is mounted with an offset; all seeded."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class MarkerPerturbation:
     """
 
     noise_px: float = 0.0
-    """Standard deviation of every found centre along u and v, each frame [px of the image]."""
+    """Standard deviation of every detected centre along u and v, each frame [px of the image]."""
     dropout: float = 0.0
     """Probability that a marker is lost in a frame, in [0, 1)."""
     shift: float = 0.0
-    """Pattern shifted by up to this along x and y, uniform, drawn at every reset of an environment [m]."""
+    """Largest shift of the pattern along x and y [m]; uniform, drawn at every reset of an environment."""
     turn: float = 0.0
-    """Pattern turned about the pad's centre by up to this, uniform, drawn with the shift [rad]."""
+    """Largest rotation of the pattern about the pad's centre [rad]; uniform, drawn with the shift."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -42,29 +42,29 @@ class MarkerPerturbation:
 
 
 class Perturber:
-    """Random streams, one an environment, so that what one draws does not depend on how many there are."""
+    """Random streams, one for each environment, so that its draws do not depend on the number of environments."""
 
     def __init__(self, settings: MarkerPerturbation, seed: int, batch: int) -> None:
         self.settings = settings
         self._streams = [np.random.default_rng((seed, env)) for env in range(batch)]
 
     def reseed(self, env: int, seed: int) -> None:
-        """Start the stream of an environment anew; environment 0 of a perturber that was made with this seed has the same."""
+        """Restart the stream of an environment, as that of environment 0 of a perturber with this seed."""
         self._streams[env] = np.random.default_rng((seed, 0))
 
     def placement(self, env: int) -> tuple[np.ndarray, float]:
-        """A new shift (2,) [m] and turn [rad] of an environment's pattern."""
+        """Shift (2,) [m] and rotation [rad] of an environment's pattern, drawn now."""
         draw = self._streams[env].uniform(-1.0, 1.0, 3)
         return self.settings.shift * draw[:2], float(self.settings.turn * draw[2])
 
     def noise(self, count: int, envs: Sequence[int] | None = None) -> np.ndarray | None:
-        """Errors of the found centres [px], (n, M, 2), of environments, all if None; None without noise."""
+        """Errors of the detected centres [px], (n, M, 2), of environments, all if None; None without noise."""
         if self.settings.noise_px == 0:
             return None
         return self.settings.noise_px * self._drawn(lambda stream: stream.standard_normal((count, 2)), envs)
 
     def visible(self, count: int, envs: Sequence[int] | None = None) -> np.ndarray | None:
-        """Which markers are found, (n, M), bool; None where none is lost."""
+        """True for markers that are detected, (n, M), bool; None where none is lost."""
         if self.settings.dropout == 0:
             return None
         return self._drawn(lambda stream: stream.random(count) >= self.settings.dropout, envs)
@@ -72,5 +72,5 @@ class Perturber:
     def _drawn(self, draw: Callable[[np.random.Generator], np.ndarray], envs: Sequence[int] | None) -> np.ndarray:
         """One draw of each environment, also of one that is named twice."""
         chosen = range(len(self._streams)) if envs is None else envs
-        found = {b: draw(self._streams[b]) for b in dict.fromkeys(chosen)}
-        return np.stack([found[b] for b in chosen])
+        drawn = {b: draw(self._streams[b]) for b in dict.fromkeys(chosen)}
+        return np.stack([drawn[b] for b in chosen])

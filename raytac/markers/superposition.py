@@ -1,50 +1,49 @@
 """Superposition: the pad's linear response to the loads that hold the contact where the object has put it.
 
 Taxim (Si and Yuan, RA-L 2022) adds up displacement fields of unit loads, from a finite-element model, with the weights that
-give the contact its known displacement. Here the fields are those of the soft pad's own tetrahedra at rest (``raytac.markers.compliance``).
-With C the compliance of the coat's vertices and A those in contact:
+give the contact its known displacement. Here the fields are those of the soft pad's own tetrahedra at rest, by its linear stiffness with
+the solver's Lamé constants, held where the case holds the pad; inverted once and kept on disk. With C the compliance of the coat's
+vertices and A those in contact:
 
     C_AA f = u_A,    u = C_·A f,
 
-u_A: down to the object along z, along x and y with the object since first touch. A vertex that the object would have to pull is let go. One
-that would need more than Coulomb's μ |f_z| to be taken along slides: it keeps only its z, and f_xy = μ |f_z| the way it was pulled. Each
-time the rest is solved again.
+u_A: down to the object along z, along x and y with the object since first touch. A vertex that the object would have to pull is released.
+One that would need more than Coulomb's μ |f_z| to stick slides: it keeps only its z, and f_xy = μ |f_z| in the direction of its last load.
+Each time the system is solved again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
+
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.io.arrays import npy_bytes
+from raytac.io.cache import cache_folder, keep_cached, read_cached
+from raytac.io.code_digest import code_digest
 from raytac.markers.contacts import Contacts, ContactSamples
-from raytac.markers.sampling import height_and_slope, object_way
-from raytac.markers.surface import bind
-from raytac.specs.sensor import SensorSpec
+from raytac.markers.sampling import height_and_slope, object_displacement
+from raytac.markers.surface import CoatPoints
+from raytac.physics.soft.mesh import PadMesh, pad_mesh
+from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = ["SuperpositionMarkers"]
-
-_ROUNDS = 8
-"""How often vertices under tension are let go, or slide; those that are left then keep their load."""
-_LEVEL = "coarse"
-"""Pad whose unit-load fields are used."""
+__all__ = ["SuperpositionModel", "cached_compliance", "coat_compliance", "rest_stiffness"]
 
 
-class SuperpositionMarkers:
-    """The model ``superposition``; needs the package ``raytac[ipc]`` for the pad's tetrahedra, and no calibration."""
+class SuperpositionModel:
+    """Model of ``Superposition``; ``level`` and ``rounds`` as there."""
 
-    name = "superposition"
     needs_contacts = True
     device = "cpu"
 
-    def __init__(self, sensor: SensorSpec) -> None:
-        from raytac.markers.compliance import cached_compliance
-        from raytac.physics.soft.mesh import pad_mesh
-
-        mesh = pad_mesh(sensor.gelpad, _LEVEL)
+    def __init__(self, sensor: SensorSpec, level: str, rounds: int) -> None:
+        mesh = pad_mesh(sensor.gelpad, level)
         self.coat = mesh.coat
         self._compliance = cached_compliance(mesh, sensor.gelpad)
-        self._friction = sensor.gelpad.friction
-        self._bound: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._friction, self._rounds = sensor.gelpad.friction, rounds
+        self._points = CoatPoints()
 
     def displacement(
         self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
@@ -54,38 +53,36 @@ class SuperpositionMarkers:
         batch = len(rest)
         places = np.broadcast_to(self.coat.rest[:, :2], (batch, len(self.coat.rest), 2))
         height, _, touched = height_and_slope(surface, places)
-        way = object_way(contacts, places)
-        wanted = np.concatenate([way, (height - self.coat.rest[:, 2])[..., None]], axis=-1)
-        held = touched & (wanted[..., 2] < 0)
+        shear = object_displacement(contacts, places)
+        prescribed = np.concatenate([shear, (height - self.coat.rest[:, 2])[..., None]], axis=-1)
+        in_contact = touched & (prescribed[..., 2] < 0)
         moved = np.zeros((batch, len(self.coat.rest), 3))
-        for b in np.flatnonzero(held.any(axis=1)):
-            moved[b] = self._superpose(wanted[b], held[b])
-        vertices, weights = self._bind(rest)
-        env = np.arange(batch)[:, None, None]
-        return (weights[..., None] * moved[env, vertices, :2]).sum(axis=2)
+        for b in np.flatnonzero(in_contact.any(axis=1)):
+            moved[b] = self._superpose(prescribed[b], in_contact[b])
+        return self._points.interpolate(self.coat, rest, moved[..., :2])
 
-    def _superpose(self, wanted: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Displacement of all vertices (V, 3) that takes the ``held`` ones where ``wanted`` (V, 3) says."""
-        held, slides = held.copy(), np.zeros(len(held), bool)
-        pull = np.zeros((len(held), 2))
-        """Direction of what takes a sliding vertex along."""
-        for _ in range(_ROUNDS):
-            at = np.flatnonzero(held)
+    def _superpose(self, prescribed: np.ndarray, in_contact: np.ndarray) -> np.ndarray:
+        """Displacement of all vertices (V, 3) that gives those ``in_contact`` (V,) their ``prescribed`` displacement (V, 3)."""
+        sticking, slides = in_contact.copy(), np.zeros(len(in_contact), bool)
+        direction = np.zeros((len(in_contact), 2))
+        """Direction of the friction on a sliding vertex."""
+        for _ in range(self._rounds):
+            at = np.flatnonzero(sticking)
             dof = (3 * at[:, None] + np.arange(3)).ravel()
-            load = self._load(dof, wanted[at], slides[at], pull[at])
+            load = self._load(dof, prescribed[at], slides[at], direction[at])
             pulled = load[:, 2] > 0
-            along = np.linalg.norm(load[:, :2], axis=1)
-            loose = ~pulled & ~slides[at] & (along > self._friction * -load[:, 2])
+            tangential = np.linalg.norm(load[:, :2], axis=1)
+            loose = ~pulled & ~slides[at] & (tangential > self._friction * -load[:, 2])
             if pulled.all() or not (pulled | loose).any():
                 break
-            held[at[pulled]] = False
+            sticking[at[pulled]] = False
             slides[at[loose]] = True
-            pull[at[loose]] = load[loose, :2] / along[loose, None]
+            direction[at[loose]] = load[loose, :2] / tangential[loose, None]
         return (self._compliance[:, dof] @ load.ravel()).reshape(-1, 3)
 
-    def _load(self, dof: np.ndarray, wanted: np.ndarray, slides: np.ndarray, pull: np.ndarray) -> np.ndarray:
-        """Loads [N] (A, 3) on the vertices of ``dof`` (3 A): what takes them where ``wanted`` (A, 3) says, or friction where they slide."""
-        matrix, right = self._compliance[np.ix_(dof, dof)].astype(float), wanted.copy()
+    def _load(self, dof: np.ndarray, prescribed: np.ndarray, slides: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Loads [N] (A, 3) on the vertices of ``dof`` (3 A) that give them their ``prescribed`` displacement, or friction that slides."""
+        matrix, right = self._compliance[np.ix_(dof, dof)].astype(float), prescribed.copy()
         # The unit of these rows is that of the others, so that the matrix stays well-conditioned.
         unit = float(np.trace(matrix)) / len(dof)
         right[slides, :2] = 0.0
@@ -93,11 +90,62 @@ class SuperpositionMarkers:
             for axis in range(2):
                 matrix[3 * k + axis] = 0.0
                 matrix[3 * k + axis, 3 * k + axis] = unit
-                matrix[3 * k + axis, 3 * k + 2] = unit * self._friction * pull[k, axis]
+                matrix[3 * k + axis, 3 * k + 2] = unit * self._friction * direction[k, axis]
         return np.linalg.solve(matrix, right.ravel()).reshape(-1, 3)
 
-    def _bind(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        one = rest[:1] if rest.strides[0] == 0 else rest
-        if self._bound is None or not np.array_equal(self._bound[0], one):
-            self._bound = np.array(one), *bind(self.coat, one[..., :2])
-        return self._bound[1], self._bound[2]
+
+def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
+    """Stiffness of all vertices [N/m], shape (3N, 3N): linear elasticity on constant-strain tetrahedra.
+
+    A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
+    """
+    young, poisson = gelpad.youngs_modulus, gelpad.poisson_ratio
+    mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    tets = mesh.tets.tets
+    x = mesh.tets.vertices[tets]
+    edges = (x[:, 1:] - x[:, :1]).transpose(0, 2, 1)
+    last = np.linalg.inv(edges)
+    g = np.concatenate([-last.sum(axis=1, keepdims=True), last], axis=1)
+    volume = np.linalg.det(edges) / 6
+    blocks = lam * np.einsum("tai,tbj->taibj", g, g) + mu * np.einsum("taj,tbi->taibj", g, g)
+    blocks += mu * np.einsum("tak,tbk,ij->taibj", g, g, np.eye(3))
+    blocks *= volume[:, None, None, None, None]
+    dof = (3 * tets[:, :, None] + np.arange(3)).reshape(len(tets), 12)
+    n = 3 * len(mesh.tets.vertices)
+    flat = (dof[:, :, None] * n + dof[:, None, :]).ravel()
+    return np.bincount(flat, blocks.reshape(-1), minlength=n * n).reshape(n, n)
+
+
+def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
+    """Displacement of the coat's vertices by unit loads on them [m/N], shape (3V, 3V); degree of freedom 3 v + axis."""
+    stiffness = rest_stiffness(mesh, gelpad)
+    count = len(mesh.tets.vertices)
+    free = np.setdiff1d(np.arange(count), mesh.bonded)
+    dof = (3 * free[:, None] + np.arange(3)).ravel()
+    number = np.full(count, -1)
+    number[free] = np.arange(len(free))
+    loads = number[mesh.coat_vertices]
+    compliance = np.zeros((3 * len(loads), 3 * len(loads)))
+    is_free = loads >= 0
+    at = (3 * loads[is_free][:, None] + np.arange(3)).ravel()
+    unit = np.zeros((len(dof), len(at)))
+    unit[at, np.arange(len(at))] = 1.0
+    fields = np.linalg.solve(stiffness[np.ix_(dof, dof)], unit)
+    own = (3 * np.flatnonzero(is_free)[:, None] + np.arange(3)).ravel()
+    compliance[np.ix_(own, own)] = fields[at]
+    return compliance
+
+
+def cached_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
+    """``coat_compliance``, float32, from the user's cache if it was made before; one that is damaged is made again, with a warning."""
+    arrays = mesh.tets.vertices, mesh.tets.tets, mesh.bonded, mesh.coat_vertices
+    basis = repr(gelpad), *(array.tobytes() for array in arrays), code_digest(__name__)
+    digest = hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
+    folder = cache_folder("markers")
+    path = None if folder is None else folder / f"compliance-{digest}.npy"
+    kept = read_cached(path)
+    if kept is not None:
+        return np.load(io.BytesIO(kept), allow_pickle=False)
+    fields = coat_compliance(mesh, gelpad).astype(np.float32)
+    keep_cached(path, npy_bytes(fields))
+    return fields

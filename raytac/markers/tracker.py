@@ -1,43 +1,23 @@
-"""``MarkerTracker``: surfaces in, marker displacements out, in metres on the pad and in pixels of the image."""
+"""``MarkerTracker``: marker displacements from surfaces, in metres on the pad and in pixels of the image."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples, ContactTracker
+from raytac.markers.base import MarkersConfig
+from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
+from raytac.markers.registry import markers_config
 from raytac.markers.sampling import height_at
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MARKER_MODELS", "MarkerFrame", "MarkerModel", "MarkerTracker", "make_model"]
-
-MARKER_MODELS = ("fots", "surface", "superposition", "force_field")
-"""Names that ``markers=`` accepts."""
-
-
-class MarkerModel(Protocol):
-    """One way to move markers."""
-
-    name: str
-    needs_contacts: bool
-    """Whether it reads contact samples and the object's motion."""
-    device: str
-
-    def displacement(
-        self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
-    ) -> np.ndarray:
-        """Displacement [m] of markers at ``rest`` (B, M, 3): along x and y, (B, M, 2), or along x, y and z, (B, M, 3).
-
-        With two components the marker stays on the surface, whose height gives the third.
-        """
-        ...
+__all__ = ["MarkerFrame", "MarkerTracker"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,24 +25,24 @@ class MarkerFrame:
     """Markers of B pads at one instant, M each, row by row of the pattern."""
 
     displacement: np.ndarray
-    """Along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is not visible or an environment that failed."""
+    """Displacement along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is lost or an environment that failed."""
     displacement_px: np.ndarray
-    """Along u, v of the image [px], shape (B, M, 2), with what perspective adds where the coat moves along z; NaN likewise."""
+    """Displacement along u, v of the image [px], shape (B, M, 2), with the perspective of a motion along z; NaN likewise."""
     rest: np.ndarray
-    """Places at rest, pad frame [m], shape (B, M, 3)."""
+    """Positions at rest, pad frame [m], shape (B, M, 3)."""
     rest_px: np.ndarray
-    """Places at rest in the image [px], shape (B, M, 2)."""
+    """Positions at rest in the image [px], shape (B, M, 2)."""
     position: np.ndarray
-    """Places now, pad frame [m], shape (B, M, 3), without noise or losses: where the dots are printed."""
+    """Positions now, pad frame [m], shape (B, M, 3), without noise or losses; the dots of the image lie there."""
     visible: np.ndarray
-    """Whether the tracker finds the marker, shape (B, M), bool."""
+    """True for markers that the tracker detects, shape (B, M), bool."""
 
     def __repr__(self) -> str:
         return summary(self)
 
     @property
     def pixel(self) -> np.ndarray:
-        """Where the markers are found in the image [px], shape (B, M, 2)."""
+        """Detected positions in the image [px], shape (B, M, 2)."""
         return self.rest_px + self.displacement_px
 
 
@@ -76,33 +56,31 @@ class MarkerTracker:
             markers = tracker.update(surface)
             markers.displacement_px  # (B, M, 2)
 
-    ``update`` is called for every surface in order: models of pads whose height is all that is known need the object's way since first
-    touch. ``reset`` forgets it.
+    ``update`` is called for every surface in order: models that read contacts need the object's motion since first touch. ``reset`` drops
+    this history.
     """
 
     def __init__(
         self,
         sensor: SensorSpec,
-        model: str | MarkerModel,
+        markers: str | MarkersConfig,
         grid: PadGrid,
         *,
         num_envs: int = 1,
         resolution: tuple[int, int] | None = None,
         device: str = "auto",
         seed: int = 0,
-        perturbation: MarkerPerturbation | None = None,
     ) -> None:
         """Place the pattern and build the model.
 
         Args:
             sensor: gives the pattern, the camera and, for fitted models, the marker motion.
-            model: one of ``MARKER_MODELS``, or a model that is built already.
-            grid: of the surfaces to come.
+            markers: name of a marker model, or its configuration.
+            grid: grid of the surfaces to come.
             num_envs: number of environments B.
-            resolution: (width, height) of the image that pixels are of [px]; None is the sensor's own.
-            device: ``auto``, ``cpu`` or ``cuda``; where ``fots`` computes.
-            seed: of ``perturbation``.
-            perturbation: noise, losses and shifts of the pattern; None is none.
+            resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
+            device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
+            seed: seed of the perturbation.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
@@ -110,14 +88,15 @@ class MarkerTracker:
             SpecError: a marker lies outside the camera's view.
             BackendError: the model's backend does not work here.
         """
+        config = markers_config(markers)
         self.sensor, self.grid, self.num_envs = sensor, grid, num_envs
         self._resolution = resolution
-        self._perturber = Perturber(perturbation or MarkerPerturbation(), seed, num_envs)
+        self._perturber = Perturber(config.perturbation or MarkerPerturbation(), seed, num_envs)
         self._shift, self._turn = np.zeros((num_envs, 2)), np.zeros(num_envs)
         self._place(range(num_envs))
-        self.model = make_model(model, sensor, grid, device) if isinstance(model, str) else model
-        self._cells = ContactCells.over(grid) if self.model.needs_contacts else None
-        self._contacts = ContactTracker(num_envs)
+        self.model = config.build(sensor, grid, num_envs=num_envs, device=device)
+        self._cells = ContactCells.over(grid, config.contacts) if self.model.needs_contacts else None
+        self._contacts = ContactTracker(num_envs, config.contacts)
 
     def _place(self, envs: range | list[int]) -> None:
         if not self._perturber.settings.moves_pattern:
@@ -130,18 +109,18 @@ class MarkerTracker:
 
     def _set_pattern(self, pattern: MarkerPattern) -> None:
         self.pattern = pattern
-        self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models know it again
+        self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models recognise it
         self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
         self._all = np.broadcast_to(True, self._rest.shape[:2])
         self._grid_rest = self._height_at_rest()
 
     def _height_at_rest(self) -> np.ndarray:
-        """z of the grid's rest surface at the pattern [m], (1 or B, M), as ``height_at`` finds it."""
+        """z of the grid's rest surface at the pattern [m], (1 or B, M), by the interpolation of ``height_at``."""
         xy = self.pattern.rest[..., :2]
         return height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Start environments (a mask (B,), a list, or None for all) anew: no history of contact, a new placement of the pattern.
+        """Restart environments (a mask (B,), a list, or None for all): no history of contact, a new placement of the pattern.
 
         Raises:
             InputError: an environment that does not exist.
@@ -151,26 +130,26 @@ class MarkerTracker:
         self._place(which)
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Start the perturbations of environments anew, each from a seed; ``reset`` then draws from them."""
+        """Restart the perturbations of environments, each from a seed; ``reset`` then draws from them."""
         for b, seed in zip(envs, seeds, strict=True):
             self._perturber.reseed(b, seed)
 
     def at_rest(self, envs: Sequence[int] = (0,)) -> MarkerFrame:
-        """Markers of untouched pads, placed as in the environments named; changes no history and draws nothing."""
+        """Markers of untouched pads, placed as in environments ``envs``; changes no history and draws nothing."""
         rest, pixel = self._rest[list(envs)], self._pixel[list(envs)]
-        nothing = np.zeros(pixel.shape)
-        return MarkerFrame(nothing, nothing, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
+        zero = np.zeros(pixel.shape)
+        return MarkerFrame(zero, zero, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
 
     def follow(self, surface: GelSurface) -> None:
-        """Take note of a surface of the motion whose markers nobody asks for; as ``update``, for models that need the history."""
+        """Add a surface to the history without computing markers."""
         if self._cells is not None:
             self._contacts.update(surface, self._cells.sample(surface))
 
     def update(self, surface: GelSurface, envs: Sequence[int] | None = None) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
 
-        ``envs``: which environment each row of the surface is of; None is all of them. Others keep their history and draw nothing, and one
-        that is named twice goes on and draws once.
+        ``envs``: environment of each row of the surface; None is all of them. Others keep their history and draw nothing; one that is named
+        twice advances and draws once.
 
         Raises:
             InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
@@ -178,8 +157,8 @@ class MarkerTracker:
         count = self.num_envs if envs is None else len(envs)
         if surface.batch != count:
             raise InputError("surface", value=surface.batch, rule=f"must have {count} environments, as this tracker")
-        # One NaN makes the sum of squares one, and no height is so large that infinity does not: many times cheaper than asking every
-        # node. First of all, since it brings the heights into the cache for those who pick some.
+        # The sum of squares is finite if all heights are: many times cheaper than a test of every node. It comes first since it brings
+        # the heights into the cache for the interpolation.
         heights = surface.height.reshape(count, -1)
         failed = ~np.isfinite(np.vecdot(heights, heights))
         samples, contacts = None, None
@@ -193,14 +172,14 @@ class MarkerTracker:
         else:
             position = np.empty(rest.shape)
             xy = np.add(rest[..., :2], moved, out=position[..., :2])
-            # Differences of heights first, so that a marker at rest has moved by exactly nothing.
+            # Differences of heights come first, so that the displacement of a marker at rest is exactly zero.
             at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
             np.subtract(height_at(surface, xy), at_rest, out=position[..., 2])
             position[..., 2] += rest[..., 2]
         return self._frame(rest, position, failed, envs)
 
     def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray, envs: Sequence[int] | None) -> MarkerFrame:
-        pixel, everything = (values if envs is None else values[envs] for values in (self._pixel, self._all))
+        pixel, all_visible = (values if envs is None else values[envs] for values in (self._pixel, self._all))
         displacement = position[..., :2] - rest[..., :2]
         displacement_px = self.pattern.camera.project(position)
         displacement_px -= pixel
@@ -211,30 +190,4 @@ class MarkerTracker:
         visible = self._perturber.visible(self.pattern.count, envs)
         for lost in ([] if visible is None else [~visible]) + ([failed] if failed.any() else []):
             displacement[lost] = displacement_px[lost] = np.nan
-        return MarkerFrame(displacement, displacement_px, rest, pixel, position, everything if visible is None else visible)
-
-
-def make_model(name: str, sensor: SensorSpec, grid: PadGrid, device: str = "auto") -> MarkerModel:
-    """The model of that name.
-
-    Raises:
-        InputError: an unknown name, or a sensor without the marker motion that the model needs.
-        BackendError: its backend does not work here.
-    """
-    if name not in MARKER_MODELS:
-        raise InputError("markers", value=name, rule="must be a known marker model", choices=MARKER_MODELS)
-    if name == "fots":
-        from raytac.markers.fots import FotsMarkers
-
-        return FotsMarkers(sensor, grid, device=device)
-    if name == "surface":
-        from raytac.markers.surface import SurfaceMarkers
-
-        return SurfaceMarkers()
-    if name == "superposition":
-        from raytac.markers.superposition import SuperpositionMarkers
-
-        return SuperpositionMarkers(sensor)
-    from raytac.markers.force_field import ForceFieldMarkers
-
-    return ForceFieldMarkers(sensor)
+        return MarkerFrame(displacement, displacement_px, rest, pixel, position, all_visible if visible is None else visible)

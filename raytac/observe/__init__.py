@@ -1,4 +1,4 @@
-"""From what a sensor sees to what a learner is given: spaces, batched arrays, stacks, randomisation. Gymnasium is not needed."""
+"""Observations for a learner from frames of a sensor: spaces, batched arrays, stacks, randomisation. Gymnasium is not needed."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Observed images of many pads that never leave the device: for a solver and a learner that are both there."""
+"""Observed images of many pads that stay on the device, for a solver and a learner on the same device."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class DeviceImages:
         images = DeviceImages(observer, observer.make_sensor(device="cuda"))
         rgb = as_tensors(images.observe(heights))["rgb"]  # (512, 240, 320, 3) uint8, on the GPU
 
-    Cut, mean over ``downscale`` pixels and difference to rest are those of ``TactileObserver.observe``, to the last bit. Keeps no history
-    and knows of no failed environments.
+    Crop, mean over ``downscale`` pixels and difference to rest are those of ``TactileObserver.observe``, to the last bit. There is no
+    history and no record of failed environments.
     """
 
     def __init__(self, observer: TactileObserver, sensor: TactileSensor) -> None:
         """Build the renderer and render the pad at rest.
 
         Args:
-            observer: what is observed; of its modalities only ``rgb`` is.
-            sensor: made with ``observer.make_sensor``; its device is where everything stays.
+            observer: settings of the observation; of its modalities only ``rgb`` is computed.
+            sensor: made with ``observer.make_sensor``; all arrays stay on its device.
 
         Raises:
-            InputError: settings that the device does not know: no ``rgb``, a stack, cameras that drift; an optical mode without images
-                on the device.
+            InputError: settings without an implementation on the device: no ``rgb``, a stack, cameras that drift; an optical mode
+                without images on the device.
             BackendError: the renderer or the device does not work here.
         """
         from raytac.optics.device_image import DeviceImage, ImageCut
@@ -48,7 +48,7 @@ class DeviceImages:
             raise InputError("stack", value=settings.stack, rule="must be 1 on the device, where nothing is kept")
         if observer.randomization.changes_images:
             raise InputError("randomization", value=observer.randomization, rule="must not change images on the device")
-        cut = ImageCut(layout.observed, layout.left, layout.top, layout.downscale)
+        cut = ImageCut(layout.observed, layout.crop_x, layout.crop_y, layout.downscale)
         self.grid = sensor.grid
         self._image = DeviceImage(sensor.optical_mode, sensor.grid, cut, difference=settings.difference)
 
@@ -61,7 +61,7 @@ class DeviceImages:
 
         Args:
             heights: [m], B·Ny·Nx of them on the device, finite, which is not checked: a Dr.Jit array or a float32 PyTorch tensor.
-            contact: where the object touches, as many bytes; only for optical modes that need it.
+            contact: 1 where the object touches, else 0, as many bytes; only for optical modes that need it.
 
         Raises:
             InputError: no whole number of grids, a batch too large for the memory, or contact missing.

@@ -1,4 +1,4 @@
-"""Seeded differences between sensors that ought to be alike: what is drawn for an environment, and what for a world."""
+"""Seeded differences between nominally equal sensors, drawn for each environment or once for a world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from raytac.specs.task import TaskScene
 __all__ = ["CameraDrift", "Randomization", "randomised_bodies", "randomised_sensor"]
 
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
-"""Widths that are not relative to 1, and what they must stay below: beyond it a pad is not askew but elsewhere."""
+"""Widths that are not relative to 1, and their upper bounds: a larger one is no mounting error."""
 
 
 @dataclass(frozen=True)
@@ -24,42 +24,42 @@ class Randomization:
     """Half widths of uniform distributions, relative to 1 unless said otherwise; all 0 is none.
 
     *Each environment, at every reset*: the camera (``CameraDrift``) by ``exposure``, ``white_balance``, ``gamma``; the pattern of
-    ``markers``; how the pad is mounted by ``pad_shift``, ``pad_turn``; and in environments with rigid pads (``raytac.envs.variation``)
-    bodies by ``body_mass``, ``body_friction``, gels by ``youngs_modulus``, ``friction``. *Each frame*: ``noise``, and noise and losses of
-    ``markers``. *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``, ``led_colour``,
-    ``reflectance``; with simulated pads, or a sensor that is in no environment, gels too, and bodies (``randomised_bodies``). A table of
-    ``taxim`` is baked anew for every such sensor, the ray tracer is not: vary seeds over processes.
+    ``markers``; the mounting of the pad by ``pad_shift``, ``pad_turn``; and in environments with rigid pads (``TaskBatch``) bodies by
+    ``body_mass``, ``body_friction``, gels by ``youngs_modulus``, ``friction``. *Each frame*: ``noise``, and noise and loss of ``markers``.
+    *Once a world*, in the sensor that all its environments share (``randomised_sensor``): ``led_power``, ``led_colour``, ``reflectance``;
+    with soft pads, or a sensor that is in no environment, gels too, and bodies (``randomised_bodies``). A table of ``taxim`` is baked for
+    every such sensor, which the ray tracer does not need: vary seeds over processes.
     """
 
     led_power: float = 0.0
-    """Of every LED by itself."""
+    """Power of each LED."""
     led_colour: float = 0.0
-    """Of every LED's every channel."""
+    """Power of each channel of each LED."""
     reflectance: float = 0.0
-    """Of the coat's every channel."""
+    """Reflectance of the coat in each channel."""
     youngs_modulus: float = 0.0
-    """Of the gel."""
+    """Young's modulus of the gel."""
     friction: float = 0.0
-    """Of the gel, where it meets bodies that the scene gives no coefficient."""
+    """Friction coefficient of the gel, for bodies without one in the scene."""
     body_mass: float = 0.0
-    """Of every free body by itself."""
+    """Mass of each free body."""
     body_friction: float = 0.0
-    """Of every body by itself, where the scene gives it a coefficient; against gel and all else alike. Of two bodies that meet, MuJoCo
-    takes the greater coefficient."""
+    """Friction coefficient of each body that has one in the scene, against gel and all else alike. For two bodies in contact MuJoCo uses
+    the greater coefficient."""
     pad_shift: float = 0.0
-    """Of every pad on its mount, along each axis of the pad frame [m]; the arm does not know of it."""
+    """Shift of each pad on its mount, along each axis of the pad frame [m]; the arm's control ignores it."""
     pad_turn: float = 0.0
-    """Of every pad on its mount: each component of a rotation vector, pad frame [rad]."""
+    """Rotation of each pad on its mount: each component of a rotation vector, pad frame [rad]."""
     exposure: float = 0.0
     """Gain of the camera, all channels, in linear light."""
     white_balance: float = 0.0
     """Gain of every channel, in linear light."""
     gamma: float = 0.0
-    """Of the exponent that encodes linear light."""
+    """Exponent that encodes linear light."""
     noise: float = 0.0
     """Standard deviation of every 8-bit value in every frame; not relative."""
     markers: MarkerPerturbation = field(default_factory=MarkerPerturbation)
-    """Noise and losses of the tracker, shift and turn of the pattern."""
+    """Noise and losses of the tracker, shift and rotation of the pattern."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -68,41 +68,41 @@ class Randomization:
                 if not isinstance(value, MarkerPerturbation):
                     raise InputError("markers", value=value, rule="must be a MarkerPerturbation")
                 continue
-            absolute, most = item.name in _ABSOLUTE, _ABSOLUTE.get(item.name, 1.0)
+            absolute, bound = item.name in _ABSOLUTE, _ABSOLUTE.get(item.name, 1.0)
             rule = "must be 0 or more, and finite" if absolute else "must be in [0, 1): a half width relative to 1"
-            if absolute and np.isfinite(most):
-                rule = f"must be in [0, {most:g}) m or rad"
-            if not (is_number(value) and 0.0 <= value < most):
+            if absolute and np.isfinite(bound):
+                rule = f"must be in [0, {bound:g}) m or rad"
+            if not (is_number(value) and 0.0 <= value < bound):
                 raise InputError(item.name, value=value, rule=rule)
 
     @property
     def changes_images(self) -> bool:
-        """Whether images differ between environments of one world."""
+        """True if images differ between environments of one world."""
         return any((self.exposure, self.white_balance, self.gamma, self.noise))
 
     @property
     def changes_bodies(self) -> bool:
-        """Whether bodies differ."""
+        """True if bodies differ."""
         return any((self.body_mass, self.body_friction))
 
     @property
     def changes_gel(self) -> bool:
-        """Whether gels differ."""
+        """True if gels differ."""
         return any((self.youngs_modulus, self.friction))
 
     @property
     def changes_mounting(self) -> bool:
-        """Whether pads are mounted askew."""
+        """True if pads have mounting errors."""
         return any((self.pad_shift, self.pad_turn))
 
     @property
     def changes_sensor(self) -> bool:
-        """Whether the sensor differs between worlds."""
+        """True if the sensor differs between worlds."""
         return any((self.led_power, self.led_colour, self.reflectance, self.changes_gel))
 
 
 def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:
-    """The sensor that a seed draws; the one given where nothing of it is drawn. A reflectance is at most 1."""
+    """Sensor drawn by a seed; the same sensor if nothing of it varies. A reflectance is at most 1."""
     r = randomization
     if not r.changes_sensor:
         return sensor
@@ -130,7 +130,7 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
 
 
 def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:
-    """The scene with the bodies that a seed draws, the same in all environments; the one given where nothing of them is drawn."""
+    """Scene with bodies drawn by a seed, equal in all environments; the same scene if none varies."""
     r = randomization
     if not r.changes_bodies:
         return scene
@@ -139,19 +139,19 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
     for body in scene.bodies:
         mass, friction = 1.0 + np.array([r.body_mass, r.body_friction]) * rng.uniform(-1.0, 1.0, 2)
         if body.dynamics == "free":
-            given = body.mass is not None
-            body = replace(body, mass=float(body.mass * mass)) if given else replace(body, density=float(body.density * mass))
-        own = {name: getattr(body, name) for name in ("friction", "gel_friction")}
-        body = replace(body, **{name: float(value * friction) for name, value in own.items() if value is not None})
+            has_mass = body.mass is not None
+            body = replace(body, mass=float(body.mass * mass)) if has_mass else replace(body, density=float(body.density * mass))
+        coefficients = {name: getattr(body, name) for name in ("friction", "gel_friction")}
+        body = replace(body, **{name: float(value * friction) for name, value in coefficients.items() if value is not None})
         bodies.append(body)
     return replace(scene, bodies=tuple(bodies))
 
 
 class CameraDrift:
-    """Cameras of B environments that each have their own exposure, white balance and exponent, and noise.
+    """Cameras of B environments, each with its own exposure, white balance, exponent and noise.
 
-    u8 → 255 (g · (u8 / 255)^γ)^(1 / γ') with g the gains; what comes out above 255 saturates, as in a camera. Streams are one an
-    environment: what one draws does not depend on how many there are.
+    u8 → 255 (g · (u8 / 255)^γ)^(1 / γ') with g the gains; values above 255 saturate, as in a camera. Each environment has its own random
+    stream, so that its draws do not depend on B.
     """
 
     def __init__(self, sensor: SensorSpec, randomization: Randomization, num_envs: int, seed: int) -> None:
@@ -161,12 +161,12 @@ class CameraDrift:
         self.reset(range(num_envs))
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Start the streams of environments anew, each from a seed."""
+        """Seed the random streams of environments."""
         for b, seed in zip(envs, seeds, strict=True):
             self._streams[b] = np.random.default_rng((seed, 0xCA3))
 
     def reset(self, envs: range | list[int]) -> None:
-        """Draw cameras of environments anew."""
+        """Draw the cameras of environments."""
         r, level = self._settings, np.arange(256) / 255.0
         for b in envs:
             draw = self._streams[b].uniform(-1.0, 1.0, 5)
@@ -175,9 +175,9 @@ class CameraDrift:
             self._curves[b] = 255.0 * (gain[:, None] * level**self._gamma) ** (1.0 / exponent)
 
     def apply(self, images: np.ndarray, *, noise: bool = True, envs: Sequence[int] | None = None) -> np.ndarray:
-        """8-bit images (n, H, W, 3) as these cameras give them; ``noise``: with that of a frame.
+        """8-bit images (n, H, W, 3) of these cameras; ``noise``: add the noise of a frame.
 
-        ``envs``: whose camera took each; None is all in order. Others draw no noise, and one that is named twice draws once.
+        ``envs``: environment of each image; None is all in order. Others draw no noise, and one that is named twice draws once.
         """
         chosen = list(range(len(self._streams))) if envs is None else list(envs)
         values = self._curves[np.asarray(chosen)[:, None, None, None], np.arange(3), images]

@@ -1,4 +1,4 @@
-"""What is observed of a tactile sensor: names, sizes and units, checked before anything is computed."""
+"""Settings of the observation of a tactile sensor: names, sizes and units, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from raytac.checks import check_known, check_mapping, check_names, check_truth, check_whole, is_number, is_whole
+from raytac.checks import check_mapping, check_names, check_truth, check_whole, is_number, is_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
-from raytac.markers import MARKER_MODELS
-from raytac.sensor.options import LARGEST_SIDE, OPTICS, checked_resolution
+from raytac.markers.base import MarkersConfig
+from raytac.markers.registry import markers_config
+from raytac.optics.base import OpticsConfig
+from raytac.optics.registry import chosen_optics
+from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
@@ -21,10 +24,10 @@ MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "cont
 
 - ``rgb``: the camera's image, uint8, (H, W, 3);
 - ``markers``: displacement of every marker along x and y of the pad, (M, 2); 0 where a marker is lost;
-- ``marker_visible``: which markers are found, (M,), 0 or 1;
+- ``marker_visible``: 1 where the tracker sees the marker, else 0, (M,);
 - ``height``: height of the surface over the pad frame's origin, (rows, columns);
-- ``indentation``: how far it lies below the surface at rest, (rows, columns); negative where the gel bulges;
-- ``contact``: share of a cell that is touched, (rows, columns), 0 to 1;
+- ``indentation``: height at rest minus height, (rows, columns); negative where the gel bulges;
+- ``contact``: share of a cell that is in contact, (rows, columns), 0 to 1;
 - ``wrench``: force on the pad and torque about the pad frame's origin, pad frame, (6,).
 """
 SCALES: Mapping[str, float | tuple[float, ...]] = {
@@ -33,7 +36,7 @@ SCALES: Mapping[str, float | tuple[float, ...]] = {
     "indentation": 1e-3,
     "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
 }
-"""What a number is divided by, so that it is of the order of 1: lengths [m], force [N] and torque [N m]."""
+"""Divisors that bring values to the order of 1: lengths [m], force [N] and torque [N m]."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,12 @@ class ObservationSettings:
     """Choices of one sensor's observation. Optical mode, marker model and pad physics change values, never shapes."""
 
     modalities: tuple[str, ...] = ("markers",)
-    """Some of ``MODALITIES``; nothing else is computed."""
+    """Names of ``MODALITIES``; nothing else is computed."""
     resolution: tuple[int, int] | str | None = None
     """(width, height) of ``rgb`` [px], or text as ``"64x48"``; None is the sensor's own."""
     crop: str | tuple[int, int, int, int] = "centre"
-    """What is cut off the rendered image: ``"centre"`` keeps the pixels square and takes the middle, as large as it fits;
-    (left, top, right, bottom) cuts that many pixels of the observed size, and the view is squeezed into what is asked for."""
+    """Crop of the rendered image. ``"centre"`` keeps the pixels square and takes the largest centred part that fits;
+    (left, top, right, bottom) removes that many pixels of the observed size, and the view is scaled to the observed shape."""
     downscale: int = 1
     """The image is rendered this many times as large along both sides and averaged."""
     difference: bool = False
@@ -55,17 +58,15 @@ class ObservationSettings:
     """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad, no more than
     its grid has nodes."""
     stack: int = 1
-    """Number of last observations: images lie one behind the other in the channels, all else along a new first axis, oldest first. After
-    a reset all are the first one."""
+    """Number of last observations: images are stacked in the channels, all else along a new first axis, oldest first. After a reset all
+    are the first one."""
     normalise: bool = True
-    """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a share in both cases."""
+    """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a ratio in both cases."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
-    optics: str = "taxim"
-    """As of ``TactileSensor``."""
-    marker_model: str = "fots"
-    """As ``markers`` of ``TactileSensor``."""
-    optics_options: Mapping[str, Any] = field(default_factory=dict)
+    optics: str | OpticsConfig[Any] = "taxim"
+    """As of ``TactileSensor``: a name, or a configuration."""
+    markers: str | MarkersConfig = "fots"
     """As of ``TactileSensor``."""
 
     def __post_init__(self) -> None:
@@ -89,10 +90,9 @@ class ObservationSettings:
                 raise InputError("crop", value=sides, rule=rule)
         for name in ("difference", "normalise"):
             check_truth(name, getattr(self, name))
-        check_known("optics", self.optics, OPTICS)
-        check_known("marker_model", self.marker_model, MARKER_MODELS)
-        for name in ("scales", "optics_options"):
-            check_mapping(name, getattr(self, name))
+        chosen_optics(self.optics)
+        markers_config(self.markers)
+        check_mapping("scales", self.scales)
         if self.difference and "rgb" not in self.modalities:
             raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
         for name, scale in self.scales.items():
@@ -104,7 +104,7 @@ class ObservationSettings:
                 raise InputError(f"scales[{name!r}]", value=scale, rule="must be positive and finite: one, or six of a wrench")
 
     def scale(self, modality: str) -> float | tuple[float, ...]:
-        """What a modality is divided by."""
+        """Divisor of a modality."""
         return self.scales.get(modality, SCALES[modality]) if self.normalise else 1.0
 
     @property
@@ -113,24 +113,25 @@ class ObservationSettings:
 
     @property
     def needs_frames(self) -> bool:
-        """Whether anything but the force is observed, for which a sensor must look at the pad's surface."""
+        """True if more than the wrench is observed, so that the pad's surface is needed."""
         return self.modalities != ("wrench",)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """What must be asked of a ``TactileSensor``; the surface itself, which maps are made from, it always gives."""
+        """Outputs of a ``TactileSensor`` that are needed; the surface, from which maps are made, is always there."""
         return tuple(name for name in ("rgb", "wrench") if name in self.modalities)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How an observed image is cut from a rendered one; (width, height) [px]."""
+    """Crop of an observed image from a rendered one; sizes are (width, height) [px]."""
 
     observed: tuple[int, int]
     rendered: tuple[int, int]
-    left: int
-    """Pixels of the observed size that are cut off."""
-    top: int
+    crop_x: int
+    """Pixels of the observed size that are removed at the left."""
+    crop_y: int
+    """Pixels of the observed size that are removed at the top."""
     downscale: int
 
 
@@ -140,20 +141,20 @@ def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
     Raises:
         InputError: the rendered image would be larger than can be rendered.
     """
-    asked = settings.resolution
-    assert not isinstance(asked, str)
-    observed = sensor.camera.resolution if asked is None else asked
+    resolution = settings.resolution
+    assert not isinstance(resolution, str)
+    observed = sensor.camera.resolution if resolution is None else resolution
     width, height = observed
     if settings.crop == "centre":
         native = sensor.camera.resolution
         scale = max(width / native[0], height / native[1])
         whole = max(width, round(native[0] * scale)), max(height, round(native[1] * scale))
-        left, top = (whole[0] - width) // 2, (whole[1] - height) // 2
+        crop_x, crop_y = (whole[0] - width) // 2, (whole[1] - height) // 2
     else:
-        left, top, right, bottom = (int(n) for n in settings.crop)
-        whole = width + left + right, height + top + bottom
+        crop_x, crop_y, right, bottom = (int(n) for n in settings.crop)
+        whole = width + crop_x + right, height + crop_y + bottom
     rendered = whole[0] * settings.downscale, whole[1] * settings.downscale
     if max(rendered) > LARGEST_SIDE:
         rule = f"with crop and downscale the rendered image is {rendered[0]}x{rendered[1]}; at most {LARGEST_SIDE} px a side"
         raise InputError("resolution", value=observed, rule=rule)
-    return Layout(observed, rendered, left, top, settings.downscale)
+    return Layout(observed, rendered, crop_x, crop_y, settings.downscale)

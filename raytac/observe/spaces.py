@@ -20,7 +20,7 @@ __all__ = ["ArraySpec", "array_specs", "gymnasium_space"]
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """One environment's array."""
+    """Array of one environment."""
 
     shape: tuple[int, ...]
     dtype: type
@@ -29,16 +29,16 @@ class ArraySpec:
 
 
 def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, ArraySpec]:
-    """Arrays that ``settings`` ask of a sensor, by modality.
+    """Arrays of an observation with ``settings``, by modality.
 
     Raises:
-        InputError: markers are asked for and the sensor has none, or an image is too large.
+        InputError: markers are observed and the sensor has none, or an image is too large.
     """
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
         raise InputError("modalities", value="markers", rule=f"needs a sensor with markers; {sensor.name} has none")
     width, height = image_layout(sensor, settings).observed
-    found = {
+    specs = {
         "rgb": ArraySpec((height, width, 3), np.uint8, 0, 255),
         "markers": ArraySpec((count, 2), np.float32, -np.inf, np.inf),
         "marker_visible": ArraySpec((count,), np.int8, 0, 1),
@@ -47,7 +47,7 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
         "contact": ArraySpec(tuple(settings.map_shape), np.float32, 0.0, 1.0),
         "wrench": ArraySpec((6,), np.float32, -np.inf, np.inf),
     }
-    return {name: _stacked(name, found[name], settings.stack) for name in settings.modalities}
+    return {name: _stacked(name, specs[name], settings.stack) for name in settings.modalities}
 
 
 def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
@@ -58,7 +58,7 @@ def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
 
 
 def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
-    """The same as a ``gymnasium.spaces.Dict`` of boxes.
+    """Arrays as a ``gymnasium.spaces.Dict`` of boxes.
 
     Raises:
         BackendError: Gymnasium is not installed.

@@ -1,4 +1,4 @@
-"""A Gymnasium wrapper that adds what tactile sensors observe to an environment of one's own."""
+"""Gymnasium wrapper that adds observations of tactile sensors to an environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["AddTactile"]
 
 
 class AddTactile(gymnasium.Wrapper):
-    """Observations become a Dict: the environment's own (its keys if it is a Dict, else ``observation``) and the modalities of each sensor.
+    """Dict of the environment's observation (its keys if it is a Dict, else ``observation``) and the modalities of each sensor.
 
     .. code-block:: python
 
@@ -36,10 +36,15 @@ class AddTactile(gymnasium.Wrapper):
         observers: Mapping[str, TactileObserver],
         frames: Callable[[], Mapping[str, TactileFrame]],
     ) -> None:
-        """``observers``: one a sensor, of one environment, without ``difference``; ``frames``: gives the present frame of each.
+        """Wrap ``env``.
+
+        Args:
+            env: environment to wrap.
+            observers: observer of each sensor, with one environment and without ``difference``.
+            frames: function that returns the present frame of each sensor.
 
         Raises:
-            InputError: an observer of several environments, or a name that is in the observation already.
+            InputError: an observer of several environments, or a name that the observation has already.
         """
         super().__init__(env)
         for name, observer in observers.items():
@@ -48,8 +53,8 @@ class AddTactile(gymnasium.Wrapper):
             if observer.settings.difference:
                 raise InputError(f"observers[{name!r}]", value="difference", rule="needs the sensor: subtract in your loop")
         self.observers, self._frames = dict(observers), frames
-        own = env.observation_space
-        spaces: dict[str, Any] = dict(own.spaces) if isinstance(own, gymnasium.spaces.Dict) else {"observation": own}
+        inner = env.observation_space
+        spaces: dict[str, Any] = dict(inner.spaces) if isinstance(inner, gymnasium.spaces.Dict) else {"observation": inner}
         for name, observer in observers.items():
             for modality, box in gymnasium_space(observer.arrays).items():
                 key = f"{name}_{modality}"
@@ -59,7 +64,7 @@ class AddTactile(gymnasium.Wrapper):
         self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Reset the environment and begin anew in every observer.
+        """Reset the environment and every observer.
 
         Raises:
             InputError: an observer whose frame is not given; in ``step`` too.
@@ -76,10 +81,10 @@ class AddTactile(gymnasium.Wrapper):
         return self._joined(observation), reward, terminated, truncated, info
 
     def _joined(self, observation: Any) -> dict[str, Any]:
-        made = dict(observation) if isinstance(observation, Mapping) else {"observation": observation}
+        joined = dict(observation) if isinstance(observation, Mapping) else {"observation": observation}
         frames = self._frames()
         for name, observer in self.observers.items():
             if name not in frames:
                 raise InputError("observers", value=name, rule="must be names of frames that are given", choices=tuple(frames))
-            made |= {f"{name}_{modality}": np.asarray(value[0]) for modality, value in observer.observe(frames[name]).items()}
-        return made
+            joined |= {f"{name}_{modality}": np.asarray(value[0]) for modality, value in observer.observe(frames[name]).items()}
+        return joined

@@ -1,9 +1,10 @@
-"""The door that every optical mode shares: a GelSurface goes in, images come out."""
+"""What every optical mode shares: a configuration that builds it, a GelSurface that goes in, images that come out."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -11,10 +12,17 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["INTEGRATORS", "OPTICAL_OUTPUTS", "OpticalMode", "OpticsImages", "chosen_shadows"]
+__all__ = [
+    "OPTICAL_OUTPUTS",
+    "BuiltOptics",
+    "OpticalMode",
+    "OpticsConfig",
+    "OpticsImages",
+    "Variant",
+    "casts_shadows",
+    "check_shadows",
+]
 
-INTEGRATORS = ("fast", "reference", "path")
-"""Integrators of the ray tracer."""
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""
 
@@ -34,10 +42,14 @@ class OpticsImages:
 
 
 class OpticalMode(Protocol):
-    """One way to make images, built once for one sensor, resolution and set of outputs."""
+    """One way to make images, built once for one sensor, resolution and set of outputs.
+
+    Modes that render on the device have ``mi``, ``camera``, ``outputs``, ``prepare(grid)`` and
+    ``render_device(heights, contact=None, ink=None)`` too, as ``raytac.optics.DeviceMode`` says.
+    """
 
     label: str
-    """Mode label for headers and reports, e.g. ``raytrace-fast``."""
+    """Name for headers and reports, e.g. ``raytrace-fast``."""
     device: str
     """``"cpu"`` or ``"cuda"``: where it runs."""
 
@@ -46,15 +58,127 @@ class OpticalMode(Protocol):
         ...
 
 
-def chosen_shadows(sensor: SensorSpec, shadows: bool | None, integrator: str = "fast") -> bool:
-    """Whether shadows are cast: as asked for, else as the sensor says.
+Mode = TypeVar("Mode", bound=OpticalMode)
 
-    Raises:
-        InputError: neither a truth value nor None, or False for an integrator that follows light as it goes.
+
+class OpticsConfig(Generic[Mode]):
+    """Base of the configurations of optical modes: frozen dataclasses that check themselves and build the mode.
+
+    .. code-block:: python
+
+        @raytac.optics.register("grey")
+        @dataclass(frozen=True)
+        class Grey(OpticsConfig):
+            gamma: float = 1.0
+
+            def maker(self):
+                return GreyMode
+
+    From then on the name is accepted wherever raytac asks for an optical mode, and ``raytac compare`` measures it.
     """
+
+    outputs: ClassVar[tuple[str, ...]] = ("rgb", "normals", "depth")
+    """Those of ``OPTICAL_OUTPUTS`` that the mode can make."""
+
+    @property
+    def sampled(self) -> bool:
+        """Whether images have noise and ``render`` takes ``spp`` and ``seed``; a comparison measures several numbers of samples."""
+        return False
+
+    @property
+    def unbiased(self) -> bool:
+        """Whether the error falls as 1/√spp, so that a comparison may extrapolate it."""
+        return self.sampled
+
+    @property
+    def label(self) -> str:
+        """Name for headers and reports before the mode is built: that of the class in lower case, unless it says otherwise."""
+        return type(self).__name__.lower()
+
+    def build(
+        self,
+        spec: SensorSpec,
+        *,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+        seed: int = 0,
+    ) -> Mode:
+        """The mode for one sensor.
+
+        Args:
+            spec: the sensor.
+            resolution: (width, height) [px]; None is the sensor's own.
+            outputs: some of the class's own.
+            device: ``auto``, ``cpu`` or ``cuda``.
+            seed: of every random number.
+
+        Raises:
+            InputError: a value out of its choices.
+            SpecError: a sensor that the mode cannot show.
+            CalibrationError: a file that is missing or malformed.
+            BackendError: the renderer cannot run on ``device``.
+        """
+        return self.maker()(spec, self, resolution=resolution, outputs=outputs, device=device, seed=seed)
+
+    def maker(self) -> Callable[..., Mode]:
+        """Class of the mode, which ``build`` calls as ``Class(spec, self, resolution=…, outputs=…, device=…, seed=…)``.
+
+        It is imported in here, so that a configuration loads no renderer.
+        """
+        raise NotImplementedError
+
+    def check(self, spec: SensorSpec) -> None:
+        """Raise at once what else the first image would, as far as that takes no renderer."""
+
+    def bake(self, spec: SensorSpec, device: str) -> None:
+        """Do the work before the first image whose result is kept on disk; a comparison does not time it."""
+
+    @classmethod
+    def variants(cls) -> tuple[Variant, ...]:
+        """Settings that ``raytac compare`` measures: the defaults, unless the mode says otherwise."""
+        config = cls()
+        return (Variant(config.label, config.label, config.label, config),)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One setting of an optical mode in a comparison."""
+
+    name: str
+    """Unique among all modes: in keys, files and tables."""
+    words: str
+    """The same for a reader."""
+    short: str
+    """Label of its point in a figure."""
+    config: OpticsConfig[Any]
+    note: str = ""
+    """What a reader of its figures must know."""
+    slow: bool = False
+    """Left out of a quick comparison, for its time."""
+
+
+@dataclass(frozen=True)
+class BuiltOptics(OpticsConfig[OpticalMode]):
+    """A mode that is built already; it keeps its own resolution, outputs and device."""
+
+    mode: OpticalMode
+    outputs: ClassVar[tuple[str, ...]] = OPTICAL_OUTPUTS
+
+    @property
+    def label(self) -> str:
+        return self.mode.label
+
+    def maker(self) -> Callable[..., OpticalMode]:
+        return lambda *_, **__: self.mode
+
+
+def casts_shadows(sensor: SensorSpec, shadows: bool | None) -> bool:
+    """``shadows``; if None, as the sensor says."""
+    return sensor.optics.shadows if shadows is None else shadows
+
+
+def check_shadows(shadows: bool | None) -> None:
+    """Raise InputError unless ``shadows`` is True, False or None."""
     if shadows is not None and not isinstance(shadows, bool):
         raise InputError("shadows", value=shadows, rule="must be True, False or None", choices=(True, False, None))
-    if shadows is False and integrator != "fast":
-        rule = f"is for the integrator 'fast': {integrator!r} follows light as it goes, shadows and all"
-        raise InputError("shadows", value=shadows, rule=rule, choices=(True, None))
-    return sensor.optics.shadows if shadows is None else shadows

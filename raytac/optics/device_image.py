@@ -8,11 +8,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.checks import check_methods
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.image.base import ImageMode
+from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.runtime import no_collection
-from raytac.optics.trace.fast_tracer import RayTracer
 
 __all__ = ["DeviceImage", "ImageCut"]
 
@@ -36,7 +36,7 @@ class DeviceImage:
         """Render the pad at rest once, which prepares the mode for its grid.
 
         Args:
-            mode: an ``ImageMode``, or a ``RayTracer`` with the integrator ``fast``.
+            mode: one that renders on the device, as ``DeviceMode`` does.
             grid: of the heights to come.
             cut: what is kept.
             difference: give (255 + image − image at rest) // 2 instead of the image.
@@ -44,11 +44,10 @@ class DeviceImage:
         Raises:
             InputError: a mode that has no images on the device, or a cut beyond the rendered image.
         """
-        if not isinstance(mode, ImageMode) and not (isinstance(mode, RayTracer) and mode.integrator == "fast"):
-            value = getattr(mode, "label", mode)
-            raise InputError(
-                "optics", value=value, rule="must be taxim, phong or raytrace with the integrator fast to stay on the device"
-            )
+        what = "a mode that renders on the device, such as taxim, phong or raytrace with the integrator fast"
+        check_methods("optics", mode, ("prepare", "render_device"), ("mi", "camera", "outputs"), what)
+        if "rgb" not in mode.outputs:
+            raise InputError("outputs", value=mode.outputs, rule="must hold 'rgb'")
         self._mode, self._cut, self.mi = mode, cut, mode.mi
         (width, height), (right, bottom) = cut.size, mode.camera.resolution
         if (cut.left + width) * cut.downscale > right or (cut.top + height) * cut.downscale > bottom:
@@ -56,23 +55,22 @@ class DeviceImage:
         self._nodes = grid.rest.size
         self._is_whole = (width, height) == (right, bottom)
         self._frozen: dict[int, Any] = {}
-        rgb = mode.render(GelSurface.at_rest(grid)).rgb
-        if rgb is None:
-            raise InputError("outputs", value=mode.outputs, rule="must hold 'rgb'")
+        mode.prepare(grid)
+        image = mode.render_device(*self.upload(GelSurface.at_rest(grid))).rgb
         self._rest = None
         if difference:
-            rest = self._kept(self.mi.UInt8(rgb.ravel()), 1, None)
+            rest = self._kept(image, 1, None)
             dr.eval(rest)
             self._rest = rest
 
-    def upload(self, surface: GelSurface) -> tuple[Any, Any]:
+    def upload(self, surface: GelSurface) -> tuple[Float, UInt8]:
         """Heights (B·Ny·Nx) and contact of a surface on the device; heights must be finite."""
         heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
         contact = self.mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
         dr.eval(heights, contact)
         return heights, contact
 
-    def __call__(self, heights: Any, contact: Any = None) -> Any:
+    def __call__(self, heights: Float, contact: UInt8 | None = None) -> Any:
         """Images (B, height, width, 3), uint8, a Dr.Jit tensor that DLPack hands on without a copy; they are there when this returns.
 
         Args:
@@ -84,10 +82,7 @@ class DeviceImage:
         """
         mi = self.mi
         heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))
-        if isinstance(self._mode, RayTracer):
-            image = self._mode.render_device(heights)["rgb"]
-        else:
-            image = self._mode.render_device(heights, contact)[0]
+        image = self._mode.render_device(heights, contact).rgb
         envs = dr.width(heights) // self._nodes
         if not self._is_whole or self._rest is not None:
             if envs not in self._frozen:

@@ -9,7 +9,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.trace.height_field import CoatLayout
+from raytac.optics.geometry import CoatLayout
 from raytac.specs.sensor import SensorSpec
 
 SPECULAR = 0.57

@@ -13,7 +13,7 @@ import drjit as dr
 from raytac.device import llvm_library, resolve_device
 from raytac.errors import BackendError, InputError
 
-__all__ = ["ROUNDING", "VARIANTS", "check_batch", "largest_batch", "load_mitsuba", "no_collection", "peak_bytes"]
+__all__ = ["VARIANTS", "check_batch", "largest_batch", "load_mitsuba", "no_collection", "peak_bytes"]
 
 
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
@@ -34,9 +34,9 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     import mitsuba as mi
 
     name = _started(mi, device, resolved)
-    from raytac.optics.trace import led_plugin as led
+    from raytac.optics.trace.led import register
 
-    led.register(mi)
+    register(mi)
     return mi, name
 
 
@@ -113,8 +113,6 @@ def no_collection() -> Iterator[None]:
             gc.enable()
 
 
-ROUNDING = 2
-"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
 _LARGEST_ARRAY = 2**32 - 1
 """Dr.Jit indexes with 32 bits."""
 

@@ -1,86 +1,194 @@
-"""What any pad's physics tells a sensor about one instant: the surface and what touches does to it."""
+"""What every physics of the gel offers: a configuration, the pad of a press that it builds, and the reading of a pad at one instant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from raytac.gel.surface import GelSurface
-from raytac.specs.press import PressScene
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.shapes.part import Part
+from raytac.specs.press import PressScene, StageSpec
+from raytac.specs.sensor import SensorSpec
 
-__all__ = ["ContactState", "PadReading"]
+__all__ = ["Pad", "PadReading", "PhysicsConfig"]
+
+OfSurface = np.ndarray | Callable[[GelSurface], np.ndarray]
+"""An array, or a function that computes it from the surface when it is first asked for."""
 
 
-@dataclass(frozen=True)
 class PadReading:
-    """B pads of one sensor at one instant; pad frame.
+    """B pads of one sensor at one instant, in a press or in a world; pad frame. Forces are those of all that touches, on the gel.
 
-    A press knows one object and its load (``ContactState``); in a world a pad is touched by whatever comes, and this is what is left.
+    Attributes:
+        failed: environments whose physics broke down, (B,), bool; their arrays hold NaN.
+        unconverged: steps of the solver since the start that did not meet its tolerance, (B,), int; None without a solver.
+        has_forces: False if this is a bare surface, of which nothing else is known.
+        pad_from_object: pose of the pressed object, (B, 4, 4). This and the next two are NaN in a world.
+        world_from_pad: pose of the case, (B, 4, 4); the identity unless the scene moves it (world and pad frame are one at first touch).
+        depth: travel below first touch at zero shear and twist [m], (B,); negative when lifted.
+        force_law_area: area of contact by the law that ties force to depth [m²], (B,); None without such a law.
+        solved: what the physics itself knows beyond this, of a type of its own: ``SoftReading`` of a soft pad's press; else None.
     """
 
-    surface: GelSurface
-    wrench: np.ndarray
-    """Force of all that touches on the pad [N] and its torque about the pad frame's origin [N m], shape (B, 6)."""
-    failed: np.ndarray
-    """Environments whose physics broke down, shape (B,), bool."""
-    traction: Callable[[], np.ndarray]
-    """Computes the traction on the pad [Pa], shape (B, Ny, Nx, 3), as ``TactileFrame.traction``; called only if it is asked for."""
-    unconverged: np.ndarray | None = None
-    """Steps of the solver since the reset that did not meet its tolerance, shape (B,), int; None for rigid pads."""
+    stage: int = -1
+    """Index in the press scene's trajectory; −1 before the first stage, of a stage that is not the scene's, and in a world."""
+    kind: str = ""
+    """Kind of that stage, or ``start``; empty in a world."""
+    fraction: float = 1.0
+    """Completed part of the stage, in (0, 1]."""
+    scene: PressScene | None = None
+    """Press scene that the reading belongs to; None in a world."""
 
-    def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
-        """The same of the environments named, one row each."""
-        whole, rows = self.surface, np.asarray(envs)
-        coat = None if whole.coat is None else replace(whole.coat, positions=whole.coat.positions[rows])
-        others = {
-            name: None if values is None else values[rows]
-            for name, values in (("pad_from_object", whole.pad_from_object), ("ink", whole.ink))
-        }
-        surface = replace(
-            whole,
-            height=whole.height[rows],
-            contact=whole.contact[rows],
-            contact_centre=whole.contact_centre[rows],
-            coat=coat,
-            **others,
-        )
-        unconverged = None if self.unconverged is None else self.unconverged[rows]
-        return PadReading(surface, self.wrench[rows], self.failed[rows], lambda: self.traction()[rows], unconverged)
+    def __init__(
+        self,
+        surface: GelSurface | Callable[[], GelSurface],
+        wrench: OfSurface | None = None,
+        failed: np.ndarray | None = None,
+        traction: OfSurface | None = None,
+        *,
+        unconverged: np.ndarray | None = None,
+        pad_from_object: np.ndarray | None = None,
+        world_from_pad: np.ndarray | None = None,
+        depth: np.ndarray | None = None,
+        force_law_area: np.ndarray | None = None,
+        solved: Any = None,
+    ) -> None:
+        """Keep what is given; what is a function is called when it is first asked for.
+
+        Args:
+            surface: gel surface; ``wrench``, ``traction``: as the members of these names; None of both and of ``failed``: not known.
+            failed, unconverged, pad_from_object, world_from_pad, depth, force_law_area, solved: see the class.
+        """
+        self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
+        self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
+        self.unconverged, self.force_law_area = unconverged, force_law_area
+        self.solved, batch = solved, len(self.failed)
+        self.pad_from_object = np.full((batch, 4, 4), np.nan) if pad_from_object is None else pad_from_object
+        self.world_from_pad = np.full((batch, 4, 4), np.nan) if world_from_pad is None else world_from_pad
+        self.depth = np.full(batch, np.nan) if depth is None else depth
+
+    @cached_property
+    def surface(self) -> GelSurface:
+        """Gel surface."""
+        return self._surface if isinstance(self._surface, GelSurface) else self._surface()
+
+    @cached_property
+    def wrench(self) -> np.ndarray:
+        """Force on the pad [N] and its torque about the pad frame's origin [N m], (B, 6); NaN of a bare surface."""
+        if self._wrench is None:
+            return np.full((len(self.failed), 6), np.nan)
+        return self._wrench(self.surface) if callable(self._wrench) else self._wrench
+
+    def traction(self) -> np.ndarray:
+        """Traction on the pad [Pa], (B, Ny, Nx, 3), as ``TactileFrame.traction``; NaN if it is not known."""
+        if self._traction is None:
+            return np.full((*self.surface.height.shape, 3), np.nan, np.float32)
+        return self._traction(self.surface) if callable(self._traction) else self._traction
 
     @property
     def force(self) -> np.ndarray:
-        """Force on the pad [N], shape (B, 3)."""
+        """Force on the pad [N], (B, 3)."""
         return self.wrench[:, :3]
 
+    @property
+    def normal_force(self) -> np.ndarray:
+        """Force towards −z [N], (B,)."""
+        return -self.wrench[:, 2]
 
-@dataclass(frozen=True)
-class ContactState:
-    """B environments at one instant. Forces are those of the object on the gel, pad frame.
+    @property
+    def shear_force(self) -> np.ndarray:
+        """Force along x and y [N], (B, 2)."""
+        return self.wrench[:, :2]
 
-    pad_from_object, shape (B, 4, 4): pose of the object. world_from_pad, shape (B, 4, 4): pose of the case; the identity unless the
-    scene moves it (world and pad frame are one at first touch). depth [m], (B,): travel below first touch at zero shear and twist;
-    negative when lifted. normal_force [N], (B,): towards −z, >= 0. shear_force [N], (B, 2): along x and y. twist_torque [N m],
-    (B,): about +z. force_law_area [m²], (B,): area of contact by the load law, which the forces follow. failed, (B,) bool: the
-    state of this environment is not finite, did not settle, or did not converge (its pose is then NaN).
+    @property
+    def twist_torque(self) -> np.ndarray:
+        """Torque about +z at the contact's centre [N m], (B,)."""
+        x, y = np.nan_to_num(self.surface.contact_centre).T
+        return self.wrench[:, 5] - (x * self.wrench[:, 1] - y * self.wrench[:, 0])
+
+    def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
+        """The same of the environments named, one row each."""
+        rows, whole, wrench = np.asarray(envs), self.surface, self.wrench
+        part, coat = copy(self), whole.coat
+        del part.surface, part.wrench  # cached of all environments
+        part._surface = replace(
+            whole,
+            **{name: getattr(whole, name)[rows] for name in ("height", "contact", "contact_centre")},
+            **{name: None if (v := getattr(whole, name)) is None else v[rows] for name in ("pad_from_object", "ink")},
+            coat=None if coat is None else replace(coat, positions=coat.positions[rows]),
+        )
+        part._wrench, part._traction = wrench[rows], lambda _: self.traction()[rows]
+        for name in ("failed", "unconverged", "pad_from_object", "world_from_pad", "depth", "force_law_area"):
+            values = getattr(self, name)
+            setattr(part, name, None if values is None else values[rows])
+        return part
+
+
+class Pad(Protocol):
+    """The gel with the object of a press scene before it; ``PressPad`` has what all pads share."""
+
+    @property
+    def scene(self) -> PressScene: ...
+
+    @property
+    def grid(self) -> PadGrid:
+        """Nodes of its surfaces."""
+        ...
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Shape of the object; empty without one."""
+        ...
+
+    def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
+        """Readings along the trajectory: one before it, then ``steps_per_stage`` through each stage."""
+        ...
+
+    def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
+        """Readings along one more stage, from wherever the pad is now."""
+        ...
+
+    def peak(self, readings: Iterable[PadReading]) -> PadReading:
+        """First of ``readings`` at the end of the scene's peak stage."""
+        ...
+
+    def object_height(self, surface: GelSurface) -> np.ndarray | None:
+        """Underside of the object at the surface's poses [m], (B, Ny, Nx), inf where it is not; None without an object."""
+        ...
+
+
+class PhysicsConfig(Protocol):
+    """Configuration of one physics: a frozen dataclass that checks itself. ``raytac.physics.register`` makes it known by a name.
+
+    A field ``level`` that is None is filled with the scene's, else ``coarse``.
     """
 
-    stage: int
-    """Index in the trajectory; −1 before the first stage."""
-    kind: str
-    """Kind of that stage, or ``start``."""
-    fraction: float
-    """How much of the stage is done, in (0, 1]."""
-    pad_from_object: np.ndarray
-    world_from_pad: np.ndarray
-    depth: np.ndarray
-    normal_force: np.ndarray
-    shear_force: np.ndarray
-    twist_torque: np.ndarray
-    force_law_area: np.ndarray
-    failed: np.ndarray
-    scene: PressScene | None = None
-    """Scene that the object belongs to; None if it is not known."""
-    unconverged: np.ndarray | None = None
-    """Steps of the solver since the start that did not meet its tolerance, (B,), int; None for the rigid pad, which has no solver."""
+    is_simulated: ClassVar[bool]
+    """Whether a solver has the gel as a mesh: surfaces have a coat, the device that is asked for is used, worlds hand over bodies."""
+
+    @property
+    def label(self) -> str:
+        """Name for headers and reports."""
+        ...
+
+    def build(self, spec: SensorSpec, press: PressScene, *, pitch: float, num_envs: int, device: str, **own: Any) -> Pad:
+        """The pad of a press.
+
+        Args:
+            spec: the sensor.
+            press: the scene.
+            pitch: spacing of the grid of surfaces [m].
+            num_envs: number of environments B.
+            device: ``auto``, ``cpu`` or ``cuda``.
+            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists``, see ``PressTargets``.
+
+        Raises:
+            BackendError: what it needs is not installed or does not work here.
+            RaytacError: the scene and the sensor do not go together.
+        """
+        ...

@@ -12,6 +12,7 @@ from raytac.errors import InputError, SpecError
 from raytac.shapes.coin import coin_elevation
 from raytac.shapes.part import Part, mesh_part, primitive
 from raytac.shapes.relief import relief_part
+from raytac.specs.press import ObjectSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA
 
 __all__ = ["Shape", "object_parts"]
@@ -36,11 +37,14 @@ def object_parts(spec: Shape) -> tuple[Part, ...]:
     base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns (y × x)
     of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes only).
     ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
+    ``heights``: a relief under z = 0, centred.
     Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind, a missing or impossible length, or a model
     that MuJoCo refuses or that has no such body.
     """
     if spec.kind == "plane":
         return (primitive("plane"),)
+    if isinstance(spec, ObjectSpec) and spec.heights:
+        return (_heights(spec),)
     if spec.kind not in OBJECT_SCHEMA:
         raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=tuple(OBJECT_SCHEMA))
     if spec.kind == "none":
@@ -90,6 +94,16 @@ def _coin(spec: Shape) -> tuple[Part, ...]:
     radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
     body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
     return body, replace(relief_part(coin_elevation(radius, relief), radius), joined=True)
+
+
+def _heights(spec: ObjectSpec) -> Part:
+    """The map in a square of zeros, which are no object; beyond its last rows and columns the height falls to 0 over one pitch."""
+    data, pitch = np.array(spec.heights), _length(spec, "pitch")
+    rows, columns = data.shape
+    n = max(rows, columns)
+    square = np.zeros((n + 2, n + 2))
+    square[1 : rows + 1, 1 : columns + 1] = data
+    return relief_part(square, 0.5 * pitch * (n + 1), _shift(0.5 * pitch * (n - columns), 0.5 * pitch * (n - rows), 0.0))
 
 
 def _mjcf(spec: Shape) -> tuple[Part, ...]:

@@ -1,29 +1,29 @@
-"""What the environments of one press scene do each in their own way: where, how turned, how deep and how far sideways."""
+"""Pads of a press: per-environment targets, checks of the trajectory, and the loop over its stages that all pads share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from raytac.checks import MOST_ENVIRONMENTS, check_numbers, check_whole
 from raytac.errors import InputError, MeshError, SpecError
-from raytac.physics.base import ContactState
+from raytac.gel.surface import GelSurface, make_grid
+from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
 from raytac.se3 import rotation_of
 from raytac.shapes.part import Part
+from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
-from raytac.specs.sensor import GelpadSpec
+from raytac.specs.sensor import GelpadSpec, SensorSpec
 
 __all__ = [
     "CLEARANCE",
-    "MOST_STEPS",
+    "PressPad",
     "PressTargets",
-    "about_z",
     "check_trajectory",
-    "peak_state",
     "per_environment",
     "scene_parts",
 ]
@@ -166,7 +166,6 @@ CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before the press and after a release."""
 MOST_STEPS = 1_000_000
 """States that a stage can be asked for."""
-_State = TypeVar("_State", bound=ContactState)
 
 
 def scene_parts(scene: PressScene) -> tuple[Part, ...]:
@@ -201,20 +200,123 @@ def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part
             raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
 
 
-def peak_state(scene: PressScene, states: Iterable[_State]) -> _State:
-    """First of ``states`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
-    for state in states:
-        if state.stage == scene.peak_stage and state.fraction == 1.0:
-            return state
-    raise InputError("states", value=scene.peak_stage, rule="hold no state at the end of the scene's peak stage")
-
-
 def per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """``values`` as an array, zeros for None; raises ``InputError`` for another shape, or what is no number."""
     return np.zeros(shape) if values is None else check_numbers(name, values, shape)
 
 
-def about_z(angle: float) -> np.ndarray:
-    """Rotation by ``angle`` [rad] about z, (3, 3)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+class PressPad(ABC):
+    """Base of the pads of a press: the object before the gel, and the loop over the stages of its trajectory.
+
+    A subclass says where a press starts (``reset``), how the object moves through a stage (``begin``, ``advance``) and what is then
+    to be read (``read``).
+
+    Attributes:
+        sensor, scene, num_envs: as given.
+        targets: what each environment does.
+        grid: nodes of the surfaces.
+        parts: shape of the object; empty without one.
+    """
+
+    def __init__(
+        self, sensor: SensorSpec, scene: PressScene, *, pitch: float, num_envs: int = 1, **own: np.ndarray | None
+    ) -> None:
+        """Check the scene, and build grid and object.
+
+        Args:
+            sensor: gives the gelpad.
+            scene: object and trajectory.
+            pitch: spacing of the grid that surfaces are given on [m].
+            num_envs: number of environments B.
+            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of each environment, see ``PressTargets``; not finite:
+                that environment fails.
+
+        Raises:
+            InputError: arguments of the wrong shape, ``depths`` deeper than the pad.
+            SpecError: the scene's object or trajectory is impossible; names the scene's file and key.
+        """
+        self.sensor, self.scene, self.num_envs = sensor, scene, num_envs
+        self.targets = PressTargets(scene, num_envs, **own)
+        self.grid = make_grid(sensor.gelpad, pitch)
+        self.parts = scene_parts(scene)
+        check_trajectory(scene, sensor.gelpad, self.parts, self.targets.depths)
+        self._has_started = False
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget all history: the pad at rest, the object ``CLEARANCE`` above it."""
+
+    @abstractmethod
+    def begin(self, index: int, stage: StageSpec, steps: int) -> None:
+        """Prepare a stage of ``steps`` readings; ``index``: its number in the scene, −1 if it is none of the scene's."""
+
+    @abstractmethod
+    def advance(self, stage: StageSpec, fraction: float) -> None:
+        """Move the object to ``fraction`` of the stage that was begun last."""
+
+    @abstractmethod
+    def read(self) -> PadReading:
+        """The pad as it is now; stage and scene are added by the loop over the stages."""
+
+    def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
+        """Readings along the trajectory: one before it (lifted by ``CLEARANCE``), then ``steps_per_stage`` through each stage.
+
+        Targets are reached in straight lines. An ``indent`` to a depth moves the object there; one to a force pushes until the contact
+        balances it, and keeps that force through a shear or twist that follows. A ``release`` lifts the object ``CLEARANCE`` above the
+        gel. ``progress``: a pad that takes long shows a bar on a terminal.
+
+        Raises:
+            InputError: ``steps_per_stage`` below 1, or an environment that goes where it cannot by its own offset, rotation, shear or
+                twist; names both.
+            SpecError: a depth or force that would take the object's lowest point past the gel's bonded face, or an object that does not
+                start over the pad or is sheared or twisted off it; names the scene's file and key.
+        """
+        check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
+        self._start()
+        yield self._reading(-1, "start", 1.0)
+        for index, stage in enumerate(self.scene.trajectory):
+            yield from self._through(index, stage, steps_per_stage)
+
+    def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
+        """Readings along one more stage, from wherever the pad is now: for a loop in which somebody else decides where to go next.
+
+        A pad that was not run yet starts above the gel. The readings are of no stage of the scene (their ``stage`` is −1). Nothing moves
+        before the first is asked for; who stops asking leaves the pad where it is then, and may follow another stage from there.
+
+        Raises:
+            InputError: ``steps`` below 1, or a stage that presses deeper than the pad or takes the object off it.
+            SpecError: a scene without object, or a stage that no pad can follow.
+        """
+        check_whole("steps", steps, 1, MOST_STEPS)
+        check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
+        if not self._has_started:
+            self._start()
+        yield from self._through(-1, stage, steps)
+
+    def peak(self, readings: Iterable[PadReading]) -> PadReading:
+        """First of ``readings`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
+        for reading in readings:
+            if reading.stage == self.scene.peak_stage and reading.fraction == 1.0:
+                return reading
+        raise InputError("readings", value=self.scene.peak_stage, rule="hold none at the end of the scene's peak stage")
+
+    def object_height(self, surface: GelSurface) -> np.ndarray | None:
+        """Underside of the object at the surface's poses [m], (B, Ny, Nx), inf where it is not; None without an object."""
+        if surface.pad_from_object is None:
+            return None
+        return object_height(self.parts, surface.pad_from_object, self.grid.x, self.grid.y)
+
+    def _start(self) -> None:
+        self.reset()
+        self._has_started = True
+
+    def _through(self, index: int, stage: StageSpec, steps: int) -> Iterator[PadReading]:
+        self.begin(index, stage, steps)
+        for step in range(1, steps + 1):
+            self.advance(stage, step / steps)
+            yield self._reading(index, stage.kind, step / steps)
+
+    def _reading(self, index: int, kind: str, fraction: float) -> PadReading:
+        reading = self.read()
+        reading.stage, reading.kind, reading.fraction, reading.scene = index, kind, fraction, self.scene
+        return reading

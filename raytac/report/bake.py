@@ -1,29 +1,46 @@
-"""Bake a table and write its folder: calibration files as Taxim has them, what was covered, and how far it is from the ray tracer."""
+"""Bake a table and write its folder: files as Taxim has them, coverage, and error.
+
+The error is that against the ray tracer, scene by scene.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
-from raytac.report.machine import machine
-from raytac.report.surfaces import press_peaks
-from raytac.report.table_error import SceneError, error_metrics, table_errors
+from raytac.optics.taxim.config import Taxim
+from raytac.optics.trace.config import RayTraced
+from raytac.report.image_error import contact_box, mae, psnr, rmse
+from raytac.report.measure import machine
+from raytac.report.press import press_peaks
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from raytac.optics.taxim.bake.bake import Baked
-    from raytac.optics.taxim.bake.settings import BakeSettings
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
     from raytac.optics.taxim.bake.fit import BinFit
+    from raytac.optics.taxim.bake.settings import BakeSettings
+    from raytac.optics.taxim.table import PolyTable
+    from raytac.optics.trace.tracer import Tracer
 
-__all__ = ["ERROR_RANGE", "bake_metrics", "run_bake", "write_coverage", "write_table_sheet"]
+__all__ = [
+    "BOX_MARGIN",
+    "ERROR_RANGE",
+    "SceneError",
+    "bake_metrics",
+    "error_metrics",
+    "run_bake",
+    "table_errors",
+    "write_coverage",
+    "write_table_sheet",
+]
 
 
 def run_bake(
@@ -50,7 +67,6 @@ def run_bake(
     from raytac.optics.taxim.bake.bake import bake
     from raytac.optics.taxim.cache import keep, table_folder
     from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
-    from raytac.report.bake import write_coverage, write_table_sheet
 
     with result_folder(out, (*CALIBRATION_FILES, "coverage.png", "sheet.png", "metrics.json")) as folder:
         size = sensor.camera.resolution if resolution is None else resolution
@@ -124,20 +140,20 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
     counts, degree = fit.counts[:-1, :-1].astype(float), fit.degree[:-1, :-1]
     extent = (-180.0, 180.0, 0.0, 90.0)
     with plt.rc_context(_STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
-        for axes in (left, right):
+        figure, (first, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
+        for axes in (first, right):
             axes.set_facecolor(_FILLED)
             axes.set_xlabel("direction of the slope [°]")
             axes.set_xticks((-180, -90, 0, 90, 180))
             axes.set_yticks((0, 15, 30, 45, 60, 75, 90))
-        left.set_ylabel("magnitude of the slope [°]")
+        first.set_ylabel("magnitude of the slope [°]")
         shown = np.ma.masked_equal(counts, 0)
         norm = LogNorm(1, max(10.0, float(counts.max())))
-        image = left.imshow(
+        image = first.imshow(
             shown, origin="lower", extent=extent, aspect="auto", cmap="viridis", norm=norm, interpolation="nearest"
         )
-        left.set_title(f"a  touched samples a bin, {sensor}")
-        figure.colorbar(image, ax=left, pad=0.02)
+        first.set_title(f"a  touched samples a bin, {sensor}")
+        figure.colorbar(image, ax=first, pad=0.02)
         shown = np.ma.masked_less(degree, 0)
         colours = ListedColormap(_DEGREES)
         right.imshow(
@@ -157,7 +173,10 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
 
 
 def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> None:
-    """One row a scene: ray tracer, table, table with shadows (if there are), and the table's signed error, mean of the channels."""
+    """Sheet of one row a scene: ray tracer, table, table with shadows, signed error of the table.
+
+    The error is the mean of the channels.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -197,3 +216,87 @@ def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> N
         figure.colorbar(shown, ax=grid, shrink=0.8, pad=0.01, aspect=40, label="table − ray tracer [levels]")
         figure.savefig(path, dpi=200)
         plt.close(figure)
+
+
+BOX_MARGIN = 15 / 320
+"""Margin of the box round the contact as a share of the image's width: 15 px at 320 × 240."""
+
+
+@dataclass(frozen=True)
+class SceneError:
+    """One press: the images and how far the table's is from the ray tracer's."""
+
+    traced: np.ndarray
+    """(H, W, 3) uint8."""
+    table: np.ndarray
+    """(H, W, 3) uint8."""
+    contact: np.ndarray
+    """(H, W) bool; nothing but False if nothing touches."""
+    uncovered: float
+    """Share of the contact's pixels whose bin no sample reached; NaN without contact."""
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the contact's bounding box with ``BOX_MARGIN`` on each side; the whole image if nothing touches."""
+        return contact_box(self.contact, round(BOX_MARGIN * self.contact.shape[1]))
+
+    @property
+    def contact_mae(self) -> float:
+        """Mean absolute error over the contact's pixels [levels], over the image if nothing touches."""
+        where = self.contact if self.contact.any() else np.ones_like(self.contact)
+        return mae(self.table[where], self.traced[where])
+
+    @property
+    def box_psnr(self) -> float:
+        """PSNR in the box [dB]."""
+        return psnr(rmse(self.table[self.box], self.traced[self.box]))
+
+    @property
+    def frame_psnr(self) -> float:
+        """PSNR over the image [dB]."""
+        return psnr(rmse(self.table, self.traced))
+
+
+def table_errors(
+    sensor: SensorSpec,
+    surfaces: Mapping[str, GelSurface],
+    table: PolyTable,
+    tracer: Tracer,
+) -> dict[str, dict[str, SceneError]]:
+    """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against the images of ``tracer`` by scene.
+
+    ``surfaces`` (B = 1 each) share one grid, that of the first image of ``tracer`` if it has rendered already.
+    """
+    setting: dict[str, Any] = {"resolution": tracer.camera.resolution, "device": tracer.device}
+    seen = RayTraced().build(sensor, outputs=("depth",), **setting)
+    traced = {name: (tracer.render(surface).rgb, seen.render(surface).contact) for name, surface in surfaces.items()}
+    errors: dict[str, dict[str, SceneError]] = {}
+    for family, shadow in (("taxim", False), ("taxim_shadow", True)):
+        if shadow and table.shadow is None:
+            continue
+        mode = Taxim(table, shadows=shadow).build(sensor, **setting)
+        errors[family] = {}
+        for name, surface in surfaces.items():
+            image, (truth, contact) = mode.render(surface), traced[name]
+            assert image.rgb is not None and truth is not None and contact is not None
+            uncovered = float("nan") if image.uncovered is None else float(image.uncovered[0])
+            errors[family][name] = SceneError(truth[0], image.rgb[0], contact[0], uncovered)
+    return errors
+
+
+def error_metrics(errors: Mapping[str, Mapping[str, SceneError]]) -> dict[str, Metric]:
+    """Keys ``<family>.<scene>.psnr_box_db``, ``.contact_mae_levels``, ``.psnr_frame_db`` and ``.uncovered_share``.
+
+    A PSNR of equal images, which is infinite, and a share without contact are left out.
+    """
+    metrics: dict[str, Metric] = {}
+    for family, by_scene in errors.items():
+        for scene, error in by_scene.items():
+            figures = {
+                "psnr_box_db": error.box_psnr,
+                "contact_mae_levels": error.contact_mae,
+                "psnr_frame_db": error.frame_psnr,
+                "uncovered_share": error.uncovered,
+            }
+            metrics |= {f"{family}.{scene}.{name}": value for name, value in figures.items() if np.isfinite(value)}
+    return metrics

@@ -90,7 +90,7 @@ def ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def has_flip() -> bool:
-    """Whether the package ``flip-evaluator`` is installed."""
+    """True if the package ``flip-evaluator`` is installed."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
@@ -110,7 +110,10 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def contact_box(contact: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the contact's bounding box with ``margin`` [px] on each side, within the image; all of it without contact."""
+    """Rows and columns of the contact's bounding box with ``margin`` [px] on each side.
+
+    It stays within the image, and is all of it without contact.
+    """
     height, width = contact.shape
     if not contact.any():
         return slice(0, height), slice(0, width)

@@ -1,4 +1,4 @@
-"""Calibrate a pad's marker motion and write its folder: the fitted file, errors on held-out presses as table and figures, metrics."""
+"""Calibration of a pad's marker motion: the fitted file, errors on held-out presses as table and figures, and metrics."""
 
 from __future__ import annotations
 
@@ -8,148 +8,133 @@ import time
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from raytac.checks import check_known
 from raytac.device import resolve_device
-from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import VERSIONED, Metric, versions, write_metrics
-from raytac.markers.calibration import PUBLISHED
-from raytac.report.machine import machine
+from raytac.io.progress import Progress
+from raytac.markers.calibration import ModelError, ProbeData, fit_motion, model_errors, probe_sensor
+from raytac.markers.calibration_presses import (
+    FIT,
+    HELD_OUT,
+    LOADS,
+    QUICK_FIT,
+    QUICK_HELD_OUT,
+    Press,
+    PressFrame,
+    press_frames,
+    simulate_press,
+)
+from raytac.markers.registry import models_without_coat
+from raytac.markers.tracker import MarkerFrame, MarkerTracker
+from raytac.report.measure import machine
+from raytac.report.press_store import PressStore, press_code
+from raytac.specs import validate_press
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.markers.calibration import ModelError
-    from raytac.markers.calibration_presses import Press, PressFrame
-    from raytac.report.press_store import PressStore
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-
-from raytac.markers.tracker import MARKER_MODELS, MarkerFrame, MarkerTracker
-
-if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from raytac.markers.calibration_presses import PressFrame
-    from raytac.report.markers import MotionReport
 
 __all__ = [
     "FILES",
-    "TESTED",
     "MotionReport",
     "calibrate_markers",
     "draw_arrows",
     "error_metrics",
     "error_table",
-    "motion_metrics",
     "press_all",
     "run_calibrate_markers",
-    "write_arrows",
-    "write_errors",
 ]
 
-
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
-"""Every file that a calibration writes."""
-TESTED = ("fots", PUBLISHED, "superposition", "force_field")
-"""Models that are compared with surface tracking."""
+"""Files that a calibration writes."""
 
 
 @dataclass(frozen=True)
 class MotionReport:
-    """A fit and what it is worth."""
+    """A fit and its errors."""
 
     motion: MarkerMotionSpec
     errors: list[ModelError]
-    """On held-out presses."""
+    """Errors on held-out presses."""
     fit_errors: list[ModelError]
-    """Of FOTS, and of FOTS as published, on the presses that both were fitted to."""
+    """Errors of FOTS, and of FOTS as published, on the presses that both were fitted to."""
     by_press: list[tuple[str, ModelError]]
-    """Of FOTS on every press, in words, under its last kind of load; those of the fit first."""
+    """Errors of FOTS by press, described in words, under its last kind of load; presses of the fit first."""
     times_ms: dict[str, float]
-    """Median time of a frame of every model, at the probes."""
+    """Median time of a frame of every model at the probes [ms]."""
     probes: int
     held_out: list[PressFrame]
 
 
 def run_calibrate_markers(
-    sensor: SensorSpec, out: Path, *, pad: str, quick: bool, device: str, seed: int, start: float, progress: bool = True
+    sensor: SensorSpec, out: Path, *, level: str, quick: bool, device: str, seed: int, start: float, progress: bool = True
 ) -> list[Path]:
-    """Press the simulated pad, fit, test on held-out presses, and write ``FILES`` to ``out``; returns the files written.
+    """Press the soft pad of a ``level``, fit, test on held-out presses, and write ``FILES`` to ``out``; returns the files written.
 
-    Finished presses are kept in ``presses`` of ``out``, also where an error or an interrupt ends the run; a later one does not press them
-    again.
+    Finished presses are kept in ``presses`` of ``out``, also if an error or an interrupt ends the run. A later run reuses them.
 
     Raises:
         RaytacError: a press did not settle.
         SpecError: a press fits nowhere on this sensor.
-        InputError: an unknown ``pad`` or ``device``, or ``out`` cannot be written.
+        InputError: an unknown ``level`` or ``device``, or ``out`` cannot be written.
         BackendError: the solver or Dr.Jit cannot run.
     """
-    if pad not in PADS:
-        raise InputError("pad", value=pad, rule="must be a known level", choices=PADS)
+    check_known("level", level, PADS)
     solver = resolve_device(device, ray_tracing=False)
-    from tqdm import tqdm
-
-    from raytac.markers.calibration_presses import FIT, HELD_OUT, QUICK_FIT, QUICK_HELD_OUT
-    from raytac.report.markers import write_arrows, write_errors
-    from raytac.report.press_store import PressStore, press_code
-
     with result_folder(out, FILES) as folder:
         fit, held_out = (QUICK_FIT, QUICK_HELD_OUT) if quick else (FIT, HELD_OUT)
         began = time.perf_counter()
-        store = PressStore(out / "presses", sensor.gelpad, pad=pad, device=solver, code=press_code(), say=tqdm.write)
-        pressed = press_all(sensor, (*fit, *held_out), pad, device, progress=progress, store=store)
+        store = PressStore(out / "presses", sensor.gelpad, pad=level, device=solver, code=press_code(), say=Progress.write)
+        pressed = press_all(sensor, (*fit, *held_out), level, device, progress=progress, store=store)
         press_s = time.perf_counter() - began
         names = {press.name for press in fit}
         report = calibrate_markers(
             sensor,
             [frame for frame in pressed if frame.press.name in names],
             [frame for frame in pressed if frame.press.name not in names],
-            pad=pad,
+            level=level,
             device=device,
         )
         (folder / "marker_motion.toml").write_text(marker_motion_text(report.motion), encoding="utf-8")
-        load_marker_motion(folder / "marker_motion.toml")  # what is written can be read
+        load_marker_motion(folder / "marker_motion.toml")  # the written file can be read
         (folder / "errors.md").write_text(error_table(report), encoding="utf-8")
         write_errors(folder / "errors.png", report)
         write_arrows(folder / "arrows.png", replace(sensor, marker_motion=report.motion), report.held_out, device=device)
-        metrics = motion_metrics(report) | {"sensor": sensor.name, "pad": pad, "seed": seed, "press_s": press_s}
+        metrics = motion_metrics(report) | {"sensor": sensor.name, "pad": level, "seed": seed, "press_s": press_s}
         metrics |= {"presses": len(names) + len(held_out), "presses_reused": store.reused}
         metrics |= {"device": device, **versions((*VERSIONED, "warp-lang")), **machine()}
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
-        found = sorted(path.name for path in folder.iterdir())
-    return [Path(out) / name for name in found]
+        written = [Path(out) / path.name for path in sorted(folder.iterdir())]
+    return written
 
 
 def press_all(
-    sensor: SensorSpec, presses: tuple[Press, ...], pad: str, device: str, *, progress: bool, store: PressStore | None = None
+    sensor: SensorSpec, presses: tuple[Press, ...], level: str, device: str, *, progress: bool, store: PressStore | None = None
 ) -> list[PressFrame]:
-    """States of all presses on the simulated pad of level ``pad``, in order.
+    """States of all presses on the soft pad of a ``level``, in order.
 
-    ``progress``: show a bar. ``store``: finished presses, which are not pressed again; None keeps none.
+    ``progress``: show a bar. ``store``: finished presses, which are reused; None keeps none.
 
     Raises:
-        SpecError: a press fits nowhere on this sensor; said before any is pressed.
+        SpecError: a press fits nowhere on this sensor; raised before the first press.
         RaytacError: a press did not settle.
         BackendError: the solver cannot run on ``device``.
     """
-    from tqdm import tqdm
-
-    from raytac.markers.calibration_presses import press_frames, simulate_press
-    from raytac.specs import validate_press
-
     for press in presses:
         validate_press(sensor, press.scene())
     solver = resolve_device(device, ray_tracing=False)
     frames: list[PressFrame] = []
-    for press in tqdm(presses, desc=f"press {sensor.name}", unit="press", disable=None if progress else True):
+    for press in Progress(presses, desc=f"press {sensor.name}", unit="press", show=progress):
         states = None if store is None else store.read(press)
         if states is None:
-            states = simulate_press(sensor, press, pad=pad, device=solver)
+            states = simulate_press(sensor, press, level=level, device=solver)
             if store is not None:
                 store.write(press, states)
         frames += press_frames(sensor, press, states)
@@ -157,59 +142,53 @@ def press_all(
 
 
 def calibrate_markers(
-    sensor: SensorSpec, fit: list[PressFrame], held_out: list[PressFrame], *, pad: str, device: str = "auto"
+    sensor: SensorSpec, fit: list[PressFrame], held_out: list[PressFrame], *, level: str, device: str = "auto"
 ) -> MotionReport:
-    """Fit to ``fit`` and test on ``held_out``: whole presses, in order, of the simulated pad of level ``pad``."""
-    from raytac.markers.calibration import ProbeData, fit_motion, model_errors, probe_sensor
-
+    """Fit to ``fit`` and test on ``held_out``: whole presses, in order, of the soft pad of a ``level``."""
     data = ProbeData.of(sensor, fit)
     motion = fit_motion(data, device=device)
     fitted = replace(sensor, marker_motion=motion)
     grid = fit[0].surface.grid
-    errors, times = model_errors(fitted, held_out, grid, models=TESTED, device=device)
-    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", PUBLISHED), device=device)
+    errors, times = model_errors(fitted, held_out, grid, device=device)
+    fit_errors, _ = model_errors(fitted, fit, grid, models=("fots", "fots_published"), device=device)
     by_press = []
     for name, group in groupby([*fit, *held_out], key=lambda frame: str(frame.press)):
         rows, _ = model_errors(fitted, list(group), grid, models=("fots",), device=device)
         by_press.append((name, rows[-1]))
     markers = probe_sensor(sensor).markers
     report = MotionReport(motion, errors, fit_errors, by_press, times, markers.rows * markers.columns, held_out)
-    return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, pad, device)))
+    return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, level, device)))
 
 
 def _provenance(
-    sensor: SensorSpec, report: MotionReport, fit: list[PressFrame], held_out: list[PressFrame], pad: str, device: str
+    sensor: SensorSpec, report: MotionReport, fit: list[PressFrame], held_out: list[PressFrame], level: str, device: str
 ) -> str:
+    """Presses, versions and errors of a fit, as text of its file."""
+
     def listed(frames: list[PressFrame]) -> list[str]:
         return [f"  {press}" for press in dict.fromkeys(str(frame.press) for frame in frames)]
 
     def errors(rows: list[ModelError], model: str) -> str:
         return ", ".join(f"{row.load} {1e6 * row.mean:.1f} um" for row in rows if row.model == model)
 
-    gelpad = sensor.gelpad
+    gelpad, used = sensor.gelpad, versions(("raytac", "warp-lang", "drjit", "numpy"))
+    made_by = ", ".join(f"{key.split('.', 1)[1]} {value}" for key, value in used.items() if key != "versions.python")
     return "\n".join(
         [
-            f"Fitted {datetime.date.today().isoformat()} to surface tracking on the simulated pad, level {pad}, of {sensor.name}:",
-            f"E {1e-3 * gelpad.youngs_modulus:g} kPa, nu {gelpad.poisson_ratio:g}, friction {gelpad.friction:g}, held at "
+            f"Fitted {datetime.date.today().isoformat()} to surface tracking on the soft pad, level {level}, of {sensor.name}:",
+            f"E {1e-3 * gelpad.youngs_modulus:g} kPa, nu {gelpad.poisson_ratio:g}, friction {gelpad.friction:g}, bonded at "
             f"{gelpad.bonded}.",
-            f"By {', '.join(_made_by(device))}.",
+            f"By {made_by}, simulated on {resolve_device(device, ray_tracing=False)}.",
             "Presses of the fit:",
             *listed(fit),
             "Presses held out:",
             *listed(held_out),
             f"Mean distance of FOTS, {report.probes} probes on a 1 mm grid, on the fit: {errors(report.fit_errors, 'fots')};",
             f"held out: {errors(report.errors, 'fots')}.",
-            f"Without [punch], as published, on the fit: {errors(report.fit_errors, PUBLISHED)};",
-            f"held out: {errors(report.errors, PUBLISHED)}.",
+            f"Without [punch], as published, on the fit: {errors(report.fit_errors, 'fots_published')};",
+            f"held out: {errors(report.errors, 'fots_published')}.",
         ]
     )
-
-
-def _made_by(device: str) -> list[str]:
-    """Versions of what the fit depends on, and where the pad was simulated."""
-    found = versions(("raytac", "warp-lang", "drjit", "numpy"))
-    names = [f"{key.split('.', 1)[1]} {value}" for key, value in found.items() if key != "versions.python"]
-    return [*names, f"simulated on {resolve_device(device, ray_tracing=False)}"]
 
 
 def motion_metrics(report: MotionReport) -> dict[str, Metric]:
@@ -229,7 +208,7 @@ def motion_metrics(report: MotionReport) -> dict[str, Metric]:
 
 
 def error_metrics(key: str, row: ModelError) -> dict[str, Metric]:
-    """Figures of one model and kind of load as ``<key>.<figure>``."""
+    """Errors of one model and kind of load as ``<key>.<figure>``."""
     metrics: dict[str, Metric] = {
         f"{key}.mean_um": 1e6 * row.mean,
         f"{key}.p95_um": 1e6 * row.p95,
@@ -277,22 +256,20 @@ _STYLE: dict[Any, Any] = {
     "ytick.major.width": 0.6,
     "legend.fontsize": 7,
 }
-_LABELS = {
-    "surface": "surface tracking",
-    "fots": "FOTS",
-    "fots_published": "FOTS as published",
-    "superposition": "superposition",
-    "force_field": "force field",
+_LOOK = {
+    "surface": ("surface tracking", "#1b1b1b"),
+    "fots": ("FOTS", "#0072b2"),
+    "fots_published": ("FOTS as published", "#56b4e9"),
+    "superposition": ("superposition", "#009e73"),
+    "force_field": ("force field", "#d55e00"),
 }
-_COLOURS = {
-    "surface": "#1b1b1b",
-    "fots": "#0072b2",
-    "fots_published": "#56b4e9",
-    "superposition": "#009e73",
-    "force_field": "#d55e00",
-}
+"""Label and colour of each model; others have their name and grey."""
 _LONGEST = 1.6
 """Length of the longest arrow in a plot, in spacings of the markers."""
+
+
+def _look(model: str) -> tuple[str, str]:
+    return _LOOK.get(model, (model, "#7f7f7f"))
 
 
 def draw_arrows(
@@ -304,22 +281,22 @@ def draw_arrows(
     colour: str = "#1b1b1b",
     image: np.ndarray | None = None,
 ) -> float:
-    """Displacement in the image as arrows from the markers' places at rest, environment 0; returns how much they are magnified.
+    """Draw displacements in the image as arrows from the markers' positions at rest, environment 0; returns their magnification.
 
-    ``magnified``: by what factor; None picks 1, 2, 5, 10 … so that the longest is about as long as markers are apart. ``image``: shown
-    underneath, (H, W, 3) uint8.
+    ``magnified``: factor on the arrows; None picks 1, 2, 5, 10 … so that the longest is about as long as the spacing of the markers.
+    ``image``: shown underneath, (H, W, 3) uint8.
     """
     width, height = resolution
-    rest, way = markers.rest_px[0], markers.displacement_px[0]
-    seen = np.isfinite(way).all(axis=1)
+    rest, displacement = markers.rest_px[0], markers.displacement_px[0]
+    visible = np.isfinite(displacement).all(axis=1)
     if magnified is None:
-        magnified = _magnification(rest, way[seen])
+        magnified = _magnification(rest, displacement[visible])
     if image is not None:
         axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest")
     axes.plot(*rest.T, ".", color="0.75" if image is None else "white", markersize=1.2, zorder=1)
     axes.quiver(
-        *rest[seen].T,
-        *(magnified * way[seen]).T,
+        *rest[visible].T,
+        *(magnified * displacement[visible]).T,
         angles="xy",
         scale_units="xy",
         scale=1.0,
@@ -331,15 +308,13 @@ def draw_arrows(
         minlength=0.0,
         zorder=2,
     )
-    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
-    axes.set_xticks(())
-    axes.set_yticks(())
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xticks=(), yticks=())
     return magnified
 
 
-def _magnification(rest: np.ndarray, way: np.ndarray) -> float:
-    """1, 2, 5, 10 … at which the longest arrow is not much longer than neighbouring markers are apart."""
-    longest = float(np.linalg.norm(way, axis=1).max(initial=0.0))
+def _magnification(rest: np.ndarray, displacement: np.ndarray) -> float:
+    """Magnification of 1, 2, 5, 10 … at which the longest arrow is at most ``_LONGEST`` spacings of neighbouring markers."""
+    longest = float(np.linalg.norm(displacement, axis=1).max(initial=0.0))
     apart = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
     spacing = float(np.median(np.where(apart > 0, apart, np.inf).min(axis=1)))
     steps = np.array([1, 2, 5, 10, 20, 50, 100], float)
@@ -348,17 +323,12 @@ def _magnification(rest: np.ndarray, way: np.ndarray) -> float:
 
 
 def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, device: str = "auto") -> None:
-    """One row a kind of load, at the end of a held-out press; one column a model. ``sensor`` has the marker motion."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from raytac.markers.calibration import probe_sensor
-    from raytac.markers.calibration_presses import LOADS
+    """Draw markers at the end of held-out presses, a row a load and a column a model; ``sensor`` has the marker motion."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
     probed = probe_sensor(sensor)
-    order = ("surface", *(name for name in MARKER_MODELS if name != "surface"))
+    order = ("surface", *(name for name in models_without_coat() if name != "fots_published"))
     presses = [list(group) for _, group in groupby(frames, key=lambda frame: frame.press.name)]
     rows = []
     for load in LOADS:
@@ -367,28 +337,29 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
             last = max(k for k, frame in enumerate(chosen) if frame.load == load)
             rows.append((load, chosen[: last + 1]))
     resolution = probed.camera.resolution
-    with plt.rc_context(_STYLE):
+    with rc_context(_STYLE):
         size = (1.8 * len(order) + 0.1, len(rows) * (1.8 * resolution[1] / resolution[0] + 0.24))
-        figure, grid = plt.subplots(len(rows), len(order), figsize=size, squeeze=False, layout="constrained")
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(rows), len(order), squeeze=False)
         for (load, press), line in zip(rows, grid, strict=True):
             magnified, truth = None, None
             for axes, model in zip(line, order, strict=True):
+                label, colour = _look(model)
                 tracker = MarkerTracker(probed, model, press[0].surface.grid, device=device)
                 markers = [tracker.update(frame.surface) for frame in press][-1]
-                magnified = draw_arrows(axes, markers, resolution, magnified=magnified, colour=_COLOURS[model])
+                magnified = draw_arrows(axes, markers, resolution, magnified=magnified, colour=colour)
                 _outline(axes, tracker, press[-1])
                 if truth is None:
                     truth = markers.displacement[0]
-                    axes.set_title(f"{load}: {_LABELS[model]}, × {magnified:g}", fontsize=7)
+                    axes.set_title(f"{load}: {label}, × {magnified:g}", fontsize=7)
                 else:
                     off = 1e6 * np.linalg.norm(markers.displacement[0] - truth, axis=1).mean()
-                    axes.set_title(f"{_LABELS[model]}, off by {off:.0f} µm", fontsize=7)
+                    axes.set_title(f"{label}, off by {off:.0f} µm", fontsize=7)
         figure.savefig(path, dpi=250)
-        plt.close(figure)
 
 
 def _outline(axes: Axes, tracker: MarkerTracker, frame: PressFrame) -> None:
-    """The contact's edge in the image."""
+    """Draw the edge of the contact."""
     surface = frame.surface
     if not surface.contact[0].any():
         return
@@ -398,32 +369,30 @@ def _outline(axes: Axes, tracker: MarkerTracker, frame: PressFrame) -> None:
 
 
 def write_errors(path: Path, report: MotionReport) -> None:
-    """Mean error of every model by kind of load, with the 95th percentile, beside the size of the motion itself."""
-    import matplotlib
+    """Draw mean error and 95th percentile of every model by kind of load, beside the size of the motion itself."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    models = [name for name in _LABELS if name in {row.model for row in report.errors}]
+    models = list(dict.fromkeys(row.model for row in report.errors))
     loads = list(dict.fromkeys(row.load for row in report.errors))
-    with plt.rc_context(_STYLE):
-        figure, axes = plt.subplots(figsize=(3.5, 2.4), layout="constrained")
-        wide = 0.8 / (len(models) + 1)
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(3.5, 2.4), layout="constrained")
+        axes = figure.subplots()
+        width = 0.8 / (len(models) + 1)
         for k, model in enumerate(models):
+            label, colour = _look(model)
             rows = {row.load: row for row in report.errors if row.model == model}
-            x = np.arange(len(loads)) + (k - 0.5 * len(models)) * wide
+            x = np.arange(len(loads)) + (k - 0.5 * len(models)) * width
             mean = [1e6 * rows[load].mean for load in loads]
-            axes.bar(x, mean, 0.92 * wide, color=_COLOURS[model], label=_LABELS[model])
-            axes.plot(x, [1e6 * rows[load].p95 for load in loads], "_", color=_COLOURS[model], markersize=7)
+            axes.bar(x, mean, 0.92 * width, color=colour, label=label)
+            axes.plot(x, [1e6 * rows[load].p95 for load in loads], "_", color=colour, markersize=7)
         still = {row.load: row.size for row in report.errors}
-        x = np.arange(len(loads)) + 0.5 * len(models) * wide
-        axes.bar(x, [1e6 * still[load] for load in loads], 0.92 * wide, color="0.8", label="the motion itself")
+        x = np.arange(len(loads)) + 0.5 * len(models) * width
+        axes.bar(x, [1e6 * still[load] for load in loads], 0.92 * width, color="0.8", label="the motion itself")
         axes.axhline(30, color="0.4", linewidth=0.6, linestyle=(0, (4, 3)))
         axes.set_xticks(range(len(loads)), loads)
         axes.set_ylabel("distance [µm]: mean, 95 % (dash)")
         axes.legend(frameon=False, ncols=2, loc="upper left")
         axes.set_ylim(0, 1.35 * axes.get_ylim()[1])
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
+        axes.spines[["top", "right"]].set_visible(False)
         figure.savefig(path, dpi=250)
-        plt.close(figure)

@@ -78,7 +78,7 @@ class PreviewData:
     traction: np.ndarray | None = None
     """Force of the object on the pad per area, pad frame [Pa], shape (Ny, Nx, 3)."""
     traction_at_rest: bool = False
-    """Whether ``traction`` is at the place that the coat has at rest (a simulated pad's), not where the contact is now."""
+    """True if ``traction`` is at the place of the coat at rest (the soft pad's), not where the contact is now."""
     section: tuple[float, float] | None = None
     """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
 
@@ -128,9 +128,9 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
 
 def _lay_out(panels: list[tuple[Callable[[Axes], None], int]], rows: int, data: PreviewData) -> Figure:
     """Place the panels, each with its width in columns, by hand, so that they line up whatever their labels are."""
-    left, right, bottom, top = data.extent_mm
+    x_low, x_high, bottom, top = data.extent_mm
     wide = 1.62  # leaves room for a colour bar's figures at the right edge
-    high = wide * float(np.clip((bottom - top) / (right - left), 0.5, 1.3))
+    high = wide * float(np.clip((bottom - top) / (x_high - x_low), 0.5, 1.3))
     margin, between, above, below, heading = 0.46, 0.74, 0.22, 0.36, 0.24  # inches
     width, total = 7.16, heading + rows * (above + high + below)
     figure = Figure(figsize=(width, total))
@@ -149,9 +149,9 @@ def _lay_out(panels: list[tuple[Callable[[Axes], None], int]], rows: int, data: 
 
 def _map_axes(axes: Axes, data: PreviewData, title: str) -> None:
     axes.set_title(title, loc="left")
-    left, right, bottom, top = data.extent_mm
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
-    axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
+    x_low, x_high, bottom, top = data.extent_mm
+    axes.set(xlim=(x_low, x_high), ylim=(bottom, top), aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_xticks([t for t in _TICKS_MM if x_low <= t <= x_high])
     axes.set_yticks([t for t in _TICKS_MM if top <= t <= bottom])
 
 
@@ -217,7 +217,7 @@ def _traction_title(kind: str, data: PreviewData) -> str:
 
 
 def _is_sheared(data: PreviewData) -> bool:
-    """Whether there is any shear traction; a map of none would be black and say nothing."""
+    """True if there is any shear traction; a map of none would be black."""
     return data.traction is not None and bool(data.traction[..., :2].any())
 
 
@@ -305,11 +305,11 @@ def _section_panel(axes: Axes, data: PreviewData, sensor: SensorSpec) -> None:
         axes.fill_between(x, under, high, color=_OBJECT, linewidth=0)
     axes.plot(x, rest, color=_REST, linewidth=0.7, linestyle=(0, (4, 2)))
     axes.plot(x, surface, color=_REST, linewidth=1.0)
-    left, right = data.extent_mm[:2]
-    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]")
-    axes.set_xticks([t for t in _TICKS_MM if left <= t <= right])
+    x_low, x_high = data.extent_mm[:2]
+    axes.set(xlim=(x_low, x_high), ylim=(low, high), xlabel="x [mm]")
+    axes.set_xticks([t for t in _TICKS_MM if x_low <= t <= x_high])
     box = axes.get_window_extent()
-    stretch = (box.height / (high - low)) / (box.width / (right - left))
+    stretch = (box.height / (high - low)) / (box.width / (x_high - x_low))
     y_mm = round(y_mm, 1) + 0.0  # no "−0.0"
     axes.set_title(f"section y = {y_mm:.1f} mm".replace("-", "−"), loc="left")
     axes.set_ylabel(f"z [mm], stretched {stretch:.1f} ×")

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
 from raytac.calibrate.photographs import FAR, Photographs
-from raytac.calibrate.presses import RealPresses
+from raytac.calibrate.presses import RealPresses, Split, by_half, by_press, shallow_to_deep
 from raytac.calibrate.ray_fit import FEWEST
-from raytac.calibrate.splits import Split, by_half, by_press, shallow_to_deep
 from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.progress import Progress
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
@@ -46,17 +45,17 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class Ablation:
-    """One thing left out of the ray tracer, fitted anew without it."""
+    """An ablation: one thing left out of the ray tracer, which is fitted again without it."""
 
     sensor: Callable[[SensorSpec], SensorSpec] = lambda sensor: sensor
     fixed: tuple[str, ...] = ()
     """Blocks of parameters that stay at their start."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the ray tracer."""
+    bounce: bool = True
+    """Inter-reflection."""
     prior: str | None = None
     """Name of another strength of priors than that of the comparison."""
     settle: bool = True
-    """Whether the image at rest is averaged (``Photographs.settled``)."""
+    """True averages the image at rest (``Photographs.settled``)."""
     other_shadows: bool = False
     """Cast shadows where the comparison has none, and none where it has."""
 
@@ -82,7 +81,7 @@ def _flat(sensor: SensorSpec) -> SensorSpec:
 
 ABLATIONS: dict[str, Ablation] = {
     # The case's glow is rendered with the bounce, so it goes too: to be held against no_glow.
-    "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), options={"bounce": False}),
+    "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), bounce=False),
     "other_shadows": Ablation(other_shadows=True),
     "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4)), fixed=("height",)),
     "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
@@ -99,7 +98,7 @@ ABLATIONS: dict[str, Ablation] = {
 
 @dataclass(frozen=True)
 class RealSettings:
-    """What is compared."""
+    """Settings of a comparison with photographs."""
 
     folds: int = 5
     tested: int | None = None
@@ -112,7 +111,7 @@ class RealSettings:
     starts: int = 3
     rounds: int = 3
     shadows: bool = False
-    """Whether the ray tracer casts shadows on the coat."""
+    """True lets the ray tracer cast shadows on the coat."""
     device: str = "auto"
     seed: int = 0
 
@@ -150,15 +149,15 @@ def compare_real(
     priors: dict[str, list[str]] = {}
     starts: dict[str, list[tuple[float, ...]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
-    with result_folder(out) as folder:  # now, so that a folder that cannot be written is told before the fits
-        with tqdm(total=len(splits) + len(ablations), desc="fits", disable=None, file=sys.stderr) as bar:
+    with result_folder(out) as folder:  # before the fits, so that a folder that cannot be written is refused at once
+        with Progress(total=len(splits) + len(ablations), desc="fits") as bar:
             for number, (kind, (train, test)) in enumerate(splits):
                 models = _fitted(sensor, shots.take(train), settings, bar)
                 priors.setdefault(kind, []).append(models.prior)
                 starts.setdefault(kind, []).append(models.fitted.start_errors)
                 seen, labelled = _tested(models, sensor, shots.take(test))
-                for where, found in (("", seen), ("labelled_", labelled)):
-                    for mode, stack in found.items():
+                for where, scores_of in (("", seen), ("labelled_", labelled)):
+                    for mode, stack in scores_of.items():
                         of = scores.setdefault(where + kind, {}).setdefault(mode, [])
                         of += press_scores(sensor, stack, shots.take(test))
                 if kind == "press":
@@ -172,7 +171,7 @@ def compare_real(
             for name in ablations:
                 one = ABLATIONS[name]
                 changed = one.sensor(sensor)
-                options = {"shadows": settings.shadows != one.other_shadows, **one.options}
+                tracing = RayTraced(shadows=settings.shadows != one.other_shadows, bounce=one.bounce)
                 models = _fitted(
                     changed,
                     shots.take(train),
@@ -181,7 +180,7 @@ def compare_real(
                     modes=("raytrace",),
                     one=one,
                     prior=one.prior or priors["press"][0],
-                    options=options,
+                    tracing=tracing,
                 )
                 seen, _ = _tested(models, changed, shots.take(test))
                 for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
@@ -230,7 +229,7 @@ def _fitted(
     modes: tuple[str, ...] = MODES,
     one: Ablation | None = None,
     prior: str | None = None,
-    options: Mapping[str, Any] | None = None,
+    tracing: RayTraced | None = None,
 ) -> Models:
     one = Ablation() if one is None else one
     return fit_models(
@@ -244,7 +243,7 @@ def _fitted(
         rounds=settings.rounds,
         settle=one.settle,
         prior=settings.prior if prior is None else prior,
-        options={"shadows": settings.shadows} if options is None else options,
+        tracing=RayTraced(shadows=settings.shadows) if tracing is None else tracing,
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
     )
 
@@ -253,11 +252,11 @@ def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dic
     """Images of every mode and of the background alone at refined circles, and at the labelled ones."""
     refined, slopes = models.circles(shots), models.fitted.state.slopes
     nothing = np.broadcast_to(shots.background, shots.presses.shape)
-    found = []
+    scores = []
     for circles in (refined, shots.circles):
         own = {name: images_of(mode, sensor, shots, circles, slopes) for name, mode in models.modes.items()}
-        found.append(own | {"background": nothing})
-    return found[0], found[1]
+        scores.append(own | {"background": nothing})
+    return scores[0], scores[1]
 
 
 def check_folds(presses: RealPresses, folds: int) -> None:
@@ -347,7 +346,9 @@ BOX_MARGIN = 15
 
 
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
-    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press; regions are those of the labelled circles.
+    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press.
+
+    Regions are those of the labelled circles.
 
     MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
     ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
@@ -358,9 +359,9 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
         images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
     ):
         off = np.abs(image - real)
-        left, right = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
+        x_low, x_high = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
         top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
-        box = np.s_[top:bottom, left:right]
+        box = np.s_[top:bottom, x_low:x_high]
         score = {
             "contact_mae": float(off[rho < 1].mean()),
             "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
@@ -19,16 +17,17 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.io.progress import Progress
 from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.mlp_weights import save_mlp
 from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.tracer import Tracer
 from raytac.report.real import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
-from raytac.specs.sensor_file import lights_text
-from raytac.specs.sensor_text import sensor_files
+from raytac.specs.sensor_file import lights_text, sensor_files
 
 __all__ = ["OUTLIER", "run_calibrate_optics"]
 
@@ -57,7 +56,9 @@ def run_calibrate_optics(
     start: float,
     shadow_table: str = SHADOW_TABLES[0],
 ) -> list[Path]:
-    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``; nothing is left there by an error.
+    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``.
+
+    An error leaves nothing there.
 
     Raises:
         InputError: an unknown model, device or strength of priors, ``holdout`` of 1 or less than 0, too few presses, fewer than
@@ -76,10 +77,10 @@ def run_calibrate_optics(
         rule = f"are too few to hold out every {holdout}th: name a smaller holdout, or 0 for none"
         raise InputError("presses", value=len(shots.presses), rule=rule)
     index = np.arange(len(shots.presses))
-    held = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
-    train, test = shots.take(index[~held]), shots.take(index[held])
-    with result_folder(out, FILES) as folder:  # now, so that a folder that cannot be written is told before the fit
-        with tqdm(desc=f"calibrate {model}", unit="step", disable=None, file=sys.stderr) as bar:
+    is_test = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
+    train, test = shots.take(index[~is_test]), shots.take(index[is_test])
+    with result_folder(out, FILES) as folder:  # before the fit, so that a folder that cannot be written is refused at once
+        with Progress(desc=f"calibrate {model}", unit="step") as bar:
 
             def tick(stage: str, cost: float) -> None:
                 bar.update()
@@ -97,7 +98,7 @@ def run_calibrate_optics(
                 rounds=rounds,
                 prior=prior,
                 shadow_table=shadow_table,
-                options={"shadows": shadows},
+                tracing=RayTraced(shadows=shadows),
                 tick=tick,
             )
         mode, fitted = models.modes[model], models.fitted
@@ -113,36 +114,36 @@ def run_calibrate_optics(
             "prior_asked": INNER if prior is None else prior,
             "leds": len(sensor.lights.leds),
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
-            "presses.fitted": int((~held).sum()),
-            "presses.held_out": int(held.sum()),
+            "presses.fitted": int((~is_test).sum()),
+            "presses.held_out": int(is_test.sum()),
             **versions(),
         }
         circles = shots.circles.copy()
-        circles[~held] = fitted.state.circles
-        if held.any():
-            circles[held] = models.circles(test)
+        circles[~is_test] = fitted.state.circles
+        if is_test.any():
+            circles[is_test] = models.circles(test)
         scores: dict[str, list[dict[str, float]]] = {}
         for name, one in models.modes.items():
-            for part, chosen, some in (("fitted", ~held, train), ("held_out", held, test)):
+            for part, chosen, some in (("fitted", ~is_test, train), ("held_out", is_test, test)):
                 if chosen.any():
                     key = part if name == model else f"{part}.alone"
                     scores[key] = press_scores(sensor, images_of(one, sensor, some, circles[chosen], fitted.state.slopes), some)
                     metrics |= {f"{key}.{measure}": value for measure, value in summary(scores[key]).items()}
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
         errors = np.array([score["contact_mae"] for score in scores["fitted"]])
-        bad = [names[k] for k, error in zip(index[~held], errors, strict=True) if error > OUTLIER * np.median(errors)]
+        bad = [names[k] for k, error in zip(index[~is_test], errors, strict=True) if error > OUTLIER * np.median(errors)]
         metrics["outliers"] = ", ".join(bad)
         for name in bad:
             print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
         if model == "raytrace":
             error = f"{metrics.get('held_out.contact_mae', metrics['fitted.contact_mae']):.2f}"
-            what = "on held-out presses" if held.any() else "on the fitted presses"
+            what = "on is_test-out presses" if is_test.any() else "on the fitted presses"
             comment = (
-                f"Fitted to {int((~held).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
+                f"Fitted to {int((~is_test).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
             )
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
             alone = models.modes[ALONE]
-            assert isinstance(alone, RayTracer)
+            assert isinstance(alone, Tracer)
             written = dataclasses.replace(alone.sensor, optics=OpticsSpec(shadows=shadows))
             for name, text in sensor_files(written).items():
                 (folder / name).write_text(text, "utf-8")
@@ -151,7 +152,7 @@ def run_calibrate_optics(
         elif isinstance(mode, MlpMode):
             save_mlp(mode.weights, folder / "mlp.npz")
         rows = ["press,held_out,cx_px,cy_px,r_px"]
-        rows += [f"{name},{int(h)},{x:.3f},{y:.3f},{r:.3f}" for name, h, (x, y, r) in zip(names, held, circles, strict=True)]
+        rows += [f"{name},{int(h)},{x:.3f},{y:.3f},{r:.3f}" for name, h, (x, y, r) in zip(names, is_test, circles, strict=True)]
         (folder / "circles.csv").write_text("\n".join(rows) + "\n", "utf-8")
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         written = sorted(path.name for path in folder.iterdir())

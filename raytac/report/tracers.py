@@ -1,4 +1,4 @@
-"""Ray tracers of one sensor, each built once: a build fits the case's light and compiles kernels, which takes seconds."""
+"""Optical modes of one sensor, each built once: a ray tracer fits the case's light and compiles kernels, which takes seconds."""
 
 from __future__ import annotations
 
@@ -8,38 +8,42 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import regions
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.optics.trace.fast_tracer import RayTracer
+    from raytac.optics.base import OpticalMode, OpticsConfig
+    from raytac.optics.trace.tracer import Tracer
 
 __all__ = ["Tracers", "path_trace"]
 
 
 @dataclass(frozen=True)
 class Tracers:
-    """Makes and keeps ray tracers on one device."""
+    """Makes and keeps optical modes on one device."""
 
     spec: SensorSpec
     device: str
     seed: int
-    built: dict[str, RayTracer] = field(default_factory=dict)
+    built: dict[str, Any] = field(default_factory=dict)
 
-    def get(self, size: tuple[int, int], **options: Any) -> RayTracer:
-        """Ray tracer for images of ``size`` (width, height) [px]; ``options`` as of ``RayTracer``.
+    def get(self, size: tuple[int, int], config: RayTraced | None = None, outputs: tuple[str, ...] = ("rgb",)) -> Tracer:
+        """Ray tracer for images of ``size`` (width, height) [px].
 
-        Sampled integrators light all LEDs in one pass of three channels, which is all that a plain image needs.
+        Path tracers light all LEDs in one pass of three channels, which is all that a plain image needs.
         """
-        key = repr((size, sorted(options.items())))
-        if key not in self.built:
-            from raytac.optics.trace.fast_tracer import RayTracer
+        return self.mode(size, RayTraced() if config is None else config, outputs)  # type: ignore[return-value]
 
+    def mode(self, size: tuple[int, int], config: OpticsConfig[Any], outputs: tuple[str, ...] = ("rgb",)) -> OpticalMode:
+        """The same of any optical mode."""
+        key = repr((size, config, outputs))
+        if key not in self.built:
             spec = self.spec
-            if options.get("integrator") in ("path", "reference"):
+            if isinstance(config, RayTraced) and config.sampled:
                 leds = tuple(replace(led, layer="all") for led in spec.lights.leds)
                 spec = replace(spec, lights=replace(spec.lights, leds=leds))
-            self.built[key] = RayTracer(spec, resolution=size, device=self.device, seed=self.seed, **options)
+            self.built[key] = config.build(spec, resolution=size, outputs=outputs, device=self.device, seed=self.seed)
         return self.built[key]
 
     def contact(self, size: tuple[int, int], surface: GelSurface) -> np.ndarray:
@@ -53,7 +57,6 @@ class Tracers:
         return regions(self.contact(size, surface), self.spec.camera.pitch_at(size))
 
 
-def path_trace(tracer: RayTracer, surface: GelSurface, spp: int, seed: int) -> np.ndarray:
-    """Linear radiance (H, W, 3) of environment 0 from a sampled integrator of ``Tracers``, with vertex update and BVH rebuild."""
-    tracer.spp, tracer.seed = spp, seed
-    return tracer.render_layers(surface)["all"][0]
+def path_trace(tracer: Tracer, surface: GelSurface, spp: int, seed: int) -> np.ndarray:
+    """Linear radiance (H, W, 3) of environment 0 from a path tracer of ``Tracers``, with vertex update and BVH rebuild."""
+    return tracer.render_layers(surface, spp=spp, seed=seed)["all"][0]

@@ -5,4 +5,3 @@ from .impedance import JointImpedance as JointImpedance
 from .panda import MAX_VELOCITY as MAX_VELOCITY
 from .panda import READY as READY
 from .panda import one_sensor_panda as one_sensor_panda
-from .pose import pose as pose

@@ -1,4 +1,4 @@
-"""An arm in a compiled MuJoCo model: the joints that move one site, by index, and what control needs to know of them."""
+"""Arm in a compiled MuJoCo model: indices, limits and motors of the joints that move one site."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.robots.pose import world_from_site
+from raytac.robots.frames import world_from_site
 
 __all__ = ["Arm"]
 
@@ -24,15 +24,15 @@ class Arm:
         range: limits (n, 2) of the joints [rad or m]; ±inf where MuJoCo has none.
         motors: indices (n,) of the actuators that apply a torque to these joints, or None if some joint has none; ``ctrl`` is then
             the torque [N·m] or force [N].
-        torque_limit: what these actuators give at most (n, 2); None with ``motors``.
+        torque_limit: least and greatest output (n, 2) of these actuators; None if ``motors`` is None.
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, joints: Sequence[str]) -> None:
         """Look the names up.
 
         Raises:
-            InputError: an unknown site or joint (with the names there are), a joint that is no hinge or slide or that is named
-                twice, no joints, or a site that the joints do not move.
+            InputError: an unknown site or joint (with the known names), a joint that is no hinge or slide or that is named twice, no
+                joints, or a site that the joints do not move.
         """
         self.model = model
         self.site = _index(model, mujoco.mjtObj.mjOBJ_SITE, "site", site)
@@ -43,9 +43,9 @@ class Arm:
         for name, kind in zip(joints, model.jnt_type[ids], strict=True):
             if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
                 raise InputError("joints", value=name, rule="must be a hinge or a slide")
-        carriers = _ancestors(model, int(model.site_bodyid[self.site]))
+        ancestors = _ancestors(model, int(model.site_bodyid[self.site]))
         for name, body in zip(joints, model.jnt_bodyid[ids], strict=True):
-            if body not in carriers:
+            if body not in ancestors:
                 raise InputError(
                     "joints", value=name, rule=f"must carry the site {site!r}, which is not on its branch of the robot"
                 )
@@ -58,7 +58,7 @@ class Arm:
         return len(self.joints)
 
     def world_from_site(self, data: mujoco.MjData) -> np.ndarray:
-        """Pose (4, 4) of the site as the last ``mj_kinematics`` or ``mj_step`` left it."""
+        """Pose (4, 4) of the site after the last ``mj_kinematics`` or ``mj_step``."""
         return world_from_site(data, self.site)
 
     def jacobian(self, data: mujoco.MjData) -> np.ndarray:
@@ -81,11 +81,11 @@ class Arm:
         return torque[self.dof]
 
     def bias(self, data: mujoco.MjData) -> np.ndarray:
-        """C(q, q̇) q̇ + g(q) (n,) [N·m]: at rest, the torques that hold the arm against gravity."""
+        """C(q, q̇) q̇ + g(q) (n,) [N·m]: at rest, the torques that balance gravity."""
         return data.qfrc_bias[self.dof]
 
     def drive(self, data: mujoco.MjData, torque: np.ndarray) -> None:
-        """Ask the joints' motors for ``torque`` (n,) [N·m], as the model's actuators take it (they saturate at ``torque_limit``).
+        """Command the joints' motors to give ``torque`` (n,) [N·m]; they saturate at ``torque_limit``.
 
         Raises ``InputError`` if a joint has no torque motor or a torque is not finite.
         """
@@ -96,27 +96,27 @@ class Arm:
         data.ctrl[self.motors] = torque
 
 
-def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, what: str, name: str) -> int:
+def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, argument: str, name: str) -> int:
     index = mujoco.mj_name2id(model, kind, name)
     if index < 0:
         count = model.nsite if kind == mujoco.mjtObj.mjOBJ_SITE else model.njnt
         names = (mujoco.mj_id2name(model, kind, i) for i in range(count))
         rule = f"must be the name of a {'site' if kind == mujoco.mjtObj.mjOBJ_SITE else 'joint'} of the model"
-        raise InputError(what, value=name, rule=rule, choices=[n for n in names if n])
+        raise InputError(argument, value=name, rule=rule, choices=[n for n in names if n])
     return index
 
 
 def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
-    found = {body}
+    ancestors = {body}
     while body > 0:
         body = int(model.body_parentid[body])
-        found.add(body)
-    return found
+        ancestors.add(body)
+    return ancestors
 
 
 def _motors(model: mujoco.MjModel, joints: Iterable[int]) -> np.ndarray | None:
-    """For each joint the actuator that is a plain torque: fixed unit gain, no bias, unit gear, no activation."""
-    found = []
+    """Torque motor of each joint (unit gain and gear, no bias, no activation), or None if one has none."""
+    motors = []
     for joint in joints:
         plain = (
             (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
@@ -129,8 +129,8 @@ def _motors(model: mujoco.MjModel, joints: Iterable[int]) -> np.ndarray | None:
         )
         if plain.sum() != 1:
             return None
-        found.append(int(np.flatnonzero(plain)[0]))
-    return np.array(found)
+        motors.append(int(np.flatnonzero(plain)[0]))
+    return np.array(motors)
 
 
 def _limits(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray:

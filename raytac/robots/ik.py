@@ -1,19 +1,30 @@
-"""Cartesian control by differential inverse kinematics: joint velocities that move a site towards a pose, within all limits.
+"""Inverse kinematics of one arm in two ways: by a quadratic program that keeps every limit, and by damped least squares for a batch.
 
-Each call solves one quadratic program with mink (K. Zakka, Apache-2.0) on DAQP:
+``DifferentialIk`` is for one arm that must not break a limit: a viewer, a demonstration, a search for joint positions. Each call solves a
+quadratic program in about a millisecond with mink (K. Zakka, Apache-2.0) on DAQP:
 
     min over Δq of  ‖J Δq − e‖² + w² ‖q₀ − q − Δq‖² + μ ‖e‖² ‖Δq‖²
     subject to      q_min ≤ q + Δq ≤ q_max,  |Δq| ≤ q̇_max Δt,
 
-e the twist from the site to its target, J the site's Jacobian, q₀ the posture that a redundant arm leans to. The term in μ is
-Levenberg and Marquardt's damping, which keeps Δq bounded where J loses rank: S. R. Buss, "Introduction to inverse kinematics with
+with e the twist from the site to its target, J the site's Jacobian, and q₀ the posture that a redundant arm tends to. The term in μ is the
+damping of Levenberg and Marquardt, which keeps Δq bounded where J loses rank: S. R. Buss, "Introduction to inverse kinematics with
 Jacobian transpose, pseudoinverse and damped least squares methods", 2004, section 5 and 7; proportional to ‖e‖² after T. Sugihara,
 "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE T-RO 27(5), 2011.
+
+``PoseServo`` is for a learner that steps dozens of environments: one small solve for all of them, without mink. A step that is too fast is
+shortened as a whole, and each joint stops at its limit on its own:
+
+    Δq = Jᵀ (J Jᵀ + λ² 1)⁻¹ e + g (1 − J⁺ J) (q₀ − q)
+
+C. W. Wampler, "Manipulator inverse kinematic solutions based on vector formulations and damped least-squares methods", IEEE Trans. Syst.
+Man Cybern. 16(1), 1986; the second term moves a redundant arm towards q₀ without moving the site (A. Liégeois, IEEE Trans. SMC 7(12),
+1977).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,23 +33,23 @@ import numpy as np
 
 from raytac.errors import BackendError, InputError
 from raytac.robots.arm import Arm
-from raytac.robots.pose import check_pose, pose_error
-from raytac.se3 import quaternion
+from raytac.robots.frames import site_poses
+from raytac.se3 import check_pose, pose_error, quaternion
 
-__all__ = ["DifferentialIk", "Reached"]
+__all__ = ["DifferentialIk", "IkResult", "PoseServo"]
 
 _STRIDE = 0.1
-"""Duration [s] that ``reach`` gives each of its steps: at 2 rad/s, a fifth of a radian."""
+"""Duration [s] of each step of ``reach``: at 2 rad/s, a fifth of a radian."""
 
 _PROGRESS, _PATIENCE = 0.99, 15
-"""A search that keeps more than this share of its error in each of so many steps has stalled."""
+"""A search has stalled when its error falls by less than 1 % in each of 15 steps in a row."""
 _FLOOR = 1e-9
-"""Least damping, so that the program has one solution on the target too."""
+"""Least damping, by which the program has a unique solution at the target too."""
 
 
 @dataclass(frozen=True)
-class Reached:
-    """What a search for joint positions came to."""
+class IkResult:
+    """Result of a search for joint positions."""
 
     joints: np.ndarray
     """Joint positions (n,) [rad or m], within the limits."""
@@ -49,11 +60,11 @@ class Reached:
     steps: int
     """Quadratic programs solved."""
     reached: bool
-    """Whether both errors are within the tolerances that were asked for."""
+    """True if both errors are within the tolerances of the search."""
 
 
 class DifferentialIk:
-    """Differential inverse kinematics of one arm. Keeps no state between calls but work arrays."""
+    """Differential inverse kinematics of one arm. It has work arrays, but no state between calls."""
 
     def __init__(
         self,
@@ -69,8 +80,8 @@ class DifferentialIk:
         Args:
             arm: joints and site.
             max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
-            posture: joint positions (n,) that a redundant arm leans to; left out: the middle of the limits, 0 where there are none.
-            posture_weight: w above, against 1 per metre and 1 per radian of the pose. It pulls the site off its target by about
+            posture: q₀ (n,), joint positions that a redundant arm tends to; None: the middle of the limits, 0 without limits.
+            posture_weight: w above, against 1 per metre and 1 per radian of the pose. It moves the site off its target by about
                 w² |q₀ − q|, 1e-6 m at the default.
             damping: μ above.
 
@@ -92,18 +103,18 @@ class DifferentialIk:
         self._configuration = mink.Configuration(arm.model)
         site = mujoco.mj_id2name(arm.model, mujoco.mjtObj.mjOBJ_SITE, arm.site)
         self._frame = mink.FrameTask(site, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=damping)
-        lean = np.zeros(arm.model.nv)
-        lean[arm.dof] = posture_weight
-        self._lean = mink.PostureTask(arm.model, cost=lean)
+        cost = np.zeros(arm.model.nv)
+        cost[arm.dof] = posture_weight
+        self._posture_task = mink.PostureTask(arm.model, cost=cost)
         others = np.setdiff1d(np.arange(arm.model.nv), arm.dof)
         self._still = [mink.DofFreezingTask(arm.model, dof_indices=others.tolist())] if others.size else None
         self._box = _box_limit(arm, self.max_velocity)
 
     def velocity(self, qpos: np.ndarray, world_from_target: np.ndarray, duration: float) -> np.ndarray:
-        """Joint velocities (n,) that take the site towards ``world_from_target`` (4, 4) within ``duration`` [s], as far as limits allow.
+        """Joint velocities (n,) towards ``world_from_target`` (4, 4) within ``duration`` [s], as far as limits allow.
 
-        ``qpos`` (nq,) is the whole model's; joints that are not the arm's stay. A joint beyond its range (MuJoCo's limits are soft)
-        is brought back as fast as it may move.
+        ``qpos`` (nq,) is the whole model's; joints of other parts stay. A joint beyond its range (MuJoCo's limits are soft)
+        moves back at its greatest speed.
 
         Raises:
             InputError: a shape, a pose or the duration is wrong, or a position is not finite.
@@ -112,7 +123,7 @@ class DifferentialIk:
         if not (math.isfinite(duration) and duration > 0.0):
             raise InputError("duration", value=duration, rule="must be positive and finite [s]")
         self._aim(qpos, world_from_target)
-        return self._step([self._frame, self._lean], duration) / duration
+        return self._step([self._frame, self._posture_task], duration) / duration
 
     def reach(
         self,
@@ -124,25 +135,25 @@ class DifferentialIk:
         steps: int = 100,
         restarts: int = 10,
         seed: int = 0,
-    ) -> Reached:
-        """Search joint positions that put the site at ``world_from_target`` (4, 4): such steps over and over, from ``qpos`` (nq,).
+    ) -> IkResult:
+        """Search joint positions with the site at ``world_from_target`` (4, 4) by repeated steps from ``qpos`` (nq,).
 
         A search that does not arrive within ``steps``, or stalls, is started again from random positions within the limits, up to
-        ``restarts`` times, since a descent within joint limits can end in a corner. The posture plays no part. Returns the first that
-        arrives, else the best, with ``reached`` false: ask for it. Collisions are not looked at.
+        ``restarts`` times, since a descent within joint limits can end in a corner. The posture is not used. Returns the first result
+        within the tolerances, else the best one with ``reached`` false. Collisions are ignored.
 
         Raises as ``velocity``.
         """
         rng = np.random.default_rng(seed)
         start = np.array(qpos, float)
-        best, spent = None, 0
+        best, steps_taken = None, 0
         low, high = np.where(np.isfinite(self.arm.range), self.arm.range, (-math.pi, math.pi)).T
         for attempt in range(restarts + 1):
             if attempt:
                 start = start.copy()
                 start[self.arm.qpos] = rng.uniform(low, high)
             self._aim(start, world_from_target)
-            last, stalled = math.inf, 0
+            previous, stalled = math.inf, 0
             for _ in range(steps + 1):
                 error = pose_error(world_from_target, self.arm.world_from_site(self._configuration.data))
                 distance, angle = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
@@ -150,18 +161,18 @@ class DifferentialIk:
                 inside = bool(((joints >= self.arm.range[:, 0]) & (joints <= self.arm.range[:, 1])).all())
                 arrived = inside and distance <= position_tolerance and angle <= rotation_tolerance
                 if inside and (best is None or arrived or distance + angle < best.position_error + best.rotation_error):
-                    best = Reached(joints, distance, angle, spent, arrived)
-                stalled = stalled + 1 if distance + angle > _PROGRESS * last else 0
-                last = distance + angle
+                    best = IkResult(joints, distance, angle, steps_taken, arrived)
+                stalled = stalled + 1 if distance + angle > _PROGRESS * previous else 0
+                previous = distance + angle
                 if arrived or stalled > _PATIENCE:
                     break
                 self._configuration.data.qpos[self.arm.qpos] += self._step([self._frame], _STRIDE)
                 self._configuration.update()
-                spent += 1
+                steps_taken += 1
             if best is not None and best.reached:
                 break
-        assert best is not None  # the random starts are inside, and every step keeps them there
-        return Reached(best.joints, best.position_error, best.rotation_error, spent, best.reached)
+        assert best is not None  # random starts are within the limits, and every step stays there
+        return IkResult(best.joints, best.position_error, best.rotation_error, steps_taken, best.reached)
 
     def _aim(self, qpos: np.ndarray, world_from_target: np.ndarray) -> None:
         mink, model = _mink(), self.arm.model
@@ -170,12 +181,12 @@ class DifferentialIk:
         target = check_pose("world_from_target", world_from_target)
         self._configuration.update(np.array(qpos, float))
         self._frame.set_target(mink.SE3(np.concatenate([quaternion(target[:3, :3]), target[:3, 3]])))
-        leaning = np.array(qpos, float)
-        leaning[self.arm.qpos] = self.posture
-        self._lean.set_target(leaning)
+        posture = np.array(qpos, float)
+        posture[self.arm.qpos] = self.posture
+        self._posture_task.set_target(posture)
 
     def _step(self, tasks: list[Any], duration: float) -> np.ndarray:
-        """Δq (n,) from the configuration's present positions."""
+        """Solve for Δq (n,) from the configuration's present positions."""
         import qpsolvers
 
         mink = _mink()
@@ -184,6 +195,71 @@ class DifferentialIk:
         if not solution.found or solution.x is None:
             raise BackendError("the quadratic program of the inverse kinematics has no solution here")
         return solution.x[self.arm.dof]
+
+
+class PoseServo:
+    """Steps of one arm in any number of environments. It has no state."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        max_velocity: np.ndarray | float,
+        posture: np.ndarray | None = None,
+        posture_gain: float = 0.1,
+        damping: float = 0.02,
+    ) -> None:
+        """Set the law.
+
+        Args:
+            arm: joints and site.
+            max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
+            posture: q₀ (n,); None: no second term.
+            posture_gain: g, share of q₀ − q that a step covers.
+            damping: λ, for metres and radians alike.
+
+        Raises:
+            InputError: a shape, sign or range is wrong.
+        """
+        n = len(arm)
+        speed = np.asarray(max_velocity, float)
+        if speed.shape not in ((), (n,)) or not (speed > 0.0).all():
+            raise InputError("max_velocity", value=speed.tolist(), rule=f"must be positive, one or {n}")
+        if posture is not None and (np.shape(posture) != (n,) or not np.isfinite(posture).all()):
+            raise InputError("posture", value=np.asarray(posture).tolist(), rule=f"must be {n} finite numbers")
+        for name, value in (("posture_gain", posture_gain), ("damping", damping)):
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(name, value=value, rule="must be 0 or more, and finite")
+        self.arm, self._speed = arm, np.broadcast_to(speed, (n,)).copy()
+        self._posture, self._gain, self._damping = posture, posture_gain, damping
+
+    def targets(
+        self, datas: Sequence[mujoco.MjData], world_from_target: np.ndarray, twist: np.ndarray, duration: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Joint positions and velocities, each (B, n), with which the sites follow moving targets.
+
+        Args:
+            datas: states, kinematics up to date (``mj_kinematics`` and ``mj_comPos``, or any step).
+            world_from_target: present targets (B, 4, 4).
+            twist: their velocity and angular velocity (B, 6) [m/s, rad/s], world axes.
+            duration: time [s] in which the present error is removed.
+
+        Positions are targets at the present time, within the joints' ranges; add velocities times the time since.
+        """
+        arm = self.arm
+        q = np.stack([data.qpos[arm.qpos] for data in datas])
+        jacobian = np.stack([arm.jacobian(data) for data in datas])
+        error = pose_error(world_from_target, site_poses(datas, arm.site))
+        transposed = np.swapaxes(jacobian, -1, -2)
+        gram = jacobian @ transposed + self._damping**2 * np.eye(6)
+        posture_step = np.zeros_like(q) if self._posture is None else self._gain * (self._posture - q)
+        # The motion of the site by the step towards the posture is subtracted.
+        error = error - (jacobian @ posture_step[..., None])[..., 0]
+        solved = transposed @ np.linalg.solve(gram, np.stack([error, twist], axis=-1))
+        step, velocity = solved[..., 0] + posture_step, solved[..., 1]
+        step_excess = np.maximum((np.abs(step) / (self._speed * duration)).max(axis=-1, keepdims=True), 1.0)
+        velocity_excess = np.maximum((np.abs(velocity) / self._speed).max(axis=-1, keepdims=True), 1.0)
+        return np.clip(q + step / step_excess, arm.range[:, 0], arm.range[:, 1]), velocity / velocity_excess
 
 
 def _mink() -> Any:
@@ -195,16 +271,16 @@ def _mink() -> Any:
 
 
 def _box_limit(arm: Arm, max_velocity: np.ndarray) -> Any:
-    """Bounds on Δq of the arm's joints only, never contradictory: mink's own would also bind joints that only lie in the scene."""
+    """Bounds on Δq of the arm's joints only, never contradictory; mink's own would also limit joints of other bodies."""
     mink = _mink()
     rows = np.eye(arm.model.nv)[arm.dof]
     bounded = np.concatenate([rows, -rows])
 
     class Box(mink.Limit):
         def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
-            most = max_velocity * dt
+            limit = max_velocity * dt
             q = configuration.data.qpos[arm.qpos]
-            up, down = (np.clip(room, -most, most) for room in (arm.range[:, 1] - q, q - arm.range[:, 0]))
+            up, down = (np.clip(room, -limit, limit) for room in (arm.range[:, 1] - q, q - arm.range[:, 0]))
             bounds = np.concatenate([up, down])
             finite = np.isfinite(bounds)
             return mink.Constraint(G=bounded[finite], h=bounds[finite]) if finite.any() else mink.Constraint()

@@ -1,6 +1,6 @@
-"""Torques that make an arm a mass on springs: in Cartesian space about a pose, in joint space about positions.
+"""Impedance control: torques by which an arm acts as a mass on springs, in Cartesian or in joint space.
 
-Both add C(q, q̇) q̇ + g(q), so that the arm floats without a target. Read the state after ``mj_forward`` or ``mj_step1``.
+Both add C(q, q̇) q̇ + g(q), which compensates gravity. Read the state after ``mj_forward`` or ``mj_step1``.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.robots.arm import Arm
-from raytac.robots.pose import check_pose, pose_error
+from raytac.se3 import check_pose, pose_error
 
 __all__ = ["CartesianImpedance", "JointImpedance", "JointTorque"]
 
 _SINGULAR = 1e-3
-"""Added to J M⁻¹ Jᵀ [1/kg]: an arm near a singularity then weighs 1000 kg in the lost direction instead of infinitely much."""
+"""Added to J M⁻¹ Jᵀ [1/kg]: near a singularity the arm then has a finite mass of 1000 kg in the singular direction."""
 
 
 @dataclass(frozen=True)
 class JointTorque:
-    """What a controller asks of the joints; of a batch, one row an environment."""
+    """Torques that a controller commands; of a batch, one row an environment."""
 
     torque: np.ndarray
-    """Torques (…, n) [N·m], as the law gives them."""
+    """Torques (…, n) [N·m] by the law."""
     saturated: np.ndarray
-    """Which of them (…, n) the motors cannot give: MuJoCo then applies the limit, and the law does not hold. False without motors."""
+    """True (…, n) for torques beyond the motors' limits: MuJoCo then applies the limit, and the law does not hold. False without motors."""
 
 
 class CartesianImpedance:
@@ -61,7 +61,7 @@ class CartesianImpedance:
             stiffness: K of the translations [N/m].
             rotational_stiffness: K of the rotations [N·m/rad].
             damping_ratio: ζ.
-            posture: q₀ (n,); left out: the null space is damped only.
+            posture: q₀ (n,); None: the null space is damped only.
             posture_frequency: ω of the posture [rad/s].
 
         Raises ``InputError`` if a value is negative or not finite, or ``posture`` has the wrong shape.
@@ -87,26 +87,28 @@ class CartesianImpedance:
 
         Args:
             data: state of the arm's model.
-            world_from_target: pose (4, 4) that the site is drawn to; the springs' twist must stay below half a turn.
-            wrench: w (6,), force [N] above torque [N·m] that the site shall exert besides, in world axes.
+            world_from_target: target pose (4, 4) of the site; the rotation to it must stay below half a turn.
+            wrench: w (6,), additional force [N] and torque [N·m] that the site exerts, world axes.
 
-        Raises ``InputError`` for a pose or a wrench that is none.
+        Raises ``InputError`` for a pose or a wrench that is not valid.
         """
         target = check_pose("world_from_target", world_from_target)
-        extra = np.zeros(6) if wrench is None else np.asarray(wrench, float)
-        if extra.shape != (6,) or not np.isfinite(extra).all():
-            raise InputError("wrench", value=extra.tolist(), rule="must be 6 finite numbers: force, then torque, world axes")
+        feedforward = np.zeros(6) if wrench is None else np.asarray(wrench, float)
+        if feedforward.shape != (6,) or not np.isfinite(feedforward).all():
+            raise InputError(
+                "wrench", value=feedforward.tolist(), rule="must be 6 finite numbers: force, then torque, world axes"
+            )
         arm = self.arm
         jacobian, mass = arm.jacobian(data), arm.mass_matrix(data)
         speed = data.qvel[arm.dof]
         solved = np.linalg.solve(mass, jacobian.T)
         inertia = np.linalg.inv(jacobian @ solved + _SINGULAR * np.eye(6))
         error = pose_error(target, arm.world_from_site(data))
-        force = self._stiffness @ error - self._damping(inertia) @ (jacobian @ speed) + extra
-        lean = np.zeros(len(arm)) if self._posture is None else self._frequency**2 * (self._posture - data.qpos[arm.qpos])
-        lean = mass @ (lean - 2.0 * self._ratio * self._frequency * speed)
-        lean -= jacobian.T @ (inertia @ (solved.T @ lean))
-        return _joint_torque(arm, jacobian.T @ force + lean + arm.bias(data))
+        force = self._stiffness @ error - self._damping(inertia) @ (jacobian @ speed) + feedforward
+        spring = np.zeros(len(arm)) if self._posture is None else self._frequency**2 * (self._posture - data.qpos[arm.qpos])
+        posture_torque = mass @ (spring - 2.0 * self._ratio * self._frequency * speed)
+        posture_torque -= jacobian.T @ (inertia @ (solved.T @ posture_torque))
+        return _joint_torque(arm, jacobian.T @ force + posture_torque + arm.bias(data))
 
     def _damping(self, inertia: np.ndarray) -> np.ndarray:
         root = np.linalg.cholesky(inertia)
@@ -120,7 +122,7 @@ class JointImpedance:
     """Springs in the joints, all of one frequency: τ = M (ω² (q_d − q) + 2 ζ ω (q̇_d − q̇)) + C q̇ + g.
 
     The computed torque law (J. J. Craig, "Introduction to Robotics", chapter 10): each joint's error obeys ë + 2 ζ ω ė + ω² e = 0.
-    It is what carries out the velocities of differential inverse kinematics.
+    It follows the velocities of differential inverse kinematics.
     """
 
     def __init__(self, arm: Arm, *, frequency: float = 30.0, damping_ratio: float = 1.0) -> None:
@@ -134,27 +136,28 @@ class JointImpedance:
         self.arm, self._frequency, self._ratio = arm, frequency, damping_ratio
 
     def torque(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
-        """Torques towards positions ``joints`` (n,) [rad] that move with ``velocity`` (n,) [rad/s]; left out: 0.
+        """Torques towards positions ``joints`` (n,) [rad] that move with ``velocity`` (n,) [rad/s]; None: 0.
 
         Raises ``InputError`` for a wrong shape or a number that is not finite.
         """
         rows = [None if value is None else np.asarray(value)[None] for value in (joints, velocity)]
-        found = self.torques([data], rows[0], rows[1])  # type: ignore[arg-type]
-        return JointTorque(found.torque[0], found.saturated[0])
+        result = self.torques([data], rows[0], rows[1])  # type: ignore[arg-type]
+        return JointTorque(result.torque[0], result.saturated[0])
 
     def torques(self, datas: Sequence[mujoco.MjData], joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
-        """The same of many states, each array (B, n)."""
+        """Torques for B states, each array (B, n)."""
         arm = self.arm
         q, speed = (
-            np.array(values)[:, at] for values, at in (([d.qpos for d in datas], arm.qpos), ([d.qvel for d in datas], arm.dof))
+            np.array(values)[:, index]
+            for values, index in (([d.qpos for d in datas], arm.qpos), ([d.qvel for d in datas], arm.dof))
         )
         velocity = np.zeros_like(q) if velocity is None else velocity
         for name, value in (("joints", joints), ("velocity", velocity)):
             if np.shape(value) != q.shape or not np.isfinite(value).all():
                 rule = f"must be {len(arm)} finite numbers, of every state"
                 raise InputError(name, value=np.asarray(value).tolist(), rule=rule)
-        pull = self._frequency**2 * (joints - q) + 2.0 * self._ratio * self._frequency * (velocity - speed)
-        inertial = np.array([arm.inertial(data, row) for data, row in zip(datas, pull, strict=True)])
+        acceleration = self._frequency**2 * (joints - q) + 2.0 * self._ratio * self._frequency * (velocity - speed)
+        inertial = np.array([arm.inertial(data, row) for data, row in zip(datas, acceleration, strict=True)])
         return _joint_torque(arm, inertial + np.array([data.qfrc_bias for data in datas])[:, arm.dof])
 
 

@@ -11,21 +11,21 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.robots.pose import check_pose, pose, world_from_site
-from raytac.se3 import quaternion
+from raytac.robots.frames import world_from_site
+from raytac.se3 import check_pose, pose, quaternion
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MountedSensor", "case_depth", "mount_sensor", "standing_on"]
+__all__ = ["MountedSensor", "RobotModel", "case_depth", "mount_sensor", "standing_on"]
 
 _WALL = 0.8e-3
 """Thickness of a case's walls and back [m]: a guess, with which the Mini's inside gives its outside of 32 × 28 mm."""
 _CASE_DENSITY = 1000.0
-"""Mean density of a case with its camera [kg/m³]: a guess; the GelSight Mini so weighs 22 g without its gel."""
+"""Mean density of a case with its camera [kg/m³]: a guess, by which the GelSight Mini weighs 22 g without its gel."""
 
 
 @dataclass(frozen=True)
 class MountedSensor:
-    """Names, in the compiled model, of what a mounted sensor consists of."""
+    """Names, in the compiled model, of the parts of a mounted sensor."""
 
     name: str
     body: str
@@ -35,11 +35,28 @@ class MountedSensor:
     case: str
     """Geom of the case; it collides."""
     gel: str
-    """Geom of the gel block; for pictures only, since a pad's contact is the business of the pad's physics."""
+    """Geom of the gel block; for pictures only, since the pad's physics computes its contact."""
 
     def world_from_pad(self, data: mujoco.MjData) -> np.ndarray:
-        """Pose (4, 4) of the pad frame as the last ``mj_kinematics`` or ``mj_step`` left it."""
+        """Pose (4, 4) of the pad frame after the last ``mj_kinematics`` or ``mj_step``."""
         return world_from_site(data, data.site(self.site).id)
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A robot with sensors, not compiled yet, and the names in it.
+
+    Add table and objects to the spec and compile it; attached to another spec, its names carry the prefix given there.
+    """
+
+    spec: mujoco.MjSpec
+    sensors: tuple[MountedSensor, ...]
+    site: str
+    """Site that the joints move: the one sensor's pad as designed, or the midpoint of two pads, where z is the direction of the fingers."""
+    opening: str | None
+    """Position actuator of the gap between two pads [m]; None without a gripper."""
+    joints: tuple[str, ...]
+    """Joints of the arm or of the driven frame, each with an actuator; none of a fixed sensor."""
 
 
 def case_depth(sensor: SensorSpec) -> float:
@@ -69,12 +86,12 @@ def mount_sensor(
 
     Args:
         spec: robot, before it is compiled.
-        sensor: what is mounted.
+        sensor: the sensor to mount.
         at: name of a body or a site of ``spec``.
-        mount_from_pad: pose (4, 4) of the pad frame in the frame of that body or site; left out: ``standing_on(sensor)``.
+        mount_from_pad: pose (4, 4) of the pad frame in the frame of that body or site; None: ``standing_on(sensor)``.
         name: prefix of the four names, unique in ``spec``: several sensors on a robot need several names.
-        kind: says which is meant where a body and a site have the same name.
-        mass: mass of sensor and gel [kg]; left out: the gel's by its density, the case's by a mean density of 1000 kg/m³ (a guess).
+        kind: ``body`` or ``site``, where both have the same name.
+        mass: mass of sensor and gel [kg]; None: the gel's by its density, the case's by a mean density of 1000 kg/m³ (a guess).
 
     Raises:
         InputError: ``at`` names nothing or two things, a pose is no rigid transform, ``name`` is taken or empty, ``mass`` is not
@@ -83,15 +100,15 @@ def mount_sensor(
     if not isinstance(spec, mujoco.MjSpec):
         raise InputError("spec", value=type(spec).__name__, rule="must be a mujoco.MjSpec, from which a model is compiled later")
     anchor = _find(spec, at, kind)
-    placed = standing_on(sensor) if mount_from_pad is None else check_pose("mount_from_pad", mount_from_pad)
+    placement = standing_on(sensor) if mount_from_pad is None else check_pose("mount_from_pad", mount_from_pad)
     if not name:
         raise InputError("name", value=name, rule="must not be empty: it is the prefix of the sensor's names")
     names = MountedSensor(name, body=f"{name}_body", site=f"{name}_pad", case=f"{name}_case", gel=f"{name}_gel")
     existing = [("body", spec.bodies, names.body), ("site", spec.sites, names.site), ("geom", spec.geoms, names.case)]
-    for what, elements, wanted in [*existing, ("geom", spec.geoms, names.gel)]:
-        if wanted in _names(elements):
-            raise InputError("name", value=name, rule=f"must be new: the robot has a {what} {wanted!r} already")
-    child = _sensor_spec(sensor, placed, *_masses(sensor, mass))
+    for what, elements, new in [*existing, ("geom", spec.geoms, names.gel)]:
+        if new in _names(elements):
+            raise InputError("name", value=name, rule=f"must be new: the robot has a {what} {new!r} already")
+    child = _sensor_spec(sensor, placement, *_masses(sensor, mass))
     if isinstance(anchor, mujoco.MjsSite):
         spec.attach(child, prefix=f"{name}_", site=anchor)
     else:
@@ -121,7 +138,7 @@ def _names(elements: Iterable[Any]) -> list[str]:
 
 
 def _masses(sensor: SensorSpec, mass: float | None) -> tuple[float, float]:
-    """Of case and gel [kg]."""
+    """Masses of case and gel [kg]."""
     (length, width), thickness = sensor.gelpad.size, sensor.gelpad.thickness
     gel = sensor.gelpad.density * length * width * thickness
     if mass is None:
@@ -132,7 +149,7 @@ def _masses(sensor: SensorSpec, mass: float | None) -> tuple[float, float]:
 
 
 def _case_size(sensor: SensorSpec) -> tuple[float, float, float]:
-    """Outside of the case along x, y, z [m], without the gel."""
+    """Outer size of the case along x, y, z [m], without the gel."""
     (length, width), thickness = sensor.case.size, sensor.gelpad.thickness
     return length + 2.0 * _WALL, width + 2.0 * _WALL, case_depth(sensor) - thickness
 

@@ -6,7 +6,6 @@ Kinematics, limits and inertias with their sources: docs/robots.md and the comme
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -15,12 +14,13 @@ import numpy as np
 
 from raytac.assets import asset_root
 from raytac.errors import InputError
-from raytac.robots.mount import MountedSensor, case_depth, mount_sensor, standing_on
-from raytac.robots.pose import pose
+from raytac.robots.gripper import FACING, GripperSettings, add_opening_servo
+from raytac.robots.mount import RobotModel, case_depth, mount_sensor, standing_on
+from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import load_sensor
 
-__all__ = ["JOINTS", "MAX_TORQUE", "MAX_VELOCITY", "READY", "PandaRobot", "one_sensor_panda", "two_finger_panda"]
+__all__ = ["JOINTS", "MAX_TORQUE", "MAX_VELOCITY", "READY", "one_sensor_panda", "two_finger_panda"]
 
 JOINTS: Final = tuple(f"joint{i}" for i in range(1, 8))
 """Names of the arm's joints."""
@@ -40,34 +40,15 @@ _TCP: Final = 0.1034
 _FINGER: Final = 0.0584
 """Finger frames in the hand's frame, along z [m] (the same)."""
 _TOOL: Final = "tool"
-"""Site where the drawing has the pad, axes parallel to link7's: it stays there where a world mounts the pad a little askew."""
-_SERVO: Final = (1e4, 100.0, 70.0)
-"""Opening servo: gain [N/m], damping [N s/m], greatest force [N], as in ``scenes/robots/panda_hand.xml``."""
+"""Site at the pad as designed, axes parallel to link7's; it stays there when a world mounts the pad with an error."""
 
 
-@dataclass(frozen=True)
-class PandaRobot:
-    """A Panda with sensors: an editable spec, and the names in it.
-
-    Add table and objects to the spec and compile it; attached to another spec, its names carry the prefix given there.
-    """
-
-    spec: mujoco.MjSpec
-    sensors: tuple[MountedSensor, ...]
-    site: str
-    """Site that the arm is steered by, fixed to the arm: where the drawing has the one sensor's pad, or the point between both."""
-    opening: str | None = None
-    """Position actuator of the hand: sum of both finger joints [m], which is the gap between both pads; None without a hand."""
-    joints: tuple[str, ...] = JOINTS
-    """The arm's joints, each with a torque motor."""
-
-
-def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> PandaRobot:
-    """A Panda whose flange carries one sensor, which looks along the flange's +z; names of the sensor begin with ``sensor``.
+def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> RobotModel:
+    """A Panda whose flange carries one sensor, ``sensor``, which looks along the flange's +z.
 
     Args:
-        sensor: what is mounted, or its name or path as ``load_sensor`` takes it.
-        model: MJCF file of another Panda without a hand, e.g. the menagerie's ``panda_nohand.xml``; left out: ours. Its position
+        sensor: the sensor to mount, or its name or path as ``load_sensor`` takes it.
+        model: MJCF file of another Panda without a hand, e.g. the menagerie's ``panda_nohand.xml``; None: ours. Its position
             actuators are replaced by torque motors and its keyframes dropped; joints ``joint1`` to ``joint7`` and a body ``link7``
             with the DH frame are needed.
 
@@ -86,19 +67,19 @@ def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
     link7_from_pad = link7_from_flange @ flange_from_pad
     mounted = mount_sensor(spec, loaded, "link7", link7_from_pad, kind="body")
     spec.body("link7").add_site(name=_TOOL, pos=link7_from_pad[:3, 3], group=4)
-    return PandaRobot(spec, (mounted,), _TOOL)
+    return RobotModel(spec, (mounted,), _TOOL, None, JOINTS)
 
 
-def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> PandaRobot:
-    """A Panda with the Franka Hand whose fingers are two sensors, pads facing each other; their names begin with ``left``, ``right``.
+def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> RobotModel:
+    """A Panda with the Franka Hand whose fingers are two sensors, ``left`` and ``right``, pads facing each other.
 
-    The finger tips give way to holders. A pad's centre lies where the touching plane of the tip was, 0.1034 m in front of the hand's
+    Holders replace the finger tips. A pad's centre lies where the touching plane of the tip was, 0.1034 m in front of the hand's
     flange; its x is the finger's x, its y points to the finger's end. The gap between both pads is the sum of the finger joints,
     0 to 0.08 m.
 
     Args:
-        sensor: what is mounted twice, or its name or path.
-        model: MJCF file of another Panda with the hand, e.g. the menagerie's ``panda.xml``; left out: ours. As for
+        sensor: the sensor to mount twice, or its name or path.
+        model: MJCF file of another Panda with the hand, e.g. the menagerie's ``panda.xml``; None: ours. As for
             ``one_sensor_panda``; bodies ``hand``, ``left_finger``, ``right_finger`` and joints ``finger_joint1``, ``finger_joint2``
             are needed.
 
@@ -114,14 +95,13 @@ def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
         _replace_servo(spec)
     loaded = load_sensor(sensor) if isinstance(sensor, str) else sensor
     depth = case_depth(loaded)
-    inward = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # columns: the pad's x, y, z in the finger's frame
-    finger_from_pad = pose(inward, np.array([0.0, 0.0, _TCP - _FINGER]))
+    finger_from_pad = pose(FACING, np.array([0.0, 0.0, _TCP - _FINGER]))
     mounted = []
     for side in ("left", "right"):
         finger = spec.body(f"{hand}{side}_finger")
         for geom in list(finger.geoms):
             spec.delete(geom)
-        # From the sledge to the far side of the case's upper edge; its mass counts in the finger's published inertia.
+        # From the slide to the far side of the case's upper edge; its mass is part of the finger's published inertia.
         top = _TCP - _FINGER - loaded.case.size[1] / 2
         finger.add_geom(
             name=f"{side}_holder",
@@ -135,7 +115,7 @@ def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
     site = f"{hand}tcp"
     if spec.site(site) is None:
         spec.body("hand").add_site(name=site, pos=(0.0, 0.0, _TCP), group=4)
-    return PandaRobot(spec, tuple(mounted), site, opening=f"{hand}opening")
+    return RobotModel(spec, tuple(mounted), site, f"{hand}opening", JOINTS)
 
 
 def _arm(model: str | Path | None) -> mujoco.MjSpec:
@@ -148,28 +128,18 @@ def _arm(model: str | Path | None) -> mujoco.MjSpec:
     for actuator in list(spec.actuators):
         if actuator.target in JOINTS:
             spec.delete(actuator)
-    for i, (joint, most) in enumerate(zip(JOINTS, MAX_TORQUE, strict=True), start=1):
+    for i, (joint, limit) in enumerate(zip(JOINTS, MAX_TORQUE, strict=True), start=1):
         motor = spec.add_actuator(name=f"motor{i}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        motor.ctrllimited, motor.ctrlrange = True, (-most, most)
+        motor.ctrllimited, motor.ctrlrange = True, (-limit, limit)
     return spec
 
 
 def _replace_servo(spec: mujoco.MjSpec) -> None:
-    """The hand's actuators of another model give way to our servo on the sum of both finger joints."""
-    fingers = ("finger_joint1", "finger_joint2")
+    """Replace the actuators of another model's hand by our servo on the sum of both finger joints."""
     for actuator in list(spec.actuators):
         if actuator.target not in JOINTS:
             spec.delete(actuator)
-    tendon = spec.add_tendon(name="opening")
-    for joint in fingers:
-        tendon.wrap_joint(joint, 1.0)
-    gain, damping, most = _SERVO
-    servo = spec.add_actuator(name="opening", target="opening", trntype=mujoco.mjtTrn.mjTRN_TENDON)
-    servo.gaintype, servo.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
-    servo.gainprm[0] = gain
-    servo.biasprm[:3] = 0.0, -gain, -damping
-    servo.ctrllimited, servo.ctrlrange = True, (0.0, 0.08)
-    servo.forcelimited, servo.forcerange = True, (-most, most)
+    add_opening_servo(spec, ("finger_joint1", "finger_joint2"), GripperSettings())
 
 
 def _read(path: Path) -> mujoco.MjSpec:
@@ -182,8 +152,8 @@ def _read(path: Path) -> mujoco.MjSpec:
 
 
 def _need(spec: mujoco.MjSpec, model: str | Path, *, bodies: tuple[str, ...], joints: tuple[str, ...]) -> None:
-    for what, names, have in (("body", bodies, spec.bodies), ("joint", joints, spec.joints)):
-        found = [element.name for element in have if element.name]
+    for kind, names, elements in (("body", bodies, spec.bodies), ("joint", joints, spec.joints)):
+        known = [element.name for element in elements if element.name]
         for name in names:
-            if name not in found:
-                raise InputError("model", value=str(model), rule=f"must have a {what} {name!r}", choices=found)
+            if name not in known:
+                raise InputError("model", value=str(model), rule=f"must have a {kind} {name!r}", choices=known)

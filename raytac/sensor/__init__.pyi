@@ -1,4 +1,3 @@
 from .options import LARGEST_SIDE as LARGEST_SIDE
-from .options import OPTICS as OPTICS
 from .options import sensor_outputs as sensor_outputs
 from .tactile_sensor import TactileSensor as TactileSensor

@@ -7,25 +7,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from raytac.checks import check_known, check_mapping, check_methods, check_names, check_whole
+from raytac.checks import check_names, check_whole
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
-from raytac.markers import MARKER_MODELS, MarkerPerturbation
-from raytac.optics.base import INTEGRATORS
+from raytac.markers.base import MarkersConfig
+from raytac.markers.registry import MARKERS, markers_config, models_without_coat
+from raytac.optics.base import OPTICAL_OUTPUTS
+from raytac.optics.registry import OPTICS
 from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
-from raytac.specs.press import PADS, PHYSICS
 
 if TYPE_CHECKING:
-    from raytac.optics.base import OpticalMode
-    from raytac.physics.soft.mesh import PadMesh
+    from raytac.optics.base import OpticsConfig
+    from raytac.physics.base import PhysicsConfig
 
 __all__ = [
     "LARGEST_SIDE",
-    "OPTICS",
-    "check_markers",
-    "check_optics",
-    "check_physics",
+    "checked_markers",
     "checked_outputs",
     "checked_resolution",
     "press_scene",
@@ -34,70 +32,34 @@ __all__ = [
     "warn_of_other_shape",
 ]
 
-OPTICS = ("raytrace", "taxim", "phong", "mlp")
-"""Names that ``optics=`` accepts."""
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02
 """How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
 
 
-def sensor_outputs(optics: str) -> tuple[str, ...]:
-    """Outputs that ``optics=`` offers: all of ``OUTPUTS``, but no layers without rays."""
-    return OUTPUTS if optics == "raytrace" else tuple(name for name in OUTPUTS if name != "layers")
+def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) -> tuple[str, ...]:
+    """Outputs that a sensor offers with an optical mode: all of ``OUTPUTS``, but for those that only other modes make."""
+    made = (OPTICS.config_class(optics) if isinstance(optics, str) else optics).outputs
+    return tuple(name for name in OUTPUTS if name not in OPTICAL_OUTPUTS or name in made)
 
 
-def check_physics(physics: str | None, pad: str | PadMesh | None) -> None:
-    """Raises ``InputError`` for an unknown name, or a pad to be cut where none is simulated."""
-    if physics is not None:
-        check_known("physics", physics, PHYSICS)
-    if isinstance(pad, str):
-        check_known("pad", pad, PADS)
-    elif pad is not None:
-        check_methods("pad", pad, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
-    if pad is not None and physics == "rigid":
-        raise InputError("pad", value=pad, rule="is how finely a simulated pad is cut; physics='rigid' has none")
-
-
-def check_optics(optics: str | OpticalMode, integrator: str, spp: int | None, options: dict[str, Any] | None) -> None:
-    """Raises ``InputError`` for an unknown name, or settings that the optical mode does not have."""
-    if isinstance(optics, str):
-        check_known("optics", optics, OPTICS)
-    else:
-        check_methods("optics", optics, ("render",), ("label", "device"), f"one of {', '.join(OPTICS)}, or an OpticalMode")
-    if options is not None:
-        check_mapping("optics_options", options)
-    check_known("integrator", integrator, INTEGRATORS)
-    if optics in OPTICS and optics != "raytrace" and (integrator != "fast" or spp is not None):
-        raise InputError(
-            "integrator, spp", value=(integrator, spp), rule=f"are settings of the ray tracer; optics={optics!r} has none"
-        )
-    if not isinstance(optics, str) and (integrator != "fast" or spp is not None or options):
-        value = {"integrator": integrator, "spp": spp, "optics_options": options}
-        raise InputError(
-            "integrator, spp, optics_options", value=value, rule="belong to a mode that is built here; it has its own"
-        )
-
-
-def checked_outputs(outputs: Sequence[str] | str, optics: str | OpticalMode) -> tuple[str, ...]:
+def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> tuple[str, ...]:
     """The names in the order of ``OUTPUTS``. Raises ``InputError`` for one that is unknown or that ``optics`` does not make."""
-    outputs = check_names("outputs", outputs, OUTPUTS)
+    outputs, offered = check_names("outputs", outputs, OUTPUTS), sensor_outputs(optics)
     for name in outputs:
-        if isinstance(optics, str) and name not in sensor_outputs(optics):
-            rule = f"must be an output of optics={optics!r}; only the ray tracer knows the light of each LED"
-            raise InputError("outputs", value=name, rule=rule, choices=sensor_outputs(optics))
+        if name not in offered:
+            raise InputError("outputs", value=name, rule=f"must be an output of optics={optics.label!r}", choices=offered)
     return tuple(name for name in OUTPUTS if name in outputs)
 
 
-def check_markers(markers: str | None, perturbation: MarkerPerturbation | None, physics: str | None) -> None:
-    """Raises ``InputError`` for an unknown model, one that the physics cannot feed, or a perturbation of no markers."""
-    if markers is not None:
-        check_known("markers", markers, MARKER_MODELS)
-        if markers == "surface" and physics == "rigid":
-            rule = "tracks the surface of a simulated gel; physics='rigid' has none"
-            raise InputError("markers", value=markers, rule=rule, choices=tuple(m for m in MARKER_MODELS if m != markers))
-    elif perturbation is not None:
-        raise InputError("marker_perturbation", value=perturbation, rule="needs a marker model: markers=…")
+def checked_markers(markers: str | MarkersConfig | None, physics: PhysicsConfig | None) -> MarkersConfig | None:
+    """Configuration of the marker model. Raises ``InputError`` for an unknown one, or one that needs what the physics does not have."""
+    config = None if markers is None else markers_config(markers)
+    if config is not None and config.needs_coat and physics is not None and not physics.is_simulated:
+        rule = f"tracks the surface of a soft pad; physics={physics.label!r} has none"
+        raise InputError("markers", value=MARKERS.name_of(config), rule=rule, choices=models_without_coat())
+    return config
 
 
 def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, int] | None:

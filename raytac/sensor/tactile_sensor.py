@@ -14,34 +14,30 @@ import numpy as np
 from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
-from raytac.frame import TactileFrame
+from raytac.frame import IMAGES, TactileFrame
 from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
-from raytac.markers import MARKER_MODELS, MarkerFrame, MarkerPerturbation, MarkerTracker
-from raytac.markers.pattern import MarkerPattern
-from raytac.optics.base import OPTICAL_OUTPUTS
-from raytac.optics.registry import Imaging
-from raytac.physics.base import PadReading
-from raytac.physics.soft.contact_width import holds_force, warn_if_narrow
+from raytac.gel.traction import cell_areas
+from raytac.markers.base import MarkersConfig
+from raytac.markers.pattern import MarkerPattern, dot_ink
+from raytac.markers.registry import MARKERS
+from raytac.markers.tracker import MarkerFrame, MarkerTracker
+from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics
+from raytac.optics.registry import chosen_optics
+from raytac.physics.base import Pad, PadReading, PhysicsConfig
+from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
+from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
 from raytac.sensor.options import (
-    check_markers,
-    check_optics,
-    check_physics,
+    checked_markers,
     checked_outputs,
     checked_resolution,
     press_scene,
     sensor_spec,
     warn_of_other_shape,
 )
-from raytac.sensor.pad import load_pad, pad_forces, reading_forces, state_surface
-from raytac.specs import PressScene, SensorSpec, validate_press
-from raytac.specs.press import PADS, chosen_physics
+from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 
 if TYPE_CHECKING:
-    from raytac.optics.base import OpticalMode
-    from raytac.physics.base import ContactState
-    from raytac.physics.rigid.pad import RigidPad
-    from raytac.physics.soft.mesh import PadMesh
-    from raytac.physics.soft.pad import SoftPad
+    from raytac.optics.base import OpticalMode, OpticsConfig
 
 __all__ = ["TactileSensor"]
 
@@ -65,53 +61,46 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
+    optics: OpticsConfig[Any]
+    """How images are made."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
-    physics: str
-    """How the gel deforms: as asked for, else as the scene that was loaded last asks, else ``rigid``."""
+    markers: MarkersConfig | None
+    """Configuration of the marker model; None without markers."""
+    physics: PhysicsConfig | None
+    """How the gel deforms, as asked for; None is as each scene says, else ``rigid``."""
 
     def __init__(
         self,
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
-        physics: str | None = None,
-        pad: str | PadMesh | None = None,
-        optics: str | OpticalMode = "raytrace",
+        physics: str | PhysicsConfig | None = None,
+        optics: str | OpticsConfig[Any] | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
-        integrator: str = "fast",
-        spp: int | None = None,
         device: str = "auto",
         seed: int = 0,
         num_envs: int = 1,
         pitch: float | None = None,
-        markers: str | None = None,
-        marker_perturbation: MarkerPerturbation | None = None,
-        optics_options: dict[str, Any] | None = None,
+        markers: str | MarkersConfig | None = None,
     ) -> None:
         """Check everything and compute nothing yet.
 
         Args:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
-            physics: how the gel deforms, one of ``PHYSICS``: ``rigid`` (by geometry and Gaussians) or ``ipc`` (simulated); None is as the
-                scene asks, else ``rigid``.
-            pad: how finely a simulated pad is cut, one of ``PADS``, or a mesh of one's own; None is as the scene asks, else ``coarse``.
-            optics: how images are made, one of ``OPTICS``, or an optical mode that is built already (it keeps its own resolution,
-                outputs and device).
+            physics: how the gel deforms, a name of ``raytac.physics.PHYSICS`` or a configuration such as ``Rigid()`` or
+                ``Ipc(level="medium")``; None is as each scene says, else ``rigid``.
+            optics: how images are made: a name of ``raytac.optics.OPTICS``, a configuration such as ``Taxim(shadows=False)``, or an
+                optical mode that is built already (it keeps its own resolution, outputs and device).
             outputs: what a frame holds, one name or several of ``raytac.frame.OUTPUTS``; nothing else is computed.
             resolution: (width, height) of the images [px], or text as ``"320x240"``; None is the sensor's own. The field of view stays
                 the sensor's: another shape squeezes it, with a warning.
-            integrator: of the ray tracer, one of ``INTEGRATORS``.
-            spp: of the ray tracer; ``fast``: rays a pixel, a square number, 1 if None; sampled integrators: samples a pixel, 256 if None.
             device: ``auto``, ``cpu`` or ``cuda``.
             seed: of every random number, in [0, 2^32).
             num_envs: number of environments B that a press simulates; ``press`` and ``load`` say how they can differ.
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
-            markers: how the sensor's markers move, one of ``MARKER_MODELS``; frames then hold them, and images show the dots. None leaves
-                them out, and images show a plain coat.
-            marker_perturbation: noise, losses and shifts of the markers; None is none.
-            optics_options: further keyword arguments of the optical mode, such as ``calibration`` of ``taxim``, or ``shadows``, which the
-                sensor else decides; their values are checked when it is built.
+            markers: marker model, a name of ``raytac.markers.MARKERS`` or a configuration such as ``Fots(perturbation=…)``; frames then
+                hold markers, and images show the dots. None leaves them out, and images show a plain coat.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -121,19 +110,17 @@ class TactileSensor:
         settings = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         self._settings: dict[str, Any] = settings
         """Arguments that make this sensor again."""
-        check_physics(physics, pad)
-        check_optics(optics, integrator, spp, optics_options)
+        self.physics = checked_physics(physics)
+        self.optics = chosen_optics(optics)
         resolve_device(device)
-        self.outputs = checked_outputs(outputs, optics)
-        check_markers(markers, marker_perturbation, physics)
+        self.outputs = checked_outputs(outputs, self.optics)
+        self.markers = checked_markers(markers, self.physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
-        check_whole("spp", 1 if spp is None else spp)
         size = checked_resolution(resolution)
         self.seed = check_seed("seed", seed)
         self.spec = sensor_spec(sensor)
-        self.integrator, self.spp = integrator, spp
-        self._asked_physics, self._asked_pad = physics, pad
-        self.physics = chosen_physics(physics, pad)
+        self._used = self.physics or PHYSICS.config("rigid")
+        """Physics of the press that was loaded last."""
         self.resolution = size if size is not None else self.spec.camera.resolution
         warn_of_other_shape(self.resolution, self.spec.camera.resolution)
         self.device, self.num_envs = device, num_envs
@@ -141,23 +128,12 @@ class TactileSensor:
         self.grid = make_grid(self.spec.gelpad, self.pitch)
         self._known_grid = self.grid
         """Grid of the last surface, which is of this pad."""
-        self._level: str | PadMesh = pad or PADS[0]
-        self.markers, self._marker_perturbation = markers, marker_perturbation
-        if markers is not None:
-            MarkerPattern.of(self.spec, self.resolution)  # a pattern that cannot be seen is told now
+        if self.markers is not None:
+            MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
-        self._imaging = Imaging(
-            self.spec,
-            optics,
-            options=optics_options or {},
-            resolution=self.resolution,
-            outputs=self._optical_outputs,
-            device=device,
-            integrator=integrator,
-            spp=spp,
-            seed=self.seed,
-        )
-        self._pad: RigidPad | SoftPad | None = None
+        self.optics.check(self.spec)
+        self._mode: OpticalMode | None = None
+        self._pad: Pad | None = None
         self._is_narrow = False
         """Whether this press was warned of already."""
 
@@ -167,41 +143,33 @@ class TactileSensor:
         Raises:
             InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
         """
-        if not isinstance(self._settings["optics"], str):
+        if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
             raise InputError("optics", value=self._settings["optics"], rule=rule)
         if self._tracker is not None:
             rule = "cannot be copied or pickled once they have a history: make another sensor with the same arguments"
-            raise InputError("markers", value=self.markers, rule=rule)
+            raise InputError("markers", value=self._settings["markers"], rule=rule)
         return partial(type(self), **self._settings), ()
 
     @property
     def label(self) -> str:
-        """Physics and optics that frames come from, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
+        """Physics of the press that was loaded last and optics, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
 
-        The optical mode names itself once it is built, which options such as a denoiser change.
+        The optical mode names itself once it is built: a table casts shadows only if it has some.
         """
-        physics = "ipc-" + self.pad if self.physics == "ipc" else self.physics
-        return f"{physics}+{self._imaging.label}" if self._optical_outputs else physics
-
-    @property
-    def pad(self) -> str:
-        """How finely a simulated pad is cut: a level of ``PADS``, or ``own`` for a mesh of one's own; empty for the rigid pad."""
-        if self.physics != "ipc":
-            return ""
-        return self._level if isinstance(self._level, str) else "own"
+        return f"{self._used.label}+{(self._mode or self.optics).label}" if self._optical_outputs else self._used.label
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
         """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports; empty without images or rays."""
-        return self._imaging.sampling if self._optical_outputs else {}
+        return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
         """``cpu`` or ``cuda``: where the images are made; without images where a simulated pad is solved, and ``cpu`` for a rigid one."""
         if self._optical_outputs:
             return self.optical_mode.device
-        return resolve_device(self.device, ray_tracing=False) if self.physics == "ipc" else "cpu"
+        return resolve_device(self.device, ray_tracing=False) if self._used.is_simulated else "cpu"
 
     @property
     def _optical_outputs(self) -> tuple[str, ...]:
@@ -209,12 +177,18 @@ class TactileSensor:
 
     def press(
         self,
-        scene: str | Path | PressScene,
+        scene: str | Path | PressScene | np.ndarray,
         *,
+        depth: float | None = None,
+        scale: float | None = None,
+        pitch: float | None = None,
         progress: bool = False,
         **own: Any,
     ) -> TactileFrame:
         """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
+
+        A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
+        ``raytac.specs.press_of``.
 
         ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a simulated pad, which takes seconds to
         minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
@@ -223,15 +197,14 @@ class TactileSensor:
             InputError: an argument of ``load`` of the wrong shape or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
         """
-        press = press_scene(scene)
+        press = press_of(scene, depth=depth, scale=scale, pitch=pitch)
         validate_press(self.spec, press)
         start = time.perf_counter()
         pad = self.load(press, **own)
-        states = pad.run(progress=progress) if self.physics == "ipc" else pad.run()  # type: ignore[call-arg]
-        state = pad.peak(self._followed(states))  # type: ignore[arg-type]
+        reading = pad.peak(self._followed(pad.run(progress=progress)))
         physics_ms = 1e3 * (time.perf_counter() - start)
-        frame = self.update(state)
-        return replace(frame, time_ms={"physics": physics_ms, **frame.time_ms})
+        frame = self.update(reading)
+        return frame.with_values(time_ms={"physics": physics_ms, **frame.time_ms})
 
     def load(
         self,
@@ -243,7 +216,7 @@ class TactileSensor:
         shears: np.ndarray | None = None,
         twists: np.ndarray | None = None,
         seeds: Sequence[int] | None = None,
-    ) -> RigidPad | SoftPad:
+    ) -> Pad:
         """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
 
         Args:
@@ -264,17 +237,13 @@ class TactileSensor:
         """
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
-        self.physics = chosen_physics(self._asked_physics, self._asked_pad, press.physics)
-        self._level = self._asked_pad or press.pad or PADS[0]
-        self._pad = load_pad(
+        self._used = scene_physics(self.physics, press)
+        self._pad = self._used.build(
             self.spec,
             press,
-            physics=self.physics,
-            level=self._level,
-            device=self.device,
             pitch=self.pitch,
             num_envs=self.num_envs,
-            seed=self.seed,
+            device=self.device,
             offsets=offsets,
             depths=depths,
             rotations=rotations,
@@ -288,37 +257,33 @@ class TactileSensor:
             self._tracker.reset()
         return self._pad
 
-    def update(self, state: ContactState | GelSurface | PadReading, envs: Sequence[int] | None = None) -> TactileFrame:
-        """Frame of a gel surface, of a state of the physics that ``load`` or ``press`` set up, or of what a world's pad reads.
+    def update(self, state: PadReading | GelSurface, envs: Sequence[int] | None = None) -> TactileFrame:
+        """Frame of what a pad reads, in a press that ``load`` set up or in a world, or of a bare gel surface.
 
-        With markers, call it for every state in order: some models follow the object since first touch (``reset_markers`` forgets).
+        With markers, call it for every reading in order: some models follow the object since first touch (``reset_markers`` forgets).
 
         ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
 
         Raises:
-            InputError: a state, and no scene was loaded, or another one than the state is of; a surface of another sensor's pad; ``envs``
+            InputError: neither of both, a reading of another scene than was loaded last, a surface of another sensor's pad; ``envs``
                 that do not exist, or not one for each row.
         """
         start = time.perf_counter()
         envs = None if envs is None else chosen_envs(envs, self.num_envs)
-        if isinstance(state, GelSurface):
-            surface, force, area, failed, unconverged = state, None, None, None, None
-            forces: dict[str, Any] = {}
-        elif isinstance(state, PadReading):
-            surface, force, area, failed, unconverged = state.surface, state.force, None, state.failed, state.unconverged
-            forces = reading_forces(state, self.outputs)
-        else:
-            surface, failed, unconverged = state_surface(self._pad, state), state.failed, state.unconverged
-            assert self._pad is not None
-            area = state.force_law_area if self.physics == "rigid" else None
-            forces = pad_forces(self._pad, state, surface, self.outputs)
-            self._check_width(state, forces.get("contact_cells"))
-            force = np.concatenate([state.shear_force, -state.normal_force[:, None]], axis=1)
+        reading = PadReading(state) if isinstance(state, GelSurface) else state
+        if not isinstance(reading, PadReading):
+            rule = "must be a GelSurface, or a reading of the physics that load() returned"
+            raise InputError("state", value=type(state).__name__, rule=rule)
+        if self._pad is not None and reading.scene is not None and reading.scene != self._pad.scene:
+            rule = f"belongs to the scene {reading.scene.name!r}, and {self._pad.scene.name!r} was loaded since"
+            raise InputError("state", value=type(state).__name__, rule=rule)
+        surface = reading.surface
         if surface.grid is not self._known_grid:
             check_grid(self.spec.gelpad, surface.grid)
             self._known_grid = surface.grid
         if envs is not None and len(envs) != surface.batch:
             raise InputError("envs", value=len(envs), rule=f"must name one environment for each of {surface.batch} rows")
+        forces = self._forces(reading)
         done = time.perf_counter()
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None
@@ -326,44 +291,54 @@ class TactileSensor:
             markers = self.marker_tracker.update(surface, envs)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
-        forces |= {"force": force, "force_law_area": area, "failed": failed, "unconverged": unconverged}
         return self._frame(surface, markers, done, time_ms, **forces)
 
-    def _check_width(self, state: ContactState, cells: np.ndarray | None) -> None:
+    def _forces(self, reading: PadReading) -> dict[str, Any]:
+        """Fields of a frame that tell of forces, as far as they are asked for; none of a bare surface.
+
+        With ``wrench`` or ``traction`` come ``contact_area`` and, of a surface with a mesh, ``contact_cells``.
+        """
+        if not reading.has_forces:
+            return {}
+        surface, failed = reading.surface, reading.failed
+        found: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
+        found["unconverged"] = reading.unconverged
+        if "wrench" in self.outputs:
+            found["wrench"] = reading.wrench
+        if "traction" in self.outputs:
+            found["traction"] = reading.traction()
+        if {"wrench", "traction"} & set(self.outputs):
+            area = cell_areas(surface.grid)
+            found["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
+            if surface.coat is not None:
+                found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
+                self._check_width(reading, found["contact_cells"])
+        return found
+
+    def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
         """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.
 
         On the way every contact is narrow once, so what lies between the ends of stages is not looked at.
         """
         if state.stage < 0:
-            self._is_narrow = False  # a press begins anew
-        if cells is None or self._is_narrow or state.fraction < 1.0 or state.stage < 0 or state.scene is None:
+            self._is_narrow = False  # a press begins
+        if self._is_narrow or state.fraction < 1.0 or state.stage < 0 or state.scene is None:
             return
         if not holds_force(state.scene, state.stage):
-            self._is_narrow = warn_if_narrow(cells, self.pad, stacklevel=3)
+            self._is_narrow = warn_if_narrow(cells, getattr(self._used, "level", None), stacklevel=4)
 
     def _frame(
         self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
     ) -> TactileFrame:
         """The frame with the images that are asked for; ``done``: when the surface was there."""
-        height = surface.height if "height" in self.outputs else None
-        if not self._optical_outputs:
-            return TactileFrame(surface, height=height, markers=markers, time_ms=time_ms, **fields)
-        images = self.optical_mode.render(surface)
-        time_ms["optics"] = 1e3 * (time.perf_counter() - done)
-        return TactileFrame(
-            surface=surface,
-            rgb=images.rgb,
-            layers=images.layers,
-            normals=images.normals,
-            position=images.position,
-            depth=images.depth,
-            height=height,
-            contact=images.contact,
-            uncovered=images.uncovered,
-            markers=markers,
-            time_ms=time_ms,
-            **fields,
-        )
+        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers, "label": self.label}
+        if self._optical_outputs:
+            images = self.optical_mode.render(surface)
+            fields |= {name: getattr(images, name, None) for name in IMAGES} | {
+                "label": self.label
+            }  # a mode is named once it is built
+            time_ms["optics"] = 1e3 * (time.perf_counter() - done)
+        return TactileFrame(surface, time_ms=time_ms, **fields)
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
         """Frame of untouched pads, what every difference image is taken from; markers keep their history.
@@ -388,7 +363,7 @@ class TactileSensor:
             BackendError: the model's backend does not work here.
         """
         if self.markers is None:
-            raise InputError("markers", value=None, rule="was not asked for", choices=MARKER_MODELS)
+            raise InputError("markers", value=None, rule="was not asked for", choices=MARKERS.names)
         if self._tracker is None:
             self._tracker = MarkerTracker(
                 self.spec,
@@ -398,7 +373,6 @@ class TactileSensor:
                 resolution=self.resolution,
                 device=self.device,
                 seed=self.seed,
-                perturbation=self._marker_perturbation,
             )
         return self._tracker
 
@@ -412,19 +386,17 @@ class TactileSensor:
         """
         self.marker_tracker.reset(envs)
 
-    def _followed(self, states: Iterable[ContactState]) -> Iterator[ContactState]:
-        """The same states, while markers that need it see every one of them."""
-        for state in states:
+    def _followed(self, readings: Iterable[PadReading]) -> Iterator[PadReading]:
+        """The same readings, while markers that need it see every one of them."""
+        for reading in readings:
             if self.markers is not None:
-                self.marker_tracker.follow(state_surface(self._pad, state))
-            yield state
+                self.marker_tracker.follow(reading.surface)
+            yield reading
 
     def _dotted(self, surface: GelSurface, markers: MarkerFrame) -> GelSurface:
         """The surface with dots printed where the markers are, if there is an image to show them."""
         if not {"rgb", "layers"} & set(self._optical_outputs):
             return surface
-        from raytac.markers.dots import dot_ink
-
         return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
@@ -439,7 +411,11 @@ class TactileSensor:
         """The renderer, built on first use.
 
         Raises:
-            InputError: an unknown name or a bad value in ``optics_options``.
-            BackendError: the renderer or the device does not work here.
+            RaytacError: as ``OpticsConfig.build``.
         """
-        return self._imaging.mode
+        mode = self._mode
+        if mode is None:
+            mode = self._mode = self.optics.build(
+                self.spec, resolution=self.resolution, outputs=self._optical_outputs, device=self.device, seed=self.seed
+            )
+        return mode

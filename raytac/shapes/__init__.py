@@ -1,4 +1,4 @@
-"""Shapes of objects: primitives, meshes and reliefs as parts, their undersides and their surfaces."""
+"""Shapes of objects: primitives, meshes and reliefs, their undersides and surfaces."""
 
 import lazy_loader
 

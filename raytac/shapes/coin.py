@@ -1,4 +1,4 @@
-"""The relief of raytac's coin: rim, ring of beads, five-pointed star and the letters RT, as an elevation map."""
+"""The relief of raytac's coin (rim, beads, star, the letters RT) as an elevation map."""
 
 from __future__ import annotations
 

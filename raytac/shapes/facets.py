@@ -1,4 +1,4 @@
-"""How finely curved parts and reliefs are cut into facets, for a solver that collides triangles."""
+"""Facets of curved parts and reliefs, for a solver that collides triangles."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from raytac.shapes.part import Part
 __all__ = ["SAG", "around", "coarse_relief", "grid_facets"]
 
 SAG = 2e-6
-"""How far a facet may lie inside a curved part [m]: far below what a pad's own triangles miss."""
+"""Greatest distance of a facet inside a curved part [m]: far below the error of a pad's own triangles."""
 _FEWEST, _MOST = 16, 256
 """Facets around a circle."""
 _RELIEF_SPACING = 0.2e-3
 """Spacing of a relief's facets [m]: below the cells of the finest pad, since the map's own would be half a million."""
 _RELIEF_SHARE = 0.04
-"""Most that this spacing may be of a relief's half width: a small coin's rim is 0.15 radii wide."""
+"""Greatest spacing as a share of a relief's half width: a small coin's rim is 0.15 radii wide."""
 
 
 def around(radius: float, sag: float) -> int:
-    """Facets around a circle [m], a multiple of 4 so that the polygon is symmetric as the circle is."""
+    """Number of facets around a circle [m], a multiple of 4 for symmetry."""
     steps = np.pi / np.arccos(1.0 - min(sag / radius, 0.5))
     return 4 * int(np.clip(np.ceil(steps / 4.0), _FEWEST // 4, _MOST // 4))
 
 
 def coarse_relief(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (n,) [m] along both axes and elevation (n, n) [m] of a relief's map, read at a wider spacing, with a margin of 0."""
+    """Coordinates (n,) and elevation (n, n) [m] of a relief at a wider spacing, 0 around it."""
     assert part.elevation is not None
     half_width, data = part.size[0], part.elevation
     spacing = 2.0 * half_width / (len(data) - 1)
     step = max(int(min(_RELIEF_SPACING, _RELIEF_SHARE * half_width) / spacing), 1)
-    taken = data[::step, ::step]
-    elevation = np.zeros((len(taken) + 2,) * 2)
-    elevation[1:-1, 1:-1] = taken
+    coarse = data[::step, ::step]
+    elevation = np.zeros((len(coarse) + 2,) * 2)
+    elevation[1:-1, 1:-1] = coarse
     return step * spacing * (np.arange(len(elevation)) - 1) - half_width, elevation
 
 

@@ -1,4 +1,4 @@
-"""One rigid part of an object, as plain numbers and arrays: the input of the height-field code."""
+"""One rigid part of an object, as plain numbers and arrays."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _SIZES = {
     "torus": 2,
 }
 _LONGEST = 1e3
-"""Longest length of a part, and farthest that it may be off [m]: beyond it, nothing of a pad's scale can be told."""
+"""Greatest length and offset of a part [m]: beyond it, rounding hides anything of a pad's scale."""
 PART_KINDS = (*_SIZES, "mesh", "relief")
-"""What a ``Part`` can be. MuJoCo's ``hfield`` becomes a ``mesh`` through ``hfield_part``."""
+"""Kinds of ``Part``; MuJoCo's ``hfield`` becomes a ``mesh`` by ``hfield_part``."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Part:
     max_slope: float = 0.0
     """Relief only: greatest slope of the elevation."""
     joined: bool = False
-    """Whether it grows out of the flat lower face, z = 0 in the object frame, of the object's first part and is one solid with it."""
+    """True if it is one solid with the object's first part and starts at that part's flat lower face, z = 0 in the object frame."""
 
 
 def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndarray | None = None) -> Part:
@@ -129,7 +129,7 @@ def _pose(object_from_part: np.ndarray | None) -> np.ndarray:
 
 
 def _is_closed(faces: np.ndarray, vertices: int) -> bool:
-    """Whether every directed edge has exactly one partner that runs the other way."""
+    """True if every directed edge has exactly one opposite edge."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     forward, backward = start * vertices + end, end * vertices + start
     unique = np.unique(forward)

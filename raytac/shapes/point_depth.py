@@ -1,4 +1,4 @@
-"""How deep points lie inside a simple solid."""
+"""Depth of points inside a simple solid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from raytac.shapes.part import Part
 __all__ = ["SOLIDS", "point_depth"]
 
 SOLIDS = ("plane", "box", "sphere", "cylinder", "capsule")
-"""Kinds of part that it is known for."""
+"""Kinds of part that ``point_depth`` takes."""
 
 
 def point_depth(part: Part, points: np.ndarray) -> np.ndarray:

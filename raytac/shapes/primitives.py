@@ -1,4 +1,4 @@
-"""Undersides of primitive shapes: the exact first hit of a vertical line from below, for all nodes and environments at once.
+"""Undersides of primitive shapes: the exact first hit of vertical lines from below.
 
 Each function takes the shape's size [m], its poses ``pad_from_part`` (B, 4, 4) and node positions ``x`` (B or 1, 1, Nx), ``y``
 (B or 1, Ny, 1) [m], and returns the z [m], shape (B, Ny, Nx), of the solid's lowest point on each node's vertical line; ``inf`` where
@@ -20,7 +20,7 @@ __all__ = ["UNDERSIDES", "bounds", "line_in_part", "radius_about_origin"]
 Underside = Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Interval = tuple[np.ndarray, np.ndarray]
 _ROOT_STEPS = 100
-"""Most steps to a torus; halving alone comes to the last bit in 55."""
+"""Most steps to a torus; bisection alone takes 55 to the last bit."""
 
 
 def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -109,7 +109,7 @@ def _box(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray
 
 
 def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Sphere at the tip joined tangentially to a conical frustum whose base, ``radius`` wide, lies ``height`` above the tip.
+    """Sphere at the tip, joined tangentially to a frustum with the base ``height`` above it.
 
     With ρ the tangent of the half angle the flank is √(x² + y²) = ρ (z − z_a); the tip's centre lies at z_a + r √(1 + ρ²) / ρ
     and its sphere touches z = 0, so the virtual apex is at z_a = r − r √(1 + ρ²) / ρ.
@@ -135,7 +135,7 @@ def _cone(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarra
 
 
 def _tori(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """One pose after the other: the search goes on only where it has not ended."""
+    """One pose after the other, so that the search continues only where it has not converged."""
     lines = (np.broadcast_to(v, (len(pose), *v.shape[1:])) for v in (x, y))
     return np.stack([_torus(size, *one) for one in zip(pose, *lines, strict=True)])
 
@@ -188,7 +188,7 @@ def _torus(size: tuple[float, ...], pose: np.ndarray, x: np.ndarray, y: np.ndarr
 
 
 def _cubic(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Real roots of t³ + p t + q, rising; where there is only one it comes three times (Viète's and Cardano's formulas)."""
+    """Real roots of t³ + p t + q, ascending, a single one three times (Viète, Cardano)."""
     square = np.maximum(-p / 3.0, 0.0)
     amplitude = np.sqrt(square)
     rest = q * q / 4.0 + (p / 3.0) ** 3
@@ -201,7 +201,7 @@ def _cubic(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _flank(size: tuple[float, ...]) -> float:
-    """tan of the half angle of the flank: tangent to the tip's sphere and through the base's rim."""
+    """tan of the flank's half angle: tangent to the tip's sphere, through the base's rim."""
     radius, height, tip = size
     return float(np.tan(np.arctan2(radius, height - tip) - np.arcsin(tip / np.hypot(radius, height - tip))))
 
@@ -229,8 +229,8 @@ def _quadric(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Interval:
     a = np.where(flat, 1.0, a)
     disc = b * b - a * c
     root = np.sqrt(np.maximum(disc, 0.0))
-    found = np.where(disc >= 0.0, (-b - root) / a, np.inf), np.where(disc >= 0.0, (-b + root) / a, -np.inf)
-    return _where_flat(flat, c <= 0.0, found) if flat.any() else found
+    interval = np.where(disc >= 0.0, (-b - root) / a, np.inf), np.where(disc >= 0.0, (-b + root) / a, -np.inf)
+    return _where_flat(flat, c <= 0.0, interval) if flat.any() else interval
 
 
 def _slab(pose: np.ndarray, k: int, x: np.ndarray, y: np.ndarray, low: float, high: float) -> Interval:
@@ -240,22 +240,22 @@ def _slab(pose: np.ndarray, k: int, x: np.ndarray, y: np.ndarray, low: float, hi
     flat = np.abs(d) < 1e-14
     inverse = 1.0 / np.where(flat, 1.0, d)
     start = (np.where(d > 0.0, low, high) - across) * inverse - along * inverse
-    found = start, start + (high - low) * np.abs(inverse)
+    interval = start, start + (high - low) * np.abs(inverse)
     if not flat.any():
-        return found
+        return interval
     o = across + along
-    return _where_flat(flat, (o >= low) & (o <= high), found)
+    return _where_flat(flat, (o >= low) & (o <= high), interval)
 
 
 def _where_flat(flat: np.ndarray, inside: np.ndarray, interval: Interval) -> Interval:
-    """``interval``, but where ``flat`` a line is ``inside`` all along or nowhere."""
+    """``interval``; where ``flat``, the whole line if ``inside``, else none of it."""
     start, end = interval
     always = np.where(inside, -np.inf, np.inf)
     return np.where(flat, always, start), np.where(flat, -always, end)
 
 
 def _common(first: Interval, *others: Interval) -> np.ndarray:
-    """Start of the intersection of intervals, of which the first is overwritten; inf where it is empty."""
+    """Start of the intersection of intervals, overwriting the first; inf where it is empty."""
     start, end = first
     for other_start, other_end in others:
         np.maximum(start, other_start, out=start)

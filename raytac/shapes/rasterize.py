@@ -1,4 +1,4 @@
-"""A z-buffer for triangle meshes seen from below: exact heights at grid nodes, vectorised over triangles, no OpenGL."""
+"""A z-buffer for triangle meshes seen from below, vectorised over triangles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BARELY_FLAT = 1e-12
 
 
 def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Lowest z [m] of a set of triangles above each node, shape (Ny, Nx); ``inf`` where there is none.
+    """Lowest z [m] of triangles above each node, shape (Ny, Nx); ``inf`` where there is none.
 
     ``corners`` [m], shape (T, 3, 3): triangle, corner, xyz in the pad frame. ``x`` (Nx,), ``y`` (Ny,): evenly spaced, ascending.
 
@@ -39,9 +39,9 @@ def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np
     row_last = np.minimum(np.floor((high[:, 1] - y[0]) / step_y + slack), ny - 1).astype(np.int64)
     triangle, offset = _runs(row_last - row_first + 1)
     row = row_first[triangle] + offset
-    left, right = _row_span(p, triangle, y[0] + row * step_y, slack * step_y)
-    column_first = np.maximum(np.ceil((left - x[0]) / step_x - slack), 0).astype(np.int64)
-    column_last = np.minimum(np.floor((right - x[0]) / step_x + slack), nx - 1).astype(np.int64)
+    x_low, x_high = _row_span(p, triangle, y[0] + row * step_y, slack * step_y)
+    column_first = np.maximum(np.ceil((x_low - x[0]) / step_x - slack), 0).astype(np.int64)
+    column_last = np.minimum(np.floor((x_high - x[0]) / step_x + slack), nx - 1).astype(np.int64)
     span, offset = _runs(column_last - column_first + 1)
     column = column_first[span] + offset
     start = p[triangle, 0]
@@ -54,7 +54,7 @@ def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np
 
 def _row_span(p: np.ndarray, triangle: np.ndarray, y: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
     """Left and right end [m] of each triangle on the horizontal line at its ``y``."""
-    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    x_low, x_high = np.full(len(y), np.inf), np.full(len(y), -np.inf)
     corner_x, corner_y = p[:, :, 0], p[:, :, 1]
     for a, b in ((0, 1), (1, 2), (2, 0)):
         rise = corner_y[:, b] - corner_y[:, a]
@@ -64,18 +64,18 @@ def _row_span(p: np.ndarray, triangle: np.ndarray, y: np.ndarray, slack: float) 
         cut_y = np.clip(y, low[triangle], high[triangle])
         cut = corner_x[triangle, a] + per_rise[triangle] * (cut_y - corner_y[triangle, a])
         crosses = np.abs(y - cut_y) <= slack
-        left = np.where(crosses, np.minimum(left, cut), left)
-        right = np.where(crosses, np.maximum(right, cut), right)
+        x_low = np.where(crosses, np.minimum(x_low, cut), x_low)
+        x_high = np.where(crosses, np.maximum(x_high, cut), x_high)
         # A level edge adds its other end too (its neighbours in the triangle carry it unless rounding skipped them).
         both = crosses & level[triangle]
-        left = np.where(both, np.minimum(left, corner_x[triangle, b]), left)
-        right = np.where(both, np.maximum(right, corner_x[triangle, b]), right)
-    missed = left > right
-    return np.where(missed, 0.0, left), np.where(missed, -1.0, right)
+        x_low = np.where(both, np.minimum(x_low, corner_x[triangle, b]), x_low)
+        x_high = np.where(both, np.maximum(x_high, corner_x[triangle, b]), x_high)
+    missed = x_low > x_high
+    return np.where(missed, 0.0, x_low), np.where(missed, -1.0, x_high)
 
 
 def _runs(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For runs of the given lengths laid end to end: the run of each element, and its place in the run."""
+    """Run of each element, and its place in it, of runs of these lengths laid end to end."""
     lengths = np.maximum(lengths, 0)
     run = np.repeat(np.arange(len(lengths)), lengths)
     return run, np.arange(len(run)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

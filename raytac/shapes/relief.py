@@ -12,11 +12,11 @@ __all__ = ["looks_down", "relief_part", "relief_underside"]
 
 _STEPS = 60
 _LIMIT = 0.7
-"""Greatest slope · tan τ for the iteration: the factor by which each step shrinks the error at worst."""
+"""Greatest slope · tan τ for the iteration: the factor on the error in each step, at worst."""
 
 
 def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.ndarray | None = None) -> Part:
-    """A relief from its elevation [m], (N, N), over a square of the given half width [m] (see ``Part``)."""
+    """A relief from its elevation [m], (N, N), over a square of a half width [m]."""
     data = np.array(elevation, float)
     if data.ndim != 2 or data.shape[0] != data.shape[1] or len(data) < 4 or not np.isfinite(data).all() or data.min() < 0.0:
         raise InputError("elevation", value=data.shape, rule="must be square (N, N), N >= 4, finite and >= 0")
@@ -30,7 +30,7 @@ def relief_part(elevation: np.ndarray, half_width: float, object_from_part: np.n
 
 
 def looks_down(part: Part, pose: np.ndarray) -> bool:
-    """Whether the relief's face is turned down so far that ``relief_underside`` converges; if not, use its triangles."""
+    """True if ``relief_underside`` converges at this tilt; if not, use the triangles."""
     tangent = float(np.hypot(pose[2, 0], pose[2, 1]))
     return bool(pose[2, 2] > 0.0 and tangent * part.max_slope <= _LIMIT * pose[2, 2])
 
@@ -40,7 +40,7 @@ def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray)
 
     On the line o + t d (part frame) the underside solves p_z + e(p_x, p_y) = 0. Face down the line is vertical in the part frame
     too and t is read off. Tilted by τ, t ← t − (p_z + e) / d_z is iterated; it converges while slope · tan τ < 1, which
-    ``looks_down`` must have found.
+    ``looks_down`` checks.
     """
     o, d = line_in_part(pose, x, y)
     half_width = part.size[0]

@@ -17,7 +17,7 @@ __all__ = ["object_bounds", "object_height", "object_radius"]
 
 
 _NODES = 32768
-"""Nodes of all environments that are worked on at once: what stays in a core's cache."""
+"""Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 
 
 def object_height(
@@ -35,16 +35,16 @@ def object_height(
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError("pad_from_object", value=poses.shape, rule="must have shape (B, 4, 4)")
     height = np.full((len(poses), y.shape[-1], x.shape[-1]), np.inf)
-    lost = np.logical_not(np.isfinite(poses).all(axis=(1, 2)))
-    if lost.any():
-        poses = np.where(lost[:, None, None], np.eye(4), poses)
+    failed = np.logical_not(np.isfinite(poses).all(axis=(1, 2)))
+    if failed.any():
+        poses = np.where(failed[:, None, None], np.eye(4), poses)
     count = max(_NODES // (height.shape[1] * height.shape[2]), 1)
     for start in range(0, len(poses), count):
         some = slice(start, start + count)
         own = (x, y) if x.ndim == 1 else (x[some], y[some])
         for part in parts:
             _lower_onto(height[some], part, poses[some] @ part.object_from_part, *own, below)
-    height[lost] = np.nan
+    height[failed] = np.nan
     return height
 
 
@@ -122,7 +122,7 @@ def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray,
 
 
 def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
-    """The same of a mesh or a relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
+    """As ``_lower_onto``, of a mesh or relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
     assert part.vertices is not None and part.faces is not None
     as_triangles = part.kind == "mesh" or not looks_down(part, pose)
     placed = part.vertices @ pose[:3, :3].T + pose[:3, 3] if as_triangles else None
@@ -139,7 +139,7 @@ def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.
 
 
 def _span(line: np.ndarray, low: float, high: float) -> slice:
-    """Of the nodes from ``low`` to ``high`` and one beyond."""
+    """Slice of the nodes from ``low`` to ``high`` and one beyond."""
     return slice(*np.searchsorted(line, (low, high), side="left") + np.array([0, 1]))
 
 

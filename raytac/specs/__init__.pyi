@@ -4,13 +4,12 @@ from .marker_motion import PunchSpec as PunchSpec
 from .marker_motion import load_marker_motion as load_marker_motion
 from .mesh import load_mesh as load_mesh
 from .press import PADS as PADS
-from .press import PHYSICS as PHYSICS
 from .press import ObjectSpec as ObjectSpec
 from .press import PressScene as PressScene
 from .press import StageSpec as StageSpec
 from .press_file import load_press as load_press
+from .press_file import press_of as press_of
 from .press_file import validate_press as validate_press
-from .scene_file import load_scene as load_scene
 from .sensor import CameraSpec as CameraSpec
 from .sensor import CaseSpec as CaseSpec
 from .sensor import CoatSpec as CoatSpec
@@ -32,4 +31,5 @@ from .task import BodySpec as BodySpec
 from .task import MountSpec as MountSpec
 from .task import RobotSpec as RobotSpec
 from .task import TaskScene as TaskScene
+from .task_file import load_scene as load_scene
 from .task_file import load_task as load_task

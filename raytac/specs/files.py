@@ -1,4 +1,4 @@
-"""From a name or a path to the file that holds a sensor, its lights, its markers' motion, a press scene, a task scene or a sweep."""
+"""Files of sensors, lights, marker motions, scenes and sweeps, by name or path."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def name_of(path: Path) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; False for a path that no file can have, such as a name too long."""
+    """True if there is such a file; False for a path that no file can have, such as a name too long."""
     try:
         return path.is_file()
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""How the markers of a pad move under a load: what ``raytac calibrate markers`` fits, as a file of ``scenes/markers/``."""
+"""Motion of a pad's markers under a load, fitted by ``raytac calibrate markers``: files of ``scenes/markers/``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "PunchSpec", "load_marker
 
 @dataclass(frozen=True)
 class PunchSpec:
-    """How the skin around a contact that sticks follows it: the rigid punch of contact mechanics; formulas in docs/markers.md."""
+    """Motion of the skin around a contact that sticks: the rigid punch of contact mechanics (docs/markers.md)."""
 
     anisotropy: float
     """κ: how much farther the skin follows along the shear than across it [-]; ν / (2 − ν) on a half-space, 0 alike."""

@@ -15,7 +15,7 @@ __all__ = ["MESH_SUFFIXES", "SIZE_RANGE", "load_mesh"]
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
 _FARTHEST = 1e9
-"""Farthest that a vertex may be [file units]: beyond it vertices cannot be told apart."""
+"""Farthest that a vertex may be [file units]: beyond it vertices cannot be distinguished."""
 SIZE_RANGE = (1e-4, 0.5)
 """Largest extent that an object may have [m]; outside it, the scale is almost surely wrong."""
 

@@ -20,20 +20,20 @@ _ROUNDING = 16 * np.finfo(np.float64).eps
 
 @dataclass(frozen=True)
 class Crossings:
-    """What ``find_crossings`` found."""
+    """Result of ``find_crossings``."""
 
     pairs: np.ndarray
     """Indices of faces that cross or overlap, (P, 2), the smaller first."""
     place: tuple[float, float, float] | None
     """Middle of the first pair, in the unit of the vertices; None without a pair."""
     is_complete: bool
-    """Whether every pair was looked at: False where the search ended early."""
+    """True if every pair was looked at; False where the search ended early."""
 
     def __bool__(self) -> bool:
         return len(self.pairs) > 0 or not self.is_complete
 
     def text(self, unit: float, name: str) -> str:
-        """How many and where, with the place in units of ``unit`` called ``name``."""
+        """Count and place of the crossings; ``unit`` [m] of the place is called ``name``."""
         if self.place is None:
             return f"so many of its triangles lie across each other that the first {_MOST_TESTS:,} pairs do not tell whether they cross"
         count = f"{len(self.pairs):,}" if self.is_complete else f"at least {len(self.pairs):,}"
@@ -58,7 +58,7 @@ def find_crossings(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
     order = _morton_order(corners)
     levels = _boxes(corners[order])
     stack = [(0, np.zeros((1, 2), np.int64))]
-    found: list[np.ndarray] = []
+    batches: list[np.ndarray] = []
     tests = count = 0
     is_complete = True
     while stack:
@@ -74,11 +74,11 @@ def find_crossings(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
         tests += len(pairs)
         crossing = pairs[_meet(corners, faces, pairs)]
         count += len(crossing)
-        found.append(np.sort(crossing, axis=1))
+        batches.append(np.sort(crossing, axis=1))
         if (count > _MOST_PAIRS or tests > _MOST_TESTS) and stack:
             is_complete = False
             break
-    pairs = np.concatenate(found) if found else np.zeros((0, 2), np.int64)
+    pairs = np.concatenate(batches) if batches else np.zeros((0, 2), np.int64)
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     place = tuple(float(v) for v in corners[pairs[0]].mean(axis=(0, 1))) if len(pairs) else None
     return Crossings(pairs, place, is_complete)  # type: ignore[arg-type]
@@ -127,7 +127,7 @@ def _children(nodes: np.ndarray) -> np.ndarray:
 
 
 def _meet(corners: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Which pairs (n, 2) of triangles cross or overlap."""
+    """Pairs (n, 2) of triangles that cross or overlap, as a mask (n,)."""
     result = np.zeros(len(pairs), bool)
     sides = [_sides(corners, pairs), _sides(corners, pairs[:, ::-1])]
     # A triangle that lies wholly on one side of the other's plane meets it nowhere else than in what they share.
@@ -149,7 +149,7 @@ def _sides(corners: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _edges_cross(corners: np.ndarray, faces: np.ndarray, pairs: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Whether an edge of the first triangle of a pair passes through the second, with which it shares no vertex."""
+    """True where an edge of a pair's first triangle passes through the second, with which it shares no vertex."""
     s, t = corners[pairs[:, 0]], corners[pairs[:, 1]]
     shared = (faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any(axis=2)
     result = np.zeros(len(pairs), bool)
@@ -176,7 +176,7 @@ def _sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _overlap(corners: np.ndarray) -> np.ndarray:
-    """Whether pairs (n, 2, 3, 3) of triangles in one plane share more than a line: no normal of an edge separates them."""
+    """True where pairs (n, 2, 3, 3) of triangles in one plane share more than a line: no edge's normal separates them."""
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     drop = np.abs(normal).sum(axis=1).argmax(axis=1)
     kept = np.array([[1, 2], [0, 2], [0, 1]])[drop]

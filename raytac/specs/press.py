@@ -1,8 +1,8 @@
-"""What a press scene is: an object, and the motion that presses it into the pad. SI units, pad frame."""
+"""Press scenes: an object, and the motion that presses it into the pad. SI units, pad frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -15,28 +15,26 @@ __all__ = [
     "DYNAMICS",
     "MOVES",
     "PADS",
-    "PHYSICS",
     "POSE_SCHEMA",
     "SCENE_SCHEMA",
     "STAGE_SCHEMA",
     "ObjectSpec",
     "PressScene",
     "StageSpec",
-    "chosen_physics",
 ]
 
 MOVES = ("object", "case")
-"""What a press can move; the other side stands still."""
+"""Sides that a press can move; the other one stands still."""
 PHYSICS = ("rigid", "ipc")
-"""How a gel can deform: by geometry and Gaussians, or simulated."""
+"""Physics of the gel: the rigid pad with its Gaussians, or the soft pad of the contact solver."""
 PADS = ("coarse", "medium", "fine")
-"""How finely a simulated pad can be cut."""
+"""Mesh levels of the soft pad."""
 DYNAMICS = ("kinematic", "affine", "soft")
-"""What an object can be to a simulated pad: driven and rigid, free and near-rigid, or driven and soft."""
+"""Dynamics of an object on the soft pad: prescribed and rigid, free and near-rigid, or prescribed and soft."""
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
-    "physics": Text(choices=PHYSICS, default=None),
+    "physics": Text(default=None),
     "pad": Text(choices=PADS, default=None),
 }
 """Keys at the top of a scene."""
@@ -51,6 +49,9 @@ POSE_SCHEMA: Final[Schema] = {
 }
 """Keys of ``[object]`` that every kind but ``none`` has."""
 
+OBJECT_KINDS: Final[dict[str, Schema]] = {**OBJECT_SCHEMA, "heights": {"pitch_mm": Number("(0, 10]")}}
+"""Kind of object to the keys of its parameters: those of scene files, and ``heights``, which is made in code."""
+
 _DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
 STAGE_SCHEMA: Final[dict[str, Schema]] = {
     "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
@@ -61,21 +62,17 @@ STAGE_SCHEMA: Final[dict[str, Schema]] = {
 """Kind of stage to its keys in ``[[trajectory]]``."""
 
 
-def chosen_physics(physics: str | None, pad: object, scene: str | None = None) -> str:
-    """``rigid`` or ``ipc``: what is asked for, else ``ipc`` where a pad's fineness is, else as the scene says, else ``rigid``."""
-    return physics or ("ipc" if pad is not None else scene or "rigid")
-
-
 @dataclass(frozen=True)
 class ObjectSpec:
     """The indenter, a union of convex or concave parts rigidly joined.
 
     Most kinds are exact shapes: sphere, cylinder, edge, cone, torus and pins are computed from a few lengths, so that no facet
-    shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body.
+    shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body;
+    ``heights`` is an elevation map of the user's.
     """
 
     kind: str
-    """``none sphere cylinder edge cone torus pins coin mesh mjcf``."""
+    """One of ``OBJECT_KINDS``."""
     params: dict[str, float | int | str]
     """Lengths [m] and counts of the kind, by the key of its TOML file without the unit; for ``mesh`` the absolute ``path`` and
     ``scale`` [m per file unit], for ``mjcf`` the absolute ``path`` and the name of the ``body``. Object frame of each kind:
@@ -85,20 +82,26 @@ class ObjectSpec:
     quaternion: tuple[float, float, float, float]
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
-    """Mass on the drive [kg]; matters only for the way to a force, not for where it settles."""
+    """Mass on the drive [kg]; it affects the motion to a force, not the state that it settles in."""
     dynamics: str = "kinematic"
     """One of ``DYNAMICS``; the rigid pad takes every object as rigid and driven."""
     youngs_modulus: float = 1e6
     """Of a soft object [Pa]."""
     poisson_ratio: float = 0.4
     """Of a soft object."""
+    heights: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
+    """Of the kind ``heights``: elevation [m] of the face that looks at the gel, rows along y, columns along x; 0 where there is none."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.kind, str) or self.kind not in OBJECT_SCHEMA:
-            raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_SCHEMA))
+        if not isinstance(self.kind, str) or self.kind not in OBJECT_KINDS:
+            raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_KINDS))
+        if bool(self.heights) != (self.kind == "heights"):
+            raise SpecError(
+                'must be given for the kind "heights", and for no other', key="object.heights", value=len(self.heights)
+            )
         if self.kind == "none":
             return
-        check_params(self.kind, self.params, OBJECT_SCHEMA[self.kind], "object")
+        check_params(self.kind, self.params, OBJECT_KINDS[self.kind], "object")
         if not isinstance(self.position, (tuple, list)) or len(self.position) != 3:
             raise SpecError("must be three numbers, of which the last is not used", key="object.position_mm", value=self.position)
         place = self.position[:2]  # as a file gives it
@@ -140,10 +143,10 @@ class PressScene:
     trajectory: tuple[StageSpec, ...]
     """Empty for an untouched pad."""
     moves: str = "object"
-    """Which side the trajectory moves, one of ``MOVES``. Targets are the object's against the pad either way."""
+    """Side that the trajectory moves, one of ``MOVES``. Targets are those of the object relative to the pad in both cases."""
     source: Path | None = None
     physics: str | None = None
-    """One of ``PHYSICS`` that the scene is meant for; None leaves it to whoever presses."""
+    """Name of the physics that the scene is meant for (checked when it is pressed); None leaves it to whoever presses."""
     pad: str | None = None
     """One of ``PADS``; None leaves it to whoever presses."""
 

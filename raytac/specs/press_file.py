@@ -1,17 +1,21 @@
-"""Reads press scenes from TOML, ``scenes/press/*.toml``, and checks the rules between scene and sensor."""
+"""Press scenes from TOML, ``scenes/press/*.toml``, from meshes and from height maps; rules between scene and sensor."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from raytac.errors import SpecError
+import numpy as np
+
+from raytac.checks import check_number, check_numbers
+from raytac.errors import InputError, SpecError
 from raytac.specs.files import find_file, name_of
+from raytac.specs.mesh import MESH_SUFFIXES, load_mesh
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion
+from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion, warn_of_crossings
 from raytac.specs.toml import Table, Text, read_toml
 
-__all__ = ["load_press", "validate_press"]
+__all__ = ["load_press", "press_of", "validate_press"]
 
 _KIND = "kind"
 
@@ -39,7 +43,7 @@ def load_press(name_or_path: str | Path) -> PressScene:
     if target.kind == "none" and "moves" in top.data:
         raise top.error("must be absent where there is no object", "moves", scene["moves"])
     if scene["pad"] is not None and scene["physics"] != "ipc":
-        raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", scene["pad"])
+        raise top.error('is how finely a soft pad is cut, so physics must be "ipc"', "pad", scene["pad"])
     if target.kind == "none" and stages:
         raise top.error("must be absent where there is no object", "trajectory")
     if target.kind != "none" and not stages:
@@ -54,6 +58,73 @@ def load_press(name_or_path: str | Path) -> PressScene:
     return PressScene(name_of(path), target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
 
 
+def press_of(
+    source: str | Path | PressScene | np.ndarray,
+    *,
+    depth: float | None = None,
+    scale: float | None = None,
+    pitch: float | None = None,
+) -> PressScene:
+    """Press scene of whatever can be pressed: a scene, a mesh or a height map.
+
+    A mesh or a height map is pressed straight down by its −z side. The middle of its bounding box is over the centre of the pad.
+
+    Args:
+        source: a scene, or its name or file (``load_press``); an STL, OBJ or PLY file (``load_mesh``); or the heights [m] of a face,
+            shape (rows, columns), as the camera sees it. The greatest height touches first, and where it is 0 there is no object.
+        depth: how deep a mesh or a height map is pressed in [m].
+        scale: metres per unit of a mesh file; None is 0.001, a file in millimetres.
+        pitch: spacing of the rows and columns of a height map [m].
+
+    Raises:
+        InputError: an argument that is missing, or that belongs to another kind of source; heights that are not finite, negative, or all 0.
+        SpecError: a depth out of range; as ``load_press``.
+        MeshError: as ``load_mesh``.
+    """
+    if not isinstance(source, (str, Path, PressScene, np.ndarray)):
+        rule = f"must be a name, a path, a PressScene or an array of heights, not {type(source).__name__}"
+        raise InputError("scene", value=source, rule=rule)
+    is_map = isinstance(source, np.ndarray)
+    is_mesh = isinstance(source, (str, Path)) and Path(source).suffix.lower() in MESH_SUFFIXES
+    for name, value, owner, belongs in (
+        ("depth", depth, "a mesh or a height map", is_mesh or is_map),
+        ("scale", scale, "a mesh", is_mesh),
+        ("pitch", pitch, "a height map", is_map),
+    ):
+        if value is not None and not belongs:
+            raise InputError(name, value=value, rule=f"belongs to {owner}: leave it out with a {'mesh' if is_mesh else 'scene'}")
+        if value is None and belongs and name != "scale":
+            units = ", in metres (on the command line in millimetres)" if name == "depth" else ", in metres"
+            raise InputError(name, value=None, rule=f"must be given with {owner}{units}")
+    if isinstance(source, PressScene):
+        return source
+    if isinstance(source, np.ndarray):
+        heights = check_numbers("heights", source, (None, None), finite=True)
+        if not heights.size or heights.min() < 0 or heights.max() == 0:
+            raise InputError("heights", value=heights.shape, rule="must be >= 0 everywhere and > 0 somewhere [m]")
+        spacing = check_number("pitch", pitch, "(0, 0.01]", "m")
+        return _pressed_in("heights", "heights", {"pitch": spacing}, depth, heights=tuple(map(tuple, heights.tolist())))
+    if not is_mesh:
+        return load_press(source)
+    path, scale = Path(source).absolute(), check_number("scale", 0.001 if scale is None else scale, "(0, 10]", "m per file unit")
+    vertices, faces = load_mesh(path, scale)
+    warn_of_crossings(str(path), vertices, faces)
+    x, y, _ = (-0.5 * (vertices.min(axis=0) + vertices.max(axis=0))).tolist()
+    return _pressed_in(name_of(path), "mesh", {"path": str(path), "scale": scale}, depth, (x, y, 0.0))
+
+
+def _pressed_in(
+    name: str,
+    kind: str,
+    params: dict[str, float | int | str],
+    depth: float | None,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    heights: tuple[tuple[float, ...], ...] = (),
+) -> PressScene:
+    target = ObjectSpec(kind, params, position, (1.0, 0.0, 0.0, 0.0), 0.1, heights=heights)
+    return PressScene(name, target, (StageSpec("indent", depth=depth),))
+
+
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
     """Check a scene against the sensor that it is pressed into.
 
@@ -63,6 +134,8 @@ def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)
     x, y, _ = scene.object.position
+    if scene.object.kind == "mesh" and scene.source is None:
+        x = y = 0.0  # its file's origin may lie anywhere; ``press_of`` puts its middle over the pad
     if scene.object.kind != "none" and (abs(x) > half[0] or abs(y) > half[1]):
         rule = f"the object must start on the pad of {sensor.name}: |x| <= {half[0] * 1e3:.4g} mm, |y| <= {half[1] * 1e3:.4g} mm"
         raise SpecError(rule, file=scene.source, key="object.position_mm", value=[x * 1e3, y * 1e3])

@@ -1,4 +1,4 @@
-"""What a sensor is: gelpad, coat, case, camera, response, markers and lights, in SI units.
+"""Sensors: gelpad, coat, case, camera, response, markers and lights, in SI units.
 
 Frames. Everything is given in the **pad frame**: origin at the centre of the undeformed outer gel surface, +z out of the
 sensor towards the object, +x image right, +y image down. The camera and the LEDs therefore lie at z < 0.
@@ -132,13 +132,13 @@ class GelpadSpec:
     friction: float
     """Coulomb friction coefficient μ against the object."""
     bonded: str = "back"
-    """What the case holds, one of ``BONDED``; only the soft pad knows it."""
+    """Faces that are bonded to the case, one of ``BONDED``; used by the soft pad alone."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
 
     def sag(self, x: Any, y: Any) -> Any:
-        """How far the surface at rest lies below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays that broadcast.
+        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays.
 
         s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
         carried along one of radius Ry.
@@ -206,7 +206,7 @@ class ResponseSpec:
 
     exposure: float | Literal["auto"]
     """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
-    (``raytac.optics.exposure``), which whoever renders finds."""
+    (``raytac.optics.response``), which whoever renders finds."""
     white_balance: Vec3
     """Gain of each channel after the exposure."""
     gamma: float
@@ -249,7 +249,10 @@ class ResponseSpec:
 
 
 def shading_degree(count: int) -> int:
-    """Highest degree n of a colour shading that ``count`` coefficients are enough for, (n + 1)(n + 2)/2 of them; −1 for none."""
+    """Highest degree n of a colour shading of ``count`` coefficients; −1 for none.
+
+    A degree n has (n + 1)(n + 2)/2 coefficients.
+    """
     return (math.isqrt(8 * count + 1) - 3) // 2
 
 
@@ -293,10 +296,10 @@ class RefractionSpec:
 
 @dataclass(frozen=True)
 class OpticsSpec:
-    """How images are made of the sensor where its geometry leaves a choice: as its lights were fitted."""
+    """Choices of rendering that the geometry leaves open, as the lights were fitted."""
 
     shadows: bool = True
-    """Whether what rises casts shadows on the coat, in every optical mode that can cast them and is not told otherwise."""
+    """True casts shadows on the coat, in every optical mode that can and is not given another value."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["optics"], "optics")
@@ -384,7 +387,7 @@ class SensorSpec:
     lights: LightsSpec
     optics: OpticsSpec = OpticsSpec()
     marker_motion: MarkerMotionSpec | None = None
-    """How the pad's markers move under a load, for models that are fitted; None if nobody calibrated them."""
+    """Motion of the pad's markers under a load, for models that are fitted; None if nobody fitted them."""
     source: Path | None = None
     """File that it was read from."""
 

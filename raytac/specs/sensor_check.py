@@ -38,7 +38,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
 
 def check_slab(sensor: SensorSpec) -> None:
-    """Check what optics with ``refraction.model = "slab"`` cannot do without: camera and all of every LED in the air below the slab.
+    """Check that camera and LEDs lie in the air below the slab of ``refraction.model = "slab"``.
 
     Raises:
         SpecError: as ``validate_sensor``.
@@ -128,17 +128,17 @@ def _check_vignetting(sensor: SensorSpec) -> None:
 
 
 def _check_shading(sensor: SensorSpec) -> None:
-    for channel, found in zip(("red", "green", "blue"), sensor.response.shading, strict=True):
-        degree = shading_degree(len(found))
-        if (degree + 1) * (degree + 2) // 2 != len(found):
-            rule = f"must have (n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not {len(found)}"
-            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
-        if max(map(abs, found), default=0.0) > _COEFFICIENT:
+    for channel, coefficients in zip(("red", "green", "blue"), sensor.response.shading, strict=True):
+        degree = shading_degree(len(coefficients))
+        if (degree + 1) * (degree + 2) // 2 != len(coefficients):
+            rule = f"must have (n + 1)(n + 2)/2 coefficients for a degree n (1, 3, 6, 10, 15, …), not {len(coefficients)}"
+            raise _error(sensor, f"response.shading_{channel}", list(coefficients), rule)
+        if max(map(abs, coefficients), default=0.0) > _COEFFICIENT:
             rule = f"must be numbers in [-{_COEFFICIENT:g}, {_COEFFICIENT:g}]"
-            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
-        if sum(map(abs, found)) > _LOG_GAIN:
+            raise _error(sensor, f"response.shading_{channel}", list(coefficients), rule)
+        if sum(map(abs, coefficients)) > _LOG_GAIN:
             rule = f"absolute values must not sum to more than {_LOG_GAIN:g}: the gain is the exponential of the polynomial"
-            raise _error(sensor, f"response.shading_{channel}", list(found), rule)
+            raise _error(sensor, f"response.shading_{channel}", list(coefficients), rule)
 
 
 def _real_roots(a: float, b: float, c: float) -> tuple[float, ...]:

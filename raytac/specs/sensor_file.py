@@ -8,8 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from raytac.specs.files import find_file, name_of
-from raytac.specs.marker_motion import load_marker_motion
+from raytac.specs.files import available, find_file, name_of
+from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.sensor import (
     LED_SCHEMA,
     SENSOR_PARTS,
@@ -21,10 +21,9 @@ from raytac.specs.sensor import (
     shading_degree,
 )
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.toml import Table, Text, read_toml
+from raytac.specs.toml import Table, Text, read_toml, split_unit
 
-__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "with_lights"]
-
+__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "sensor_files", "with_lights"]
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
@@ -56,12 +55,12 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
     base = None
     if "base" in top.data:
         named = top.read_one("base", SENSOR_SCHEMA[""]["base"])
-        found, above = find_file("sensor", named, base=path.parent), (*above, path.resolve())
-        if found.resolve() in above:
+        file, above = find_file("sensor", named, base=path.parent), (*above, path.resolve())
+        if file.resolve() in above:
             raise top.error("must be a sensor that is not built on this one", "base", top.data["base"])
         if len(above) > _LONGEST_CHAIN:
             raise top.error(f"a sensor must be built on at most {_LONGEST_CHAIN} others, one after the other", "base", named)
-        base = _read_sensor(found, above)
+        base = _read_sensor(file, above)
     schema = dict(SENSOR_SCHEMA[""])
     if base is not None:
         schema["lights"] = Text(default="")
@@ -155,12 +154,73 @@ def response_text(response: ResponseSpec) -> str:
         f"black_level = {row(response.black_level)}",
         f"vignetting = {row(response.vignetting)}",
     ]
-    for channel, found in zip(("red", "green", "blue"), response.shading, strict=True):
-        if not found:
+    for channel, coefficients in zip(("red", "green", "blue"), response.shading, strict=True):
+        if not coefficients:
             continue
         lines.append(f"shading_{channel} = [")
-        rest = iter(found)
-        for order in range(shading_degree(len(found)), -1, -1):
+        rest = iter(coefficients)
+        for order in range(shading_degree(len(coefficients)), -1, -1):
             lines.append("    " + ", ".join(f"{value:.4f}" for value in islice(rest, order + 1)) + ",")
         lines.append("]")
+    return "\n".join(lines) + "\n"
+
+
+_MOTION = "marker_motion.toml"
+
+
+def sensor_files(sensor: SensorSpec) -> dict[str, str]:
+    """Texts by name of file: ``sensor.toml``, and further files that it needs.
+
+    Its lights are in a ``lights.toml`` beside it, which is not among them.
+
+    A sensor whose lights, response and optics are all that it does not have from a shipped one names that as its base; any other holds
+    every table itself. Markers' motion is a shipped name or a file beside it. No path of this machine is in it.
+    """
+    files: dict[str, str] = {}
+    base = _shipped_base(sensor)
+    head = ['lights = "lights.toml"'] if base is None else [f'base = "{base}"', 'lights = "lights.toml"']
+    tables = ["response", "optics"] if base is not None else [name for name in SENSOR_SCHEMA if name]
+    if base is None and sensor.marker_motion is not None:
+        shipped = _shipped_motion(sensor.marker_motion)
+        head.append(f'marker_motion = "{shipped or _MOTION}"')
+        if shipped is None:
+            files[_MOTION] = marker_motion_text(sensor.marker_motion)
+    blocks = [response_text(sensor.response) if name == "response" else _table(sensor, name) for name in tables]
+    return {"sensor.toml": "\n".join(["\n".join(head) + "\n", *blocks])} | files
+
+
+def _shipped_base(sensor: SensorSpec) -> str | None:
+    """Name of the shipped sensor that ``sensor`` was read from and is but for its lights, response and optics; None if there is none."""
+    source = sensor.source
+    if source is None or source.stem not in available("sensor") or source.resolve() != find_file("sensor", source.stem).resolve():
+        return None
+    shipped = load_sensor(source.stem)
+    own = replace(sensor, lights=shipped.lights, response=shipped.response, optics=shipped.optics)
+    return source.stem if own == shipped else None
+
+
+def _shipped_motion(motion: MarkerMotionSpec) -> str | None:
+    """Name of the shipped marker motion that this is; None if it is another."""
+    for name in available("marker motion"):
+        if replace(load_marker_motion(name), source=motion.source) == motion:
+            return name
+    return None
+
+
+def _table(sensor: SensorSpec, name: str) -> str:
+    """One table in the units of its keys, to fifteen digits: what is read back is the same number."""
+    lines = [f"[{name}]"]
+    for key in SENSOR_SCHEMA[name]:
+        own, unit = split_unit(key)
+        value = getattr(getattr(sensor, name), own)
+
+        def text(one: object, unit=unit) -> str:
+            if isinstance(one, bool):
+                return "true" if one else "false"
+            if isinstance(one, str):
+                return f'"{one}"'
+            return str(one) if isinstance(one, int) else f"{one * unit.denominator / unit.numerator:.15g}"  # type: ignore[operator]
+
+        written = f"[{', '.join(text(one) for one in value)}]" if isinstance(value, tuple) else text(value)
+        lines.append(f"{key} = {written}")
     return "\n".join(lines) + "\n"

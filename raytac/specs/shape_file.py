@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from raytac.checks import is_number
 from raytac.errors import MeshError, SpecError
 from raytac.specs.files import is_file
@@ -15,7 +17,15 @@ from raytac.specs.mesh import load_mesh
 from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, split_unit
 
-__all__ = ["OBJECT_SCHEMA", "check_params", "check_quaternion", "check_shape", "resolved", "unit_quaternion"]
+__all__ = [
+    "OBJECT_SCHEMA",
+    "check_params",
+    "check_quaternion",
+    "check_shape",
+    "resolved",
+    "unit_quaternion",
+    "warn_of_crossings",
+]
 
 _LENGTH = Number("(0, 100]")
 
@@ -58,7 +68,9 @@ def check_shape(table: Table, kind: str, values: dict[str, Any]) -> None:
 
 
 def check_params(kind: str, params: Mapping[str, Any], schema: Schema, prefix: str) -> None:
-    """The rules of ``check_shape`` for a shape that is made in code, in SI; a file that it names is looked at where it is read.
+    """Check a shape that is made in code, in SI, by the rules of ``check_shape``.
+
+    A file that it names is checked where it is read.
 
     Raises:
         SpecError: a length or count that is missing or out of its range, lengths that contradict each other, or an unknown name.
@@ -126,12 +138,15 @@ def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
         rule = f"{error.rule} (mesh {values['path']})"
         dotted = f"{table.prefix}.{key}" if table.prefix else key
         raise MeshError(rule, file=table.file, key=dotted, value=table.data[key], choices=error.choices) from error
+    warn_of_crossings(values["path"], vertices, faces)
+
+
+def warn_of_crossings(path: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Warn of a mesh [m] whose triangles cross each other."""
     crossings = find_crossings(vertices, faces)
     if crossings:
-        warnings.warn(
-            f"mesh {values['path']}: {crossings.text(1e-3, 'mm')}; the rigid pad takes its lowest faces, physics='ipc' refuses it",
-            stacklevel=2,
-        )
+        text = crossings.text(1e-3, "mm")
+        warnings.warn(f"mesh {path}: {text}; the rigid pad takes its lowest faces, physics='ipc' refuses it", stacklevel=3)
 
 
 def _mm(length: float) -> float:

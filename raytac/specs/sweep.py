@@ -1,4 +1,4 @@
-"""What a sweep is: which objects are pressed how into which sensors, how often, and what is kept of it. SI units, pad frame."""
+"""Sweeps: objects, sensors, ranges of presses, their number, and the outputs that are kept. SI units, pad frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.errors import SpecError
-from raytac.specs.press import PADS, PHYSICS, PressScene
+from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.toml import ANY, REQUIRED, Integer, Number, Schema, Text, check_fields, split_unit
 
@@ -23,7 +23,7 @@ SWEEP_SCHEMA: Final[Schema] = {
     "count": Integer("[1, 1000000000]"),
     "shard_size": Integer("[1, 100000]", default=256),
     "seed": Integer("[0, 4294967295]", default=0),
-    "physics": Text(choices=PHYSICS, default="rigid"),
+    "physics": Text(default="rigid"),
     "pad": Text(choices=PADS, default=None),
     "optics": Text(default="taxim"),
     "outputs": Text(length=ANY, default=("rgb", "height", "wrench")),
@@ -70,7 +70,7 @@ MARKER_NOISE_SCHEMA: Final[Mapping[str, Number]] = {
 
 @dataclass(frozen=True)
 class PressRanges:
-    """Where presses are drawn from; equal ends fix a value."""
+    """Ranges that presses are drawn from; equal ends fix a value."""
 
     depth: Range
     """Travel below first touch [m]."""
@@ -82,7 +82,7 @@ class PressRanges:
     tilt: Range = (0.0, 0.0)
     """Lean of the object, turned by yaw, away from +z [rad]; the direction of the lean is uniform over the circle."""
     shear: Range = (0.0, 0.0)
-    """Length of the way sideways after the indent [m]; its direction is uniform over the circle."""
+    """Length of the sideways displacement after the indent [m]; its direction is uniform over the circle."""
     twist: Range = (0.0, 0.0)
     """Turn about +z after that, in contact [rad]."""
 
@@ -109,9 +109,9 @@ class SweepSpec:
     shard_size: int = 256
     seed: int = 0
     physics: str = "rigid"
-    """One of ``PHYSICS``."""
+    """Name of the physics; checked when the sweep is planned."""
     pad: str | None = None
-    """One of ``PADS``, of a simulated pad; None is coarse."""
+    """One of ``PADS``, of a soft pad; None is coarse."""
     optics: str = "taxim"
     outputs: tuple[str, ...] = ("rgb", "height", "wrench")
     """Arrays that are kept, besides parameters, poses and markers."""
@@ -135,7 +135,7 @@ class SweepSpec:
         own = {key: rule for key, rule in SWEEP_SCHEMA.items() if key not in ("sensors", "objects")}
         check_fields(vars(self), own, file=self.source)
         if self.pad is not None and self.physics != "ipc":
-            rule = 'is how finely a simulated pad is cut, so physics must be "ipc"'
+            rule = 'is how finely a soft pad is cut, so physics must be "ipc"'
             raise SpecError(rule, file=self.source, key="pad", value=self.pad)
         self._check_pressed("sensors", SensorSpec)
         self._check_pressed("objects", PressScene)

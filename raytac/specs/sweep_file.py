@@ -23,7 +23,7 @@ def load_sweep(name_or_path: str | Path) -> SweepSpec:
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range, or a range whose ends are
-            the wrong way round; or as ``load_sensor`` and ``load_press``.
+            in the wrong order; or as ``load_sensor`` and ``load_press``.
     """
     path = find_file("sweep", name_or_path)
     top = read_toml(path)
@@ -59,4 +59,4 @@ def _read_randomization(top: Table) -> tuple[dict[str, float], dict[str, float]]
     markers = table.section("markers").read(MARKER_NOISE_SCHEMA) if "markers" in table.data else {}
     if "noise" in markers:
         markers["noise_px"] = markers.pop("noise")
-    return ({k: v for k, v in found.items() if v is not None} for found in (values, markers))  # type: ignore[return-value]
+    return ({k: v for k, v in given.items() if v is not None} for given in (values, markers))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""What a task scene is: a robot that carries sensors, bodies around it, and the steps in which they move. SI units, world frame.
+"""Task scenes: a robot that carries sensors, bodies around it, and the steps in which they move. SI units, world frame.
 
 World frame: base of the arm, z up, x ahead.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.errors import SpecError
-from raytac.specs.press import PADS, PHYSICS
+from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec, Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
 from raytac.specs.toml import ANY, Number, Schema, Text, check_fields
@@ -36,11 +36,11 @@ __all__ = [
 ROBOTS = ("panda_one_sensor", "panda_two_fingers", "floating_gripper", "fixed_sensor")
 """Robots that raytac builds itself; any other is the path of an MJCF file."""
 OWNERS = ("ipc", "mujoco")
-"""Which simulator moves a free body where the pads are simulated."""
+"""Simulators that can move a free body where the pads are soft."""
 MOTIONS = ("fixed", "free", "soft")
-"""What a body can be: it never moves, it moves as a rigid body, it moves and deforms."""
+"""Dynamics of a body: it never moves, it moves as a rigid body, it moves and deforms."""
 COUPLINGS = ("two_way", "one_way")
-"""Whether what the pads feel acts back on the robot and on MuJoCo's bodies."""
+"""Couplings: forces on the pads act back on the robot and on MuJoCo's bodies, or do not."""
 PAIR_FRICTION = 0.5
 """Friction coefficient of a body that names none, against all but gel (a guess: dry plastics lie between 0.2 and 0.6)."""
 
@@ -54,7 +54,7 @@ _POSE: Final[Schema] = {
 }
 
 TASK_SCHEMA: Final[Schema] = {
-    "physics": Text(choices=PHYSICS, default=None),
+    "physics": Text(default=None),
     "pad": Text(choices=PADS, default=None),
     "coupling": Text(choices=COUPLINGS, default="two_way"),
     "timestep_s": Number(_STEP, default=0.002),
@@ -111,7 +111,7 @@ BODY_SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class MountSpec:
-    """One sensor on a robot of one's own."""
+    """One sensor on a robot from a file."""
 
     name: str
     """Name of the sensor."""
@@ -131,20 +131,20 @@ class MountSpec:
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """What carries the sensors, and where it starts."""
+    """Carrier of the sensors, and its start."""
 
     model: str
     """One of ``ROBOTS``, or the absolute path of an MJCF file."""
     sensor: str | Path | SensorSpec = "gelsight_mini"
     """Every sensor on it: name or path of a sensor file, or a specification."""
     joints: tuple[float, ...] | None = None
-    """Where an arm's joints start [rad]; None: the Panda's READY, another robot's own start."""
+    """Start of an arm's joints [rad]; None: the Panda's READY, another robot's own start."""
     opening: float | None = None
     """Gap between both pads at the start [m]; None: as wide as the gripper opens."""
     position: Vec3 = (0.0, 0.0, 0.0)
-    """Where a ``floating_gripper`` (point midway between the pads) or a ``fixed_sensor`` (pad frame) starts [m]."""
+    """Start of a ``floating_gripper`` (point midway between the pads) or a ``fixed_sensor`` (pad frame) [m]."""
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """How it is turned there, wxyz."""
+    """Orientation there, wxyz."""
     mounts: tuple[MountSpec, ...] = ()
     """Sensors of an MJCF robot."""
     arm_joints: tuple[str, ...] = ()
@@ -219,13 +219,13 @@ class TaskScene:
     robot: RobotSpec
     bodies: tuple[BodySpec, ...]
     physics: str | None = None
-    """One of ``raytac.specs.press.PHYSICS`` that the scene is meant for; None leaves it to the user."""
+    """Name of the physics that the scene is meant for (checked when a world is made); None leaves it to the user."""
     pad: str | None = None
     """One of ``raytac.specs.press.PADS``; None leaves it to the user."""
     timestep: float = 0.002
     """Of MuJoCo [s]."""
     soft_timestep: float = 0.01
-    """Of the simulated pads [s], a whole multiple of ``timestep``."""
+    """Of the soft pads [s], a whole multiple of ``timestep``."""
     control_timestep: float = 0.01
     """Of the robot's control [s], a whole multiple of ``timestep`` and of ``soft_timestep``."""
     coupling: str = "two_way"

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from raytac.specs.files import find_file, is_file, name_of
+from raytac.errors import SpecError
+from raytac.specs.files import available, find_file, is_file, name_of
+from raytac.specs.press import PressScene
+from raytac.specs.press_file import load_press
 from raytac.specs.shape_file import check_shape, resolved, unit_quaternion
 from raytac.specs.task import (
     BODY_SCHEMA,
@@ -21,7 +24,7 @@ from raytac.specs.task import (
 )
 from raytac.specs.toml import Schema, Table, Text, read_toml, split_unit
 
-__all__ = ["load_task"]
+__all__ = ["load_scene", "load_task"]
 
 _OWN: Final = {
     "panda_one_sensor": ("joints_deg",),
@@ -62,7 +65,7 @@ def load_task(name_or_path: str | Path) -> TaskScene:
     top = read_toml(path)
     values = top.read(TASK_SCHEMA, sections=("robot", "body"))
     if values["pad"] is not None and values["physics"] != "ipc":
-        raise top.error('is how finely a simulated pad is cut, so physics must be "ipc"', "pad", values["pad"])
+        raise top.error('is how finely a soft pad is cut, so physics must be "ipc"', "pad", values["pad"])
     robot = _read_robot(top.section("robot"))
     tables = top.sections("body")
     bodies = tuple(_read_body(table) for table in tables)
@@ -77,10 +80,10 @@ def _read_robot(table: Table) -> RobotSpec:
     if not own:
         if not model.endswith(".xml"):
             raise table.error("must be a robot that raytac builds, or the path of an .xml file", "model", model, ROBOTS)
-        found = resolved(table, model)
-        if not is_file(found):
-            raise table.error(f"the model file does not exist ({found})", "model", model)
-        values["model"] = str(found)
+        file = resolved(table, model)
+        if not is_file(file):
+            raise table.error(f"the model file does not exist ({file})", "model", model)
+        values["model"] = str(file)
     takes = _OWN[model if own else ""]
     for key in table.data:
         if key not in ("model", "sensor", *takes):
@@ -141,3 +144,23 @@ def _check_names(tables: tuple[Table, ...], bodies: tuple[BodySpec, ...]) -> Non
             raise table.error("another body has this name already", "name", body.name)
         if body.held_by is not None and body.held_by not in fixed:
             raise table.error("must be the name of a fixed body of the scene", "held_by", body.held_by, fixed)
+
+
+def load_scene(name_or_path: str | Path) -> PressScene | TaskScene:
+    """Read and check a press scene or a task scene, by its shipped name or by the path of a file.
+
+    A file with ``[robot]`` is a task.
+
+    Raises:
+        SpecError: a name that neither has (the message lists all); as ``load_press`` and ``load_task``.
+        MeshError: an object's mesh cannot be used.
+    """
+    presses, tasks = available("press scene"), available("task scene")
+    text = str(name_or_path)
+    if isinstance(name_or_path, str) and not text.endswith(".toml") and not set(text) & {"/", "\\"}:
+        if text not in (*presses, *tasks):
+            rule = "no shipped press or task of this name, and not a path to a .toml file"
+            raise SpecError(rule, key="scene", value=text, choices=(*presses, *tasks))
+        return load_task(text) if text in tasks else load_press(text)
+    path = find_file("press scene", name_or_path)
+    return load_task(path) if "robot" in read_toml(path).data else load_press(path)

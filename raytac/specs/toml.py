@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -103,9 +103,43 @@ class _Refused(Exception):
         self.choices = tuple(choices)
 
 
+class _Field:
+    """One field of a table, which is one value or a list of ``length`` values (``ANY``: one or more)."""
+
+    length: int = 0
+    default: Any = REQUIRED
+    choices: tuple[str, ...] = ()
+
+    def rule(self, unit: Unit) -> str:
+        """The rule that the values of a file obey, in words."""
+        raise NotImplementedError
+
+    def _one(self, value: object, unit: Unit) -> Any:
+        """One value of a file, checked and in SI."""
+        raise NotImplementedError
+
+    def refused(self, unit: Unit, choices: Sequence[str] = ()) -> _Refused:
+        return _Refused(self.rule(unit), choices)
+
+    def parse(self, value: object, unit: Unit) -> Any:
+        """The value of a file, checked and in SI; a list becomes a tuple."""
+        if not self.length:
+            return self._one(value, unit)
+        if not isinstance(value, list) or not value or self.length not in (ANY, len(value)):
+            raise self.refused(unit, self.choices)
+        return tuple(self._one(item, unit) for item in value)
+
+    def check(self, value: object, unit: Unit) -> None:
+        """Refuse a value in SI that no file could give."""
+        self.parse(list(value) if isinstance(value, tuple) else value, unit)
+
+
 @dataclass(frozen=True)
-class Number:
-    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval`` (in the unit of the file), or ``word`` in its place."""
+class Number(_Field):
+    """A real number, or ``length`` of them (``ANY``: one or more), in ``interval``.
+
+    ``interval`` is in the unit of the file. ``word`` is accepted in place of the number.
+    """
 
     interval: str
     length: int = 0
@@ -118,43 +152,32 @@ class Number:
 
     def rule(self, unit: Unit) -> str:
         many = "a list of numbers, each" if self.length == ANY else f"{self.length} numbers, each"
-        number = many if self.length else "a number"
         word = f', or "{self.word}"' if self.word else ""
-        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
+        return f"must be {many if self.length else 'a number'} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
 
     def parse(self, value: object, unit: Unit) -> float | str | tuple[float, ...]:
-        if self.word and isinstance(value, str) and value == self.word:
-            return self.word
-        if not self.length:
-            return self._one(value, unit)
-        if not isinstance(value, list) or len(value) != (max(len(value), 1) if self.length == ANY else self.length):
-            raise _Refused(self.rule(unit))
-        return tuple(self._one(v, unit) for v in value)
+        return self.word if self.word and value == self.word else super().parse(value, unit)
 
     def _one(self, value: object, unit: Unit) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _Refused(self.rule(unit))
+            raise self.refused(unit)
         try:
             number = float(value)
         except OverflowError:
-            raise _Refused(self.rule(unit)) from None
+            raise self.refused(unit) from None
         si = unit.to_si(number)
         if number not in self._range or si not in _in_si(self._range, unit):  # a tiny length may become 0 m
-            raise _Refused(self.rule(unit))
+            raise self.refused(unit)
         return si
 
     def check(self, value: object, unit: Unit) -> None:
-        """Refuse a value in SI that no file could give."""
         if self.word and isinstance(value, str) and value == self.word:
             return
-        interval = _in_si(self._range, unit)
-        for item in _items(value, self.length, self.rule(unit)):
-            if not is_number(item) or item not in interval:
-                raise _Refused(self.rule(unit))
+        _check_items(self, value, is_number, _in_si(self._range, unit), unit)
 
 
 @dataclass(frozen=True)
-class Integer:
+class Integer(_Field):
     """A whole number, or ``length`` of them, in ``interval``."""
 
     interval: str
@@ -165,30 +188,21 @@ class Integer:
         number = f"{self.length} whole numbers, each" if self.length else "a whole number"
         return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
 
-    def parse(self, value: object, unit: Unit) -> int | tuple[int, ...]:
-        if not self.length:
-            return self._one(value, unit)
-        if not isinstance(value, list) or len(value) != self.length:
-            raise _Refused(self.rule(unit))
-        return tuple(self._one(v, unit) for v in value)
-
     def _one(self, value: object, unit: Unit) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or value not in Interval.parse(self.interval):
-            raise _Refused(self.rule(unit))
+            raise self.refused(unit)
         return value
 
     def check(self, value: object, unit: Unit) -> None:
-        """Refuse a value that no file could give."""
-        interval = Interval.parse(self.interval)
-        for item in _items(value, self.length, self.rule(unit)):
-            if not is_whole(item) or item not in interval:
-                raise _Refused(self.rule(unit))
+        _check_items(self, value, is_whole, Interval.parse(self.interval), unit)
 
 
 @dataclass(frozen=True)
-class Text:
-    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words); or, with
-    ``length`` = ``ANY``, a list of one or more of them, none twice."""
+class Text(_Field):
+    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words).
+
+    With ``length`` = ``ANY``, a list of one or more of them, none twice.
+    """
 
     choices: tuple[str, ...] = ()
     pattern: str = r"(?s).+"
@@ -198,51 +212,25 @@ class Text:
 
     def rule(self, unit: Unit) -> str:
         if self.length:
-            return (
-                "must be a list of known names, none twice"
-                if self.choices
-                else f"must be a list, each {self.described}, none twice"
-            )
+            return f"must be a list{' of known names' if self.choices else f', each {self.described}'}, none twice"
         return "must be a known name" if self.choices else f"must be {self.described}"
 
     def parse(self, value: object, unit: Unit) -> str | tuple[str, ...]:
-        if not self.length:
-            return self._one(value, unit)
-        if not isinstance(value, list) or not value:
-            raise _Refused(self.rule(unit), self.choices)
-        words = tuple(self._one(item, unit) for item in value)
-        if len(set(words)) != len(words):
-            raise _Refused(self.rule(unit), self.choices)
+        words = super().parse(value, unit)
+        if self.length and len(set(words)) != len(words):
+            raise self.refused(unit, self.choices)
         return words
 
     def _one(self, value: object, unit: Unit) -> str:
         if not isinstance(value, str) or (self.choices and value not in self.choices):
-            raise _Refused(self.rule(unit), self.choices)
+            raise self.refused(unit, self.choices)
         if not re.fullmatch(self.pattern, value) or "\0" in value:
-            raise _Refused(self.rule(unit))
+            raise self.refused(unit)
         return value
-
-    def check(self, value: object, unit: Unit) -> None:
-        """Refuse a value that no file could give."""
-        self.parse(list(value) if isinstance(value, tuple) else value, unit)
-
-
-def _in_si(interval: Interval, unit: Unit) -> Interval:
-    """The same range in SI. Conversion is monotone, so that what lies in the range of the file lies in this one."""
-    return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
-
-
-def _items(value: object, length: int, rule: str) -> Sequence[Any]:
-    """The numbers of a field: one, or as many as ``length`` says."""
-    if not length:
-        return (value,)
-    if not isinstance(value, (tuple, list)) or (len(value) != length and not (length == ANY and value)):
-        raise _Refused(rule)
-    return value
 
 
 @dataclass(frozen=True)
-class Flag:
+class Flag(_Field):
     """``true`` or ``false``."""
 
     default: Any = REQUIRED
@@ -250,21 +238,35 @@ class Flag:
     def rule(self, unit: Unit) -> str:
         return "must be true or false"
 
-    def parse(self, value: object, unit: Unit) -> bool:
+    def _one(self, value: object, unit: Unit) -> bool:
         if not isinstance(value, bool):
-            raise _Refused(self.rule(unit))
+            raise self.refused(unit)
         return value
 
-    def check(self, value: object, unit: Unit) -> None:
-        """Refuse a value that no file could give."""
-        self.parse(value, unit)
+
+def _in_si(interval: Interval, unit: Unit) -> Interval:
+    """The same range in SI. Conversion is monotone, so that what lies in the range of the file lies in this one."""
+    return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
+
+
+def _check_items(spec: _Field, value: Any, is_kind: Callable[[object], bool], interval: Interval, unit: Unit) -> None:
+    """Refuse what is not one number of a kind in ``interval``, or as many of them as the field's ``length`` says."""
+    items: Sequence[Any] = (value,)
+    if spec.length:
+        if not isinstance(value, (tuple, list)) or (len(value) != spec.length and not (spec.length == ANY and value)):
+            raise spec.refused(unit)
+        items = value
+    if not all(is_kind(item) and item in interval for item in items):
+        raise spec.refused(unit)
 
 
 Schema = Mapping[str, Number | Integer | Text | Flag]
 
 
 def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
-    """Check values in SI, by name, against the schema of the table that describes them in a file; ``vars`` gives those of a dataclass.
+    """Check values in SI, by name, against the schema of the table that describes them in a file.
+
+    ``vars`` gives those of a dataclass.
 
     Thus a specification that was made or changed in code obeys the rules of one from a file. The default of a field needs no check.
 

@@ -1,4 +1,7 @@
-"""The page: buttons, sliders, images and figures around the 3-D view; forwards what users do and draws what the player tells."""
+"""The page: buttons, sliders, images and figures around the 3-D view.
+
+It forwards what users do, and draws what the player reports.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from raytac.view.colours import ColourScale, legend_html
-from raytac.view.picture import ARROW_SCALE, picture
 from raytac.view.player import Player, Status
-from raytac.view.scene_view import SceneView
+from raytac.view.scene_view import ColourScale, SceneView, legend_html
 from raytac.view.session import QUANTITIES, Control, PadView, Session, Snapshot
 
 if TYPE_CHECKING:
     from viser import GuiEvent, GuiSliderHandle, ViserServer
 
-__all__ = ["Page"]
+__all__ = ["ARROW_SCALE", "Page", "picture"]
 
 _MODES = {
     "starting": "computing the first image …",
@@ -46,7 +47,7 @@ class Page:
         self._drawing = threading.Lock()
         """One thread draws at a time: the player's, or that of a user who changed what is shown."""
         self._last: Snapshot | None = None
-        self._held: set[str] = set()
+        self._moved: set[str] = set()
         """Controls that users moved since the last play, step or reset: they stay where the users put them."""
         names = [name for name in QUANTITIES if any(name in pad.quantities for pad in session.pads)]
         self._scales = {name: ColourScale(QUANTITIES[name]) for name in names}
@@ -62,7 +63,7 @@ class Page:
 
         def command(event: GuiEvent[Any]) -> None:
             if event.target.value != "Pause":
-                self._held.clear()
+                self._moved.clear()
             if event.target.value == "Reset":
                 for scale in self._scales.values():
                     scale.reset()
@@ -79,7 +80,7 @@ class Page:
                 self._last = snapshot
                 self._draw(snapshot)
             if status.error:
-                self._held.clear()
+                self._moved.clear()
             rate = f", {status.states_per_s:.1f} states/s" if status.states_per_s else ""
             self._status.content = f"**{_MODES[status.mode]}**{rate}"
             self._error.visible = bool(status.error)
@@ -143,8 +144,8 @@ class Page:
         def moved(event: GuiEvent[Any]) -> None:
             if event.client is None:  # set by the page itself
                 return
-            self._held.discard(control.instead_of)
-            self._held.add(control.name)
+            self._moved.discard(control.instead_of)
+            self._moved.add(control.name)
             player.drive(control.name, slider.value)  # the value now: of many events the last one counts
 
         slider.on_update(moved)
@@ -186,7 +187,7 @@ class Page:
             slider, value = self._sliders[control.name], snapshot.controls.get(control.name)
             if (slider.min, slider.max) != (control.low, control.high):
                 slider.min, slider.max = control.low, control.high
-            if value is None or not np.isfinite(value) or control.name in self._held:
+            if value is None or not np.isfinite(value) or control.name in self._moved:
                 continue
             steps = round((min(max(value, control.low), control.high) - control.low) / control.step)
             slider.value = min(control.low + steps * control.step, control.high)
@@ -218,3 +219,42 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 def _boxed(text: str, colour: str) -> str:
     style = f"margin:0 1em;padding:0.5em;font-size:0.85em;border-left:3px solid {colour};color:{colour}"
     return f"<div style='{style}'>{html.escape(text)}</div>"
+
+
+ARROW_SCALE = 2.0
+"""Length of a drawn arrow over the marker's displacement, so that tenths of a pixel are seen."""
+_LEAST_WIDTH = 480
+"""Images are enlarged by a whole factor to at least this width [px], so that arrows are crisp."""
+_SHORTEST = 1.0
+"""Arrows of fewer enlarged pixels are drawn as dots."""
+_INK = (255, 220, 60)
+
+
+def picture(pad: PadView, *, arrows: bool) -> np.ndarray | None:
+    """8-bit image (H', W', 3) of the pad's sensor; None if it makes none. ``arrows``: where it has markers, over the image."""
+    if pad.rgb is None:
+        return None
+    factor = -(-_LEAST_WIDTH // pad.rgb.shape[1])
+    if not arrows or pad.markers_px is None:
+        return pad.rgb
+    from PIL import Image, ImageDraw
+
+    height, width = pad.rgb.shape[:2]
+    image = Image.fromarray(pad.rgb).resize((factor * width, factor * height), Image.Resampling.BILINEAR)
+    draw = ImageDraw.Draw(image)
+    rest, moved = pad.markers_px
+    starts, arrows_px = factor * rest, factor * ARROW_SCALE * moved
+    for (x, y), (dx, dy) in zip(starts, arrows_px, strict=True):
+        if not np.isfinite([x, y, dx, dy]).all():
+            continue
+        length = float(np.hypot(dx, dy))
+        if length < _SHORTEST:
+            draw.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=_INK)
+            continue
+        end = np.array([x + dx, y + dy])
+        draw.line([(x, y), (float(end[0]), float(end[1]))], fill=_INK, width=2)
+        along, across = np.array([dx, dy]) / length, np.array([-dy, dx]) / length
+        head = min(7.0, 0.5 * length)
+        tip = [end, end - head * along + 0.45 * head * across, end - head * along - 0.45 * head * across]
+        draw.polygon([(float(px), float(py)) for px, py in tip], fill=_INK)
+    return np.asarray(image)

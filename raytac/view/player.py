@@ -1,4 +1,4 @@
-"""``Player``: the one thread that runs a session, told what to do by any number of others."""
+"""``Player``: the one thread that runs a session, commanded by any number of others."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _SMOOTH = 0.8
 
 @dataclass(frozen=True)
 class Status:
-    """What the player is doing."""
+    """State of the player."""
 
     mode: str = "starting"
-    """``starting``, ``paused``, ``playing``, ``driving`` (on the way to where the controls ask) or ``stopped``."""
+    """``starting``, ``paused``, ``playing``, ``driving`` (moving to the targets of the controls) or ``stopped``."""
     states_per_s: float = 0.0
     """States computed, imaged and handed out a second, smoothed; 0 when nothing moves."""
     count: int = 0
@@ -37,7 +37,7 @@ class Player:
     """Runs a session in a thread of its own and hands every new state to ``show``.
 
     Commands return at once and may come from any thread, as often as they like: of many targets for a control that arrive while a state
-    is computed only the last one is driven to. What goes wrong is told in ``Status.error``; the thread lives on.
+    is computed only the last one is driven to. Errors are reported in ``Status.error``; the thread lives on.
 
     .. code-block:: python
 
@@ -69,7 +69,10 @@ class Player:
         self._thread.start()
 
     def close(self, patience: float | None = None) -> bool:
-        """End the thread after the state it is computing; returns whether it ended within ``patience`` seconds (None: however long)."""
+        """End the thread after the state it is computing; True if it ended within ``patience`` seconds.
+
+        None waits however long it takes.
+        """
         with self._wakeup:
             self._is_closing = True
             self._wakeup.notify()

@@ -11,7 +11,7 @@ import numpy as np
 
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
-from raytac.physics.base import ContactState
+from raytac.physics.base import PadReading
 from raytac.physics.soft.bodies import OBJECT, PAD
 from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import TactileSensor
@@ -42,7 +42,7 @@ _DEEPEST = 0.4
 """Share of the pad's thickness that the depth slider reaches, more if the scene goes deeper."""
 _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
 """Ends of the sliders for force [N], shear [mm] and twist [degrees], until the object goes beyond them."""
-_STATES = {"rigid": 20, "ipc": 10}
+_STATES, _SIMULATED_STATES = 20, 10
 """States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
 _SAG = 1e-5
 """How far the drawn facets of a curved object lie inside it [m]."""
@@ -83,7 +83,7 @@ class PressSession:
         self.lines = (*sensor_lines(sensor.spec), *self._coat_lines())
         self._held: dict[str, float] = {}
         """Controls that were moved and hold the object, in their own unit."""
-        self._states: Iterator[ContactState] = iter(())
+        self._states: Iterator[PadReading] = iter(())
         self.reset()
 
     # --- what a player asks ----------------------------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class PressSession:
         self._has_ended = False
         if self._sensor.markers is not None:
             self._sensor.reset_markers()
-        self._states = self._pad.run(_STATES[self._sensor.physics])
+        self._states = self._pad.run(_SIMULATED_STATES if isinstance(self._pad, SoftPad) else _STATES)
         self._state = next(self._states)
         self._start = self._state.pad_from_object[0]
         self._shot: Snapshot | None = None
@@ -249,7 +249,7 @@ class PressSession:
         if self._is_drivable:
             facts["depth"] = f"{1e3 * float(state.depth[0]):.3f} mm"
         facts["deepest imprint"] = f"{1e3 * float(np.nanmax(surface.indentation[0])):.3f} mm"
-        if frame.contact_area is not None:
+        if "contact_area" in frame.outputs:
             facts["contact area"] = f"{1e6 * float(frame.contact_area[0]):.2f} mm²"
         return facts
 

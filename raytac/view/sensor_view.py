@@ -1,4 +1,4 @@
-"""A sensor as the viewer draws it: gel block, case, lights and view of the camera once, its coat and image at every state."""
+"""Drawing of a sensor: gel block, case, lights and camera once, coat and image at every state."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ __all__ = [
 _MOST_VERTICES = 12_000
 """Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
 _CLEAR = 2e-5
-"""How far lines lie above the faces below them [m]."""
+"""Height of lines above the faces below them [m]."""
 MESH_COLOUR, MESH_WIDTH = (205, 212, 222), 0.8
-"""Of a simulated pad's own mesh over its smooth coat; the width on the screen [px]."""
+"""Of a soft pad's own mesh over its smooth coat; the width on the screen [px]."""
 _GEL, _CASE, _VIEW = (176, 205, 212), (105, 112, 122), (190, 150, 60)
 
 
@@ -58,33 +58,33 @@ def grid_faces(grid: PadGrid) -> np.ndarray:
 
 
 def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0) -> PadView:
-    """What the page draws of one environment's frame, with the coat at the nodes of ``grid`` (from ``strided``)."""
+    """View of one environment's frame, with the coat at the nodes of ``grid`` (from ``strided``)."""
     at, height = _places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
     x, y = np.meshgrid(grid.x, grid.y)
     values = {"indentation": (grid.rest - height).ravel()}
-    if frame.traction is not None:
+    if "traction" in frame.outputs:
         traction = frame.traction[env][at].reshape(-1, 3)
         values["pressure"], values["shear"] = -traction[:, 2], np.hypot(traction[:, 0], traction[:, 1])
     markers = None
-    if frame.markers is not None:
+    if "markers" in frame.outputs:
         markers = frame.markers.rest_px[env], frame.markers.displacement_px[env]
     return PadView(
         world_from_pad=world_from_pad,
         vertices=np.stack([x.ravel(), y.ravel(), height.ravel()], axis=1),
         values=values,
-        rgb=None if frame.rgb is None else frame.rgb[env],
+        rgb=frame.rgb[env] if "rgb" in frame.outputs else None,
         markers_px=markers,
-        wrench=None if frame.wrench is None else frame.wrench[env],
+        wrench=frame.wrench[env] if "wrench" in frame.outputs else None,
     )
 
 
 def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
-    """What to say of a contact that a simulated pad's cells cannot resolve; empty if they can."""
-    if frame.contact_cells is None or not frame.contact_cells[env] < LEAST_CELLS:
+    """Warning of a contact that the soft pad's cells cannot resolve; empty if they can."""
+    if "contact_cells" not in frame.outputs or not frame.contact_cells[env] < LEAST_CELLS:
         return ""
     cells = frame.contact_cells[env]
     return (
-        f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} the simulated pad is too stiff, "
+        f"The contact is {cells:.1f} cells across: below {LEAST_CELLS:g} the soft pad is too stiff, "
         "the force at a given depth too large, the depth under a given force too small."
     )
 
@@ -178,7 +178,7 @@ def _block(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lights(spec: SensorSpec) -> tuple[Solid, ...]:
-    found = []
+    lights = []
     for led in spec.lights.leds:
         u, v = np.asarray(led.edges)
         half_u, half_v = 0.5 * led.size[0] * u, 0.5 * led.size[1] * v
@@ -186,8 +186,8 @@ def _lights(spec: SensorSpec) -> tuple[Solid, ...]:
         faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
         power = np.asarray(led.power)
         red, green, blue = (round(60 + 195 * float(p)) for p in power / max(float(power.max()), 1e-12))
-        found.append(Solid(f"leds/{led.name}", corners, faces, (red, green, blue)))
-    return tuple(found)
+        lights.append(Solid(f"leds/{led.name}", corners, faces, (red, green, blue)))
+    return tuple(lights)
 
 
 def _box_edges(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:

@@ -1,27 +1,32 @@
-"""viser's server with a guard before it: requests of other pages are refused, and messages are checked before viser sees them."""
+"""viser's server behind a guard: addresses of the page, and checked messages.
+
+Requests of other pages are refused, and messages are checked before viser sees them.
+"""
 
 from __future__ import annotations
 
 import http
+import ipaddress
 import logging
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
+from math import dist, hypot, isfinite
 from types import FunctionType, ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
-from raytac.errors import BackendError
-from raytac.view.addresses import PageAddresses
-from raytac.view.messages import LARGEST, BadMessage, checked_message, one_line
+from raytac.errors import BackendError, InputError
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
-__all__ = ["guarded_server"]
+__all__ = ["LARGEST", "BadMessage", "PageAddresses", "checked_message", "guarded_server", "one_line"]
 
 _LOG = logging.getLogger("raytac.view")
 _FAULTS = (CloseCode.PROTOCOL_ERROR, CloseCode.INVALID_DATA, CloseCode.MESSAGE_TOO_BIG)
@@ -88,7 +93,7 @@ def _copied(function: Any, **names: Any) -> Any:
 
 
 def _overlaid(module: ModuleType, **names: Any) -> SimpleNamespace:
-    """What a module holds, with some names changed."""
+    """Contents of a module with some names replaced."""
     return SimpleNamespace(**{**vars(module), **names})
 
 
@@ -151,3 +156,168 @@ class _OneLine(logging.Filter):
 
 
 _LOG.addFilter(_OneLine())
+
+
+LARGEST = 2**16
+"""Longest message that is taken [bytes]; a camera takes 300."""
+_Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+"""Of a camera; not NaN. The 3-D view is some units large, whatever it shows."""
+_Vector = tuple[_Number, _Number, _Number]
+
+
+class BadMessage(ValueError):
+    """A message that no browser with this page sends."""
+
+
+class _Camera(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    """Fields as of viser's message of that name."""
+
+    wxyz: tuple[_Number, _Number, _Number, _Number]
+    position: _Vector
+    fov: _Number
+    near: _Number
+    far: _Number
+    image_height: Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+    image_width: Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+    look_at: _Vector
+    up_direction: _Vector
+
+    def __post_init__(self) -> None:
+        if dist(self.position, self.look_at) < 1e-6 or hypot(*self.up_direction) < 1e-6:
+            raise ValueError("a camera must look somewhere and have an up direction")
+
+
+class _Value(msgspec.Struct, forbid_unknown_fields=True):
+    """The only property of an element that a user sets; viser would let a browser set any."""
+
+    value: bool | float | str
+
+
+class _Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    uuid: str
+    updates: _Value
+
+
+_DECODER = msgspec.msgpack.Decoder(_Camera | _Update)
+
+
+def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
+    """The same message encoded again, from nothing but what was understood of it.
+
+    Args:
+        raw: as it came.
+        element: the element of a uuid, with its ``value``, and ``options`` or ``min`` and ``max`` if these say what it can be; None if
+            there is none (any more), which viser does not mind.
+
+    Raises:
+        BadMessage: no MessagePack, of another type, or not what its type or its element takes.
+    """
+    if isinstance(raw, str):
+        raise BadMessage("text instead of MessagePack")
+    try:
+        message = _DECODER.decode(raw)
+    except msgspec.DecodeError as error:
+        raise BadMessage(one_line(str(error))) from error
+    if isinstance(message, _Update):
+        target, value = element(message.uuid), message.updates.value
+        if target is not None and not _fits(target, value):
+            raise BadMessage(f"{str(value)[:40]!r} is no value of this element")
+    return msgspec.msgpack.encode(message)
+
+
+def one_line(text: str) -> str:
+    """The start of a text that may quote anything, without line breaks and whatever else commands a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text[:120])
+
+
+def _fits(target: Any, value: bool | float | str) -> bool:
+    options = getattr(target, "options", None)
+    if options is not None:
+        return value in options
+    if isinstance(target.value, bool) or isinstance(value, bool):
+        return isinstance(target.value, bool) and isinstance(value, bool)
+    if isinstance(target.value, str) or isinstance(value, str) or not isfinite(value):
+        return False
+    low, high = getattr(target, "min", value), getattr(target, "max", value)
+    slack = 1e-6 * (high - low)  # a slider's value is a sum of steps
+    return low - slack <= value <= high + slack
+
+
+_LOCAL = ("127.0.0.1", "localhost", "[::1]")
+_NAME = re.compile(r"(?!-)[a-z0-9_-]{1,63}(?<!-)(\.(?!-)[a-z0-9_-]{1,63}(?<!-))*", re.ASCII)
+_DEFAULT_PORTS = (80, 443)
+"""Browsers leave these out of an address."""
+
+
+class PageAddresses:
+    """Names and ports under which browsers may reach the page.
+
+    Any web page that a user opens may send requests to this machine. In the header ``Origin`` a browser names the page that a request
+    comes from, in ``Host`` the name that it asked for. The first shows another page; the second shows a foreign name whose owner has let
+    it point to this machine (DNS rebinding).
+    """
+
+    def __init__(self, host: str, allow_hosts: Sequence[str] = ()) -> None:
+        """Names for this machine, ``host``, and what is allowed beside.
+
+        Args:
+            host: address that is listened at.
+            allow_hosts: further names, as ``NAME`` or ``NAME:PORT`` (the port that the browser sees, where something forwards it); an
+                IPv6 address with a port stands in brackets.
+
+        Raises:
+            InputError: one that is no host name or address.
+        """
+        for name, value in (("host", host), *(("allow_host", value) for value in allow_hosts)):
+            if not isinstance(value, str):
+                raise InputError(name, value=value, rule="must be text")
+        if isinstance(allow_hosts, str):
+            raise InputError("allow_hosts", value=allow_hosts, rule="must be a list of names")
+        self._pairs: set[tuple[str, int | None]] = {(name, None) for name in (*_LOCAL, _bracketed(host.lower()))}
+        """Name and port; None is the port that is listened at."""
+        self._pairs |= {_split(text) for text in allow_hosts}
+
+    def refusal(self, hosts: Sequence[str], origins: Sequence[str], served_at: tuple[str, int]) -> str:
+        """Why a request is refused; empty if it is for this page, and from it.
+
+        Args:
+            hosts: all values of the request's header ``Host``.
+            origins: those of ``Origin``; a program that is no browser, and a browser that opens the page, send none.
+            served_at: address and port of this machine that the request came in at. The address itself is one of the page's own, since
+                no name was looked up to find it.
+        """
+        if len(hosts) != 1 or hosts[0].lower() not in self._own(served_at):
+            return f"Host {', '.join(hosts)!r} is not an address of this page; open {self.url(served_at)}, or allow it by --allow-host"
+        own = hosts[0].lower()
+        if origins and (len(origins) != 1 or origins[0].lower() not in (f"http://{own}", f"https://{own}")):
+            return f"Origin {', '.join(origins)!r} is another page"
+        return ""
+
+    def url(self, served_at: tuple[str, int]) -> str:
+        """Address that opens the page."""
+        return f"http://{_bracketed(served_at[0])}:{served_at[1]}"
+
+    def _own(self, served_at: tuple[str, int]) -> set[str]:
+        """Every value of ``Host`` that is this page's."""
+        pairs = {(name, port or served_at[1]) for name, port in (*self._pairs, (_bracketed(served_at[0]), None))}
+        return {f"{name}:{port}" for name, port in pairs} | {name for name, port in pairs if port in _DEFAULT_PORTS}
+
+
+def _split(text: str) -> tuple[str, int | None]:
+    """Name and port of ``NAME`` or ``NAME:PORT``, as browsers write them."""
+    whole = _bracketed(text.strip().lower())  # the end of a bare IPv6 address is no port
+    match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^\[\]:]+)(?::([0-9]{1,5}))?", whole)
+    name = _bracketed(match[1].strip("[]")) if match else ""
+    port = int(match[2]) if match and match[2] else None
+    if not (name.startswith("[") or _NAME.fullmatch(name)) or port == 0 or (port or 0) > 65535:
+        rule = "must be a host name or address, as in gpu3.example.org or gpu3.example.org:9000, without http:// and path"
+        raise InputError("allow_host", value=text, rule=rule)
+    return name, port
+
+
+def _bracketed(name: str) -> str:
+    """An IPv6 address as it stands in a URL; anything else as it is."""
+    try:
+        return f"[{ipaddress.IPv6Address(name).compressed}]"
+    except ValueError:
+        return name

@@ -1,4 +1,4 @@
-"""What the viewer needs of whatever it shows: the ``Session`` protocol and the plain data that goes through it.
+"""The ``Session`` protocol, which the viewer shows, and the plain data that goes through it.
 
 A session holds the physics and knows nothing of browsers; the page draws what a session hands out and knows nothing of physics. Lengths
 are in metres in the session's world frame unless a field says otherwise.
@@ -52,7 +52,7 @@ QUANTITIES = {
     "pressure": Quantity("normal traction [kPa]", 1e-3, 1.0),
     "shear": Quantity("shear traction [kPa]", 1e-3, 1.0),
 }
-"""What colours a coat; a session may hand out fewer."""
+"""Quantities that can colour a coat; a session may offer fewer."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Solid:
     colour: Colour
     opacity: float = 1.0
     hides_pads: bool = False
-    """Whether it lies over what pads feel; the page can make such solids see-through."""
+    """True if it covers the pads; the page can make such solids see-through."""
 
 
 @dataclass(frozen=True)
@@ -169,18 +169,18 @@ class Snapshot:
     reshaped: Mapping[str, np.ndarray] = field(default_factory=dict)
     """New vertices (V, 3) [m] of solids that deform."""
     controls: Mapping[str, float] = field(default_factory=dict)
-    """Where each control stands: what was asked for where one drives, else what is so."""
+    """Value of each control: the target where one drives, else the present value."""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Lines of the read-out, by label."""
     warning: str = ""
-    """What the user should know of this state; empty is nothing."""
+    """Warning about this state; empty if there is none."""
     time_ms: Mapping[str, float] = field(default_factory=dict)
     """Wall time of what was computed [ms]."""
 
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where the eye of the 3-D view starts, world frame [m]; z is up."""
+    """Start of the eye of the 3-D view, world frame [m]; z is up."""
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
@@ -197,7 +197,7 @@ class Session(Protocol):
     controls: tuple[Control, ...]
     """Their ends may move while the scene moves, their names not."""
     is_driven_at_rest: bool
-    """Whether a control that is moved moves the scene at once, though it is paused: True for what is quasi-static."""
+    """True if a moved control moves the scene at once although it is paused: for what is quasi-static."""
     solids: tuple[Solid, ...]
     lines: tuple[Lines, ...]
     pads: tuple[Pad, ...]

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from raytac.errors import BackendError, InputError
-from raytac.view.addresses import PageAddresses
 from raytac.view.page import Page
 from raytac.view.player import Player
+from raytac.view.server import PageAddresses
 from raytac.view.session import Session
 
 __all__ = ["Viewer", "check_address", "check_viewer"]
 
 _PATIENCE = 10.0
-"""How long the end waits for the state that is being computed [s]; the thread is a daemon and ends with the program at the latest."""
+"""Longest wait at the end for the state that is being computed [s]; the thread is a daemon and ends with the program."""
 
 
 def check_viewer() -> None:

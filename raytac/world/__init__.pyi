@@ -1,4 +1,6 @@
+from .environment_models import Variation as Variation
+from .pads import WORLD_PADS as WORLD_PADS
+from .pads import WorldPads as WorldPads
 from .scene_camera import SceneCamera as SceneCamera
-from .state import WorldState as WorldState
-from .variation import Variation as Variation
 from .world import TactileWorld as TactileWorld
+from .world_state import WorldState as WorldState

@@ -1,4 +1,4 @@
-"""From a task scene to one MuJoCo model: robot with its sensors, bodies, and where everything starts."""
+"""Composition of a task scene to one MuJoCo model: the robot with its sensors, bodies, and the start of all of them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.objects import object_parts
 from raytac.robots.arm import Arm
 from raytac.robots.gripper import floating_gripper
-from raytac.robots.mount import MountedSensor, mount_sensor
+from raytac.robots.mount import MountedSensor, RobotModel, mount_sensor
 from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
-from raytac.robots.pose import pose
-from raytac.se3 import quaternion, rotation_of
+from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import load_sensor
 from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, RobotSpec, TaskScene
 
-__all__ = ["ComposedBody", "ComposedScene", "compose", "pose_of"]
+__all__ = ["ComposedBody", "ComposedScene", "compose"]
 
 _GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -33,22 +32,22 @@ _GEOMS = {
     "plane": mujoco.mjtGeom.mjGEOM_PLANE,
 }
 _PLANE = (2.0, 2.0, 0.1)
-"""Half widths and grid spacing [m] that a half-space is drawn with; it has no end."""
+"""Half widths and grid spacing [m] of the picture of a half-space, which is unbounded."""
 _COLOUR = (0.72, 0.72, 0.7)
 _HARD = 0.2, 0.999
-"""Contacts of bodies that are rigid: ω Δt of their direct form, and its impedance d. Under a force F on a mass m they give way by
-(1 − d) F Δt² / (m 0.2²): a steel ball of 4 g under 1 N at 2 ms by 25 µm, where MuJoCo's default would by some tenths of a millimetre."""
+"""Contacts of rigid bodies: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
+(1 − d) F Δt² / (m 0.2²): 25 µm for a steel ball of 4 g under 1 N at 2 ms, some tenths of a millimetre with MuJoCo's default."""
 
 
 @dataclass(frozen=True)
 class ComposedBody:
-    """A body of the scene in the model."""
+    """Body of the scene in the model."""
 
     spec: BodySpec
     parts: tuple[Part, ...]
-    """Its shape, body frame [m]: what pads sense."""
+    """Shape that pads sense, body frame [m]."""
     index: int
-    """Body of the model."""
+    """Index of the body in the model."""
     mocap: int
     """Index into ``mocap_pos`` of a body that another simulator moves, else −1."""
     qpos: int
@@ -56,30 +55,30 @@ class ComposedBody:
 
     @property
     def is_free(self) -> bool:
-        """Whether MuJoCo moves it."""
+        """True if MuJoCo moves it."""
         return self.qpos >= 0
 
 
 @dataclass(frozen=True)
 class ComposedScene:
-    """A compiled scene and the names in it."""
+    """Compiled scene, and the indices of its parts."""
 
     scene: TaskScene
     model: mujoco.MjModel
     sensors: tuple[MountedSensor, ...]
     sensor_specs: tuple[SensorSpec, ...]
     arm: Arm | None
-    """The joints that move the robot's site; None where there are none."""
+    """Joints that move the robot's site; None without joints."""
     opening: int | None
-    """Actuator of the gap between two pads; None without."""
+    """Actuator of the gap between two pads; None without one."""
     fingers: np.ndarray
-    """Addresses in ``qpos`` of the joints whose sum is that gap; none without."""
+    """Addresses in ``qpos`` of the joints whose sum is that gap."""
     bodies: dict[str, ComposedBody]
     """Rigid bodies by name; soft ones are not MuJoCo's."""
     start: np.ndarray
     """Positions (nq,) at the start."""
     ctrl: np.ndarray
-    """Controls (nu,) at the start: the keyframe's, or with which position actuators hold what is there and motors are idle."""
+    """Controls (nu,) at the start: the keyframe's, or those with which position actuators keep the start and motors are idle."""
 
 
 def compose(scene: TaskScene, physics: str) -> ComposedScene:
@@ -96,8 +95,8 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
     spec.option.timestep = scene.timestep
     spec.option.gravity = scene.gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones have one coefficient for every direction; the noslip pass takes away the creep of MuJoCo's soft friction, which
-    # would let go of whatever is held for seconds.
+    # Elliptic cones have one coefficient for every direction. The noslip pass removes the creep of MuJoCo's soft friction, by which a
+    # grasped body slips within seconds.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.noslip_iterations = 4
@@ -111,7 +110,7 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
         if body.dynamics == "soft":
             if physics == "rigid":
                 choices = ("fixed", "free")
-                rule = "is for simulated pads, physics='ipc': with the rigid pad nothing deforms"
+                rule = "is for soft pads, physics='ipc': with the rigid pad nothing deforms"
                 raise SpecError(rule, file=scene.source, key=f"body[{i}].dynamics", value="soft", choices=choices)
             continue
         if spec.body(body.name) is not None:
@@ -136,40 +135,26 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
     return ComposedScene(scene, model, robot.sensors, specs, arm, opening, fingers, bodies, start, ctrl)
 
 
-def pose_of(position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
-    """Pose (4, 4) from a position [m] and a quaternion wxyz."""
-    return pose(rotation_of(quaternion), np.asarray(position, float))
-
-
-@dataclass(frozen=True)
-class _Robot:
-    spec: mujoco.MjSpec
-    sensors: tuple[MountedSensor, ...]
-    site: str
-    opening: str | None
-    joints: tuple[str, ...]
-
-
-def _robot(scene: TaskScene) -> tuple[_Robot, tuple[SensorSpec, ...]]:
+def _robot(scene: TaskScene) -> tuple[RobotModel, tuple[SensorSpec, ...]]:
     """The robot of a scene, not compiled, and the sensors on it."""
     robot = scene.robot
     sensor = robot.sensor if isinstance(robot.sensor, SensorSpec) else load_sensor(robot.sensor)
     if robot.model == "panda_one_sensor":
-        made = one_sensor_panda(sensor)
+        robot_model = one_sensor_panda(sensor)
     elif robot.model == "panda_two_fingers":
-        made = two_finger_panda(sensor)
+        robot_model = two_finger_panda(sensor)
     elif robot.model == "floating_gripper":
-        made = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
+        robot_model = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
     elif robot.model == "fixed_sensor":
         spec = mujoco.MjSpec()
         mounted = mount_sensor(spec, sensor, "world", pose_of(robot.position, robot.quaternion))
-        made = _Robot(spec, (mounted,), mounted.site, None, ())
+        robot_model = RobotModel(spec, (mounted,), mounted.site, None, ())
     else:
-        made = _own_robot(scene, robot, sensor)
-    return _Robot(made.spec, made.sensors, made.site, made.opening, tuple(made.joints)), (sensor,) * len(made.sensors)
+        robot_model = _own_robot(scene, robot, sensor)
+    return robot_model, (sensor,) * len(robot_model.sensors)
 
 
-def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot:
+def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> RobotModel:
     try:
         check_mjcf_size(robot.model)
         spec = mujoco.MjSpec.from_file(robot.model)
@@ -180,14 +165,14 @@ def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> _Robot
         raise SpecError("a robot from a file needs a sensor", file=scene.source, key="robot.mount")
     mounted = []
     for i, mount in enumerate(robot.mounts):
-        placed = None if mount.position is None else pose_of(mount.position, mount.quaternion)
+        placement = None if mount.position is None else pose_of(mount.position, mount.quaternion)
         try:
             kind = mount.kind if mount.kind in ("body", "site") else None
-            mounted.append(mount_sensor(spec, sensor, mount.at, placed, name=mount.name, kind=kind))  # type: ignore[arg-type]
+            mounted.append(mount_sensor(spec, sensor, mount.at, placement, name=mount.name, kind=kind))  # type: ignore[arg-type]
         except InputError as error:
             key = f"robot.mount[{i}].{error.name if error.name in ('at', 'name', 'kind') else 'position_mm'}"
             raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
-    return _Robot(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
+    return RobotModel(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
 
 
 def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
@@ -202,16 +187,16 @@ def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
 
 
 def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool) -> None:
-    made = spec.worldbody.add_body(name=body.name, pos=body.position, quat=body.quaternion, mocap=mirrored)
+    mjs_body = spec.worldbody.add_body(name=body.name, pos=body.position, quat=body.quaternion, mocap=mirrored)
     free = body.dynamics == "free" and not mirrored
     if free:
-        made.add_freejoint(name=f"{body.name}_free")
+        mjs_body.add_freejoint(name=f"{body.name}_free")
     density = body.density
     if free and body.mass is not None:
         density = body.mass / _mass(parts)
     friction = PAIR_FRICTION if body.friction is None else body.friction
     for i, part in enumerate(parts):
-        geom = _add_geom(spec, made, part, f"{body.name}_{i}")
+        geom = _add_geom(spec, mjs_body, part, f"{body.name}_{i}")
         geom.density = density
         geom.friction = (friction, 0.0, 0.0)
         geom.priority = 1
@@ -223,10 +208,10 @@ def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timest
 
 
 def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, name: str) -> mujoco.MjsGeom:
-    place = {"name": name, "pos": part.object_from_part[:3, 3], "quat": quaternion(part.object_from_part[:3, :3])}
+    placement = {"name": name, "pos": part.object_from_part[:3, 3], "quat": quaternion(part.object_from_part[:3, :3])}
     if part.kind in _GEOMS:
         size = _PLANE if part.kind == "plane" else (*part.size, 0.0, 0.0)[:3]
-        return body.add_geom(type=_GEOMS[part.kind], size=size, **place)
+        return body.add_geom(type=_GEOMS[part.kind], size=size, **placement)
     if part.kind == "mesh":
         vertices, faces = part.vertices, part.faces
     else:
@@ -236,11 +221,11 @@ def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, name: str) 
         vertices, faces = surface.vertices, surface.faces
     assert vertices is not None and faces is not None
     spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel(), userface=np.asarray(faces, np.int32).ravel())
-    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **place)
+    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **placement)
 
 
 def _mass(parts: Sequence[Part]) -> float:
-    """Mass of a shape of density 1 as MuJoCo reckons it [kg]."""
+    """Mass of a shape of density 1 by MuJoCo's formulas [kg]."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="body")
     for i, part in enumerate(parts):
@@ -305,7 +290,7 @@ def _fingers(model: mujoco.MjModel, opening: int | None) -> np.ndarray:
 
 
 def _balance_servos(model: mujoco.MjModel, start: np.ndarray, ctrl: np.ndarray) -> None:
-    """Set controls (nu,) of position servos so that at rest at ``start`` they give no force: g u + b₀ + b₁ l = 0 for the length l."""
+    """Set controls (nu,) of position servos to no force at rest at ``start``: g u + b₀ + b₁ l = 0 for the length l."""
     data = mujoco.MjData(model)
     data.qpos[:] = start
     mujoco.mj_fwdPosition(model, data)

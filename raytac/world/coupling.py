@@ -1,21 +1,21 @@
-"""Two-way coupling of MuJoCo and a contact solver that takes turns: forces that stay stable and passive between the solver's steps.
+"""Two-way coupling of MuJoCo and a contact solver in turns: forces that stay stable and passive between the solver's steps.
 
-MuJoCo moves links and bodies, the solver moves gels (and bodies of its own). Once every interval T the solver says which wrench w₀ each
-of MuJoCo's bodies bears where it is then. If w₀ were simply held for T, a light finger on a stiff contact would be thrown back and forth:
-staggered exchange is stable only while k T² / m is about 1 or less. So within the interval MuJoCo's steps feel
+MuJoCo moves links and bodies, the solver moves gels (and bodies of its own). Once every interval T the solver computes the wrench w₀ on
+each of MuJoCo's bodies at its present pose. If w₀ were constant over T, a light finger on a stiff contact would oscillate: staggered
+exchange is stable only while k T² / m is about 1 or less. So within the interval MuJoCo's steps apply
 
     w = w₀ − K Δ
 
-for every contact between two bodies: Δ is their relative displacement since w₀ was taken, and K is not less than the contact's true
-stiffness. At the end the solver says anew what w₀ is, so K has no part in the state that is settled in.
+for every contact between two bodies: Δ is their relative displacement since w₀ was computed, and K is not less than the contact's true
+stiffness. At the end the solver computes w₀ again, so that K has no part in a state at rest.
 
 *Passive*: let U be the contact's potential energy, with curvature of at most K. Then −w₀ Δ + ½ Δ K Δ ≥ U(x₀ + Δ) − U(x₀): in each interval
-MuJoCo spends at least what the contact stores, whatever T is, and the sum of both energies cannot grow. What K is too large by is lost,
-½ Δ (K − k) Δ an interval, like a drag. What a contact stores in the interval in which it is first made is not paid for: with a step h of
-MuJoCo between the last state without and the first with contact, that is up to ½ k (v h)².
+MuJoCo spends at least the energy that the contact stores, whatever T is, and the sum of both energies cannot grow. The excess of K over
+the true stiffness k dissipates ½ Δ (K − k) Δ an interval, like a drag. The energy of a contact in the interval in which it begins is not
+balanced: with a step h of MuJoCo between the last state without and the first with contact, that is up to ½ k (v h)².
 
-*Bodies that the solver moves* would be dragged along in the same way if they stood still in this law. So each has a stand-in for the
-interval: a rigid body of its mass with its velocity, that feels w₀, gravity, and the other side of each K.
+*Bodies that the solver moves* would be dragged along in the same way if they stood still in this law. So each is represented for the
+interval by a rigid body of its mass and velocity, on which w₀, gravity and the other side of each K act.
 
 *In time* the law is taken at the end of MuJoCo's step (backward Euler), for all contacts at once, with the inertia of the whole robot: with
 
@@ -26,85 +26,99 @@ so stiffness times mass ratio sets no limit to h. ``xfrc_applied`` carries w₀ 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.se3 import rotation_vector, rotations
+from raytac.se3 import rotation_vector, rotations, shifted_wrench
 
-__all__ = ["Coupling", "FreePartner", "Touching"]
+if TYPE_CHECKING:
+    from raytac.physics.soft.scene import SoftScene
+
+__all__ = ["STIFFENING", "CoupledContact", "Coupling", "CouplingInput", "SolverBody", "coupling_inputs"]
+
+STIFFENING = 2.0
+"""Stiffness assumed of a bonded soft body over that at rest: it stiffens as it is stretched, twisted or sheared (docs/coupling.md)."""
+_HARD = 2e5
+"""Stiffness of contact between bodies without gel [N/m], as hard as a gel's whole face (a guess)."""
 
 
 @dataclass(frozen=True)
-class FreePartner:
-    """A body that the solver moves, as it is at the beginning of an interval; world frame."""
+class SolverBody:
+    """Body that the solver moves, at the beginning of an interval; world frame."""
 
     mass: float
-    """[kg]."""
+    """Mass [kg]."""
     inertia: np.ndarray
-    """About its centre of mass [kg m²], (3, 3)."""
+    """Inertia about the centre of mass [kg m²], (3, 3)."""
     centre: np.ndarray
     """Centre of mass [m], (3,)."""
     velocity: np.ndarray
-    """Of the centre of mass [m/s] and about it [rad/s], (6,)."""
+    """Velocity of the centre of mass [m/s] and angular velocity [rad/s], (6,)."""
     wrench: np.ndarray
-    """All that acts on it, gravity too [N], and the torque about the centre of mass [N m], (6,)."""
+    """Sum of all forces on it, with gravity [N], and of their torques about the centre of mass [N m], (6,)."""
 
 
 @dataclass(frozen=True)
-class Touching:
-    """One contact between two bodies that can move, or one that can and one that stands still."""
+class CoupledContact:
+    """One contact between two bodies, of which at least one can move."""
 
     body: int | str
-    """A body of MuJoCo's by number, or a ``FreePartner`` by name."""
+    """Body of MuJoCo by its number, or a ``SolverBody`` by its name."""
     stiffness: np.ndarray
-    """K (6, 6), symmetric and positive semi-definite, world axes, for displacements [m] and turns [rad] about ``point``."""
+    """K (6, 6), symmetric and positive semi-definite, world axes, for displacements [m] and rotations [rad] about ``point``."""
     point: np.ndarray
-    """Place that K is about [m], world frame, (3,)."""
+    """Reference point of K [m], world frame, (3,)."""
     other: int | str | None = None
-    """The other side: likewise, or None for what stands still."""
-    push: np.ndarray | None = None
-    """Normal force on ``body`` that w₀ has [N], world frame, (3,): where K would make it pull, the contact opens. None: it never does."""
+    """The other side, likewise; None: it stands still."""
+    normal_force: np.ndarray | None = None
+    """Normal force on ``body`` in w₀ [N], world frame, (3,). The contact opens where K would make it negative. None: it never opens."""
     wrench: np.ndarray | None = None
-    """All that w₀ has of this contact, normal force and friction [N] on ``body`` and their torque about ``point`` [N m], (6,): what an open
-    contact takes with it. None: ``push`` alone. It is taken off at the point as it has moved by then, with the torque unchanged: wrong by
-    force × way, of second order in an interval."""
+    """Share of this contact in w₀: normal force and friction [N] on ``body`` and their torque about ``point`` [N m], (6,). It vanishes when
+    the contact opens. None: ``normal_force`` alone. It is removed at the displaced point with the torque unchanged: the error is force ×
+    displacement, of second order in an interval."""
 
     @property
     def released(self) -> np.ndarray:
-        """What an open contact takes off w₀, (6,)."""
+        """Change of w₀ when the contact opens, (6,)."""
         if self.wrench is not None:
             return -self.wrench
-        return np.concatenate([np.zeros(3) if self.push is None else -self.push, np.zeros(3)])
+        return np.concatenate([np.zeros(3) if self.normal_force is None else -self.normal_force, np.zeros(3)])
+
+
+CouplingInput = tuple[np.ndarray, list[CoupledContact], dict[str, SolverBody]]
+"""Wrenches (n, 6), contacts and solver bodies of one environment, as ``Coupling.update`` takes them."""
 
 
 @dataclass
 class _Interval:
-    """One environment between two answers of the solver."""
+    """One environment between two steps of the solver."""
 
     wrench: np.ndarray
-    contacts: Sequence[Touching] = ()
-    partners: dict[str, FreePartner] = field(default_factory=dict)
+    contacts: Sequence[CoupledContact] = ()
+    solver_bodies: dict[str, SolverBody] = field(default_factory=dict)
     anchors: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Of each contact: its point in the frame of its body and of the other one (or the world)."""
-    turns: list[np.ndarray] = field(default_factory=list)
-    """Of each contact: rotation of the body as seen from the other one."""
-    moved: dict[str, np.ndarray] = field(default_factory=dict)
-    """Of each partner: displacement and turn since the beginning, (6,)."""
+    """Point of each contact in the frame of its body and in that of the other one (or the world)."""
+    rotations: list[np.ndarray] = field(default_factory=list)
+    """Rotation of the body relative to the other one at the beginning, of each contact."""
+    displacement: dict[str, np.ndarray] = field(default_factory=dict)
+    """Displacement and rotation of each solver body since the beginning, (6,)."""
     speed: dict[str, np.ndarray] = field(default_factory=dict)
+    """Velocity of each solver body, (6,)."""
 
 
 class Coupling:
-    """What a contact solver does to MuJoCo's bodies between two of its steps.
+    """Wrenches of a contact solver on MuJoCo's bodies between two of its steps.
 
     .. code-block:: python
 
         coupling = Coupling(model, [finger_body], num_envs=1)
         coupling.update(data, 0, wrench, contacts)         # after each step of the solver
-        for _ in range(10):                                # MuJoCo's steps until the next one
+        for _ in range(10):                                # MuJoCo's steps until the solver's next one
             mujoco.mj_step1(model, data)
             control(data)
             coupling.apply(data, 0)
@@ -124,7 +138,7 @@ class Coupling:
         self._intervals = [_Interval(np.zeros((len(bodies), 6))) for _ in range(num_envs)]
 
     def reset(self, b: int, data: mujoco.MjData | None = None) -> None:
-        """No forces in environment ``b``; takes away what ``data`` still holds."""
+        """Remove all forces from environment ``b``, and from ``data`` if given."""
         self._intervals[b] = _Interval(np.zeros((len(self.bodies), 6)))
         if data is not None:
             data.xfrc_applied[list(self.bodies)] = 0.0
@@ -134,15 +148,15 @@ class Coupling:
         data: mujoco.MjData,
         b: int,
         wrench: np.ndarray,
-        contacts: Sequence[Touching] = (),
-        partners: dict[str, FreePartner] | None = None,
+        contacts: Sequence[CoupledContact] = (),
+        solver_bodies: dict[str, SolverBody] | None = None,
     ) -> None:
-        """Begin an interval of environment ``b`` with the solver's answer at ``data``'s present poses (after ``mj_kinematics``).
+        """Begin an interval of environment ``b`` with the solver's result at ``data``'s present poses (after ``mj_kinematics``).
 
         Args:
             wrench: w₀ on each body [N], [N m] about the body's frame origin, world axes, (n, 6).
-            contacts: what K acts between.
-            partners: the bodies that ``contacts`` name.
+            contacts: contacts with their bounds K.
+            solver_bodies: the solver's bodies that ``contacts`` name.
 
         Raises:
             InputError: a wrench of the wrong shape or not finite, or a contact whose sides are not known.
@@ -151,42 +165,42 @@ class Coupling:
             raise InputError(
                 "wrench", value=np.asarray(wrench).tolist(), rule=f"must be finite, of shape {(len(self.bodies), 6)}"
             )
-        partners = partners or {}
-        interval = _Interval(np.array(wrench, float), tuple(contacts), dict(partners))
+        solver_bodies = solver_bodies or {}
+        interval = _Interval(np.array(wrench, float), tuple(contacts), dict(solver_bodies))
         for contact in contacts:
             for side in (contact.body, contact.other):
                 if isinstance(side, int) and side not in self.bodies:
                     raise InputError("contacts", value=side, rule="must be between bodies that are coupled", choices=self.bodies)
-                if isinstance(side, str) and side not in partners:
-                    raise InputError("contacts", value=side, rule="must be the name of a partner", choices=partners)
+                if isinstance(side, str) and side not in solver_bodies:
+                    raise InputError("contacts", value=side, rule="must be the name of a solver body", choices=solver_bodies)
             turn, origin = self._frame(data, interval, contact.body)
             turn2, origin2 = self._frame(data, interval, contact.other)
             interval.anchors.append((turn.T @ (contact.point - origin), turn2.T @ (contact.point - origin2)))
-            interval.turns.append(turn2.T @ turn)
-        for name, partner in partners.items():
-            interval.moved[name], interval.speed[name] = np.zeros(6), partner.velocity.copy()
+            interval.rotations.append(turn2.T @ turn)
+        for name, body in solver_bodies.items():
+            interval.displacement[name], interval.speed[name] = np.zeros(6), body.velocity.copy()
         self._intervals[b] = interval
 
     def apply(self, data: mujoco.MjData, b: int) -> None:
         """Write ``xfrc_applied`` for the coming ``mj_step2``; after ``mj_step1`` and with the controls set."""
         interval, model = self._intervals[b], self.model
-        held = list(self.bodies)
-        data.xfrc_applied[held] = self._at_centre(data, interval.wrench)
+        bodies = list(self.bodies)
+        data.xfrc_applied[bodies] = self._at_centre(data, interval.wrench)
         if not interval.contacts:
             return
         h = model.opt.timestep
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         free = data.qvel + h * data.qacc_smooth
-        names = list(interval.partners)
-        inertia = [_inertia(partner) for partner in interval.partners.values()]
+        names = list(interval.solver_bodies)
+        inertia = [_inertia(body) for body in interval.solver_bodies.values()]
         free_speed = [
-            interval.speed[name] + h * np.linalg.solve(mass, interval.partners[name].wrench)
+            interval.speed[name] + h * np.linalg.solve(mass, interval.solver_bodies[name].wrench)
             for name, mass in zip(names, inertia, strict=True)
         ]
         count = len(interval.contacts)
-        jacobian, stand_in = np.zeros((6 * count, model.nv)), np.zeros((6 * count, 6 * len(names)))
-        away, stiffness, points = np.zeros(6 * count), np.zeros((6 * count, 6 * count)), []
+        jacobian, solver_jacobian = np.zeros((6 * count, model.nv)), np.zeros((6 * count, 6 * len(names)))
+        displacement, stiffness, points = np.zeros(6 * count), np.zeros((6 * count, 6 * count)), []
         for k, contact in enumerate(interval.contacts):
             rows = slice(6 * k, 6 * k + 6)
             points.append(self._point(data, interval, k))
@@ -194,78 +208,79 @@ class Coupling:
                 if isinstance(side, int):
                     jacobian[rows] += sign * self._jacobian(data, side, points[-1])
                 elif side is not None:
-                    at = 6 * names.index(side)
-                    stand_in[rows, at : at + 6] += sign * _lever(points[-1] - self._centre(interval, side))
-            away[rows] = self._displacement(data, interval, k)
+                    first = 6 * names.index(side)
+                    solver_jacobian[rows, first : first + 6] += sign * _point_jacobian(points[-1] - self._centre(interval, side))
+            displacement[rows] = self._displacement(data, interval, k)
             stiffness[rows, rows] = contact.stiffness
         solved = np.zeros((6 * count, model.nv))
         mujoco.mj_solveM(model, data, solved, jacobian)
         mobility, relative = jacobian @ solved.T, jacobian @ free
-        for at, mass in enumerate(inertia):
-            block = stand_in[:, 6 * at : 6 * at + 6]
+        for i, mass in enumerate(inertia):
+            block = solver_jacobian[:, 6 * i : 6 * i + 6]
             mobility = mobility + block @ np.linalg.solve(mass, block.T)
-            relative = relative + block @ free_speed[at]
-        c = _solve(interval.contacts, stiffness, mobility, away, relative, h)
-        extra = np.zeros((len(held), 6))
+            relative = relative + block @ free_speed[i]
+        c = _solve(interval.contacts, stiffness, mobility, displacement, relative, h)
+        correction = np.zeros((len(bodies), 6))
         for k, contact in enumerate(interval.contacts):
             for side, sign in ((contact.body, 1.0), (contact.other, -1.0)):
                 if isinstance(side, int):
-                    extra[held.index(side)] += sign * _moved_to(c[6 * k : 6 * k + 6], points[k], data.xpos[side])
-        data.xfrc_applied[held] = self._at_centre(data, interval.wrench + extra)
-        for at, (name, mass) in enumerate(zip(names, inertia, strict=True)):
-            interval.speed[name] = free_speed[at] + h * np.linalg.solve(mass, stand_in[:, 6 * at : 6 * at + 6].T @ c)
-            interval.moved[name] = interval.moved[name] + h * interval.speed[name]
+                    correction[bodies.index(side)] += sign * shifted_wrench(c[6 * k : 6 * k + 6], points[k] - data.xpos[side])
+        data.xfrc_applied[bodies] = self._at_centre(data, interval.wrench + correction)
+        for i, (name, mass) in enumerate(zip(names, inertia, strict=True)):
+            interval.speed[name] = free_speed[i] + h * np.linalg.solve(mass, solver_jacobian[:, 6 * i : 6 * i + 6].T @ c)
+            interval.displacement[name] = interval.displacement[name] + h * interval.speed[name]
 
     def _at_centre(self, data: mujoco.MjData, wrench: np.ndarray) -> np.ndarray:
-        """Wrenches (n, 6) about the bodies' origins, as MuJoCo takes them: about their centres of mass."""
+        """Wrenches (n, 6) about the bodies' centres of mass, as MuJoCo takes them, from those about their origins."""
         arm = data.xpos[list(self.bodies)] - data.xipos[list(self.bodies)]
-        return np.concatenate([wrench[:, :3], wrench[:, 3:] + np.cross(arm, wrench[:, :3])], axis=1)
+        return shifted_wrench(wrench, arm)
 
     @staticmethod
     def _frame(data: mujoco.MjData, interval: _Interval, side: int | str | None) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (3, 3) and origin (3,) of a side as it is now: of a partner, with its own axes along the world's at the beginning."""
+        """Present rotation (3, 3) and origin (3,) of a side; the axes of a solver body are the world's at the beginning."""
         if isinstance(side, int):
             return data.xmat[side].reshape(3, 3), data.xpos[side]
         if side is None:
             return np.eye(3), np.zeros(3)
-        moved = interval.moved.get(side, np.zeros(6))
-        return rotations(moved[None, 3:])[0], interval.partners[side].centre + moved[:3]
+        displacement = interval.displacement.get(side, np.zeros(6))
+        return rotations(displacement[3:]), interval.solver_bodies[side].centre + displacement[:3]
 
     def _point(self, data: mujoco.MjData, interval: _Interval, k: int) -> np.ndarray:
         turn, origin = self._frame(data, interval, interval.contacts[k].body)
         return origin + turn @ interval.anchors[k][0]
 
     def _displacement(self, data: mujoco.MjData, interval: _Interval, k: int) -> np.ndarray:
-        """Of the body against the other side since the beginning, at the contact's point, world axes (6,)."""
+        """Displacement (6,) of the body relative to the other side since the beginning, at the contact's point, world axes."""
         contact = interval.contacts[k]
         turn, _ = self._frame(data, interval, contact.body)
         turn2, origin2 = self._frame(data, interval, contact.other)
-        way = self._point(data, interval, k) - (origin2 + turn2 @ interval.anchors[k][1])
-        return np.concatenate([way, turn2 @ rotation_vector(turn2.T @ turn @ interval.turns[k].T)])
+        displacement = self._point(data, interval, k) - (origin2 + turn2 @ interval.anchors[k][1])
+        return np.concatenate([displacement, turn2 @ rotation_vector(turn2.T @ turn @ interval.rotations[k].T)])
 
     def _jacobian(self, data: mujoco.MjData, body: int, point: np.ndarray) -> np.ndarray:
-        found = np.zeros((6, self.model.nv))
-        mujoco.mj_jac(self.model, data, found[:3], found[3:], point, body)
-        return found
+        jacobian = np.zeros((6, self.model.nv))
+        mujoco.mj_jac(self.model, data, jacobian[:3], jacobian[3:], point, body)
+        return jacobian
 
     @staticmethod
     def _centre(interval: _Interval, name: str) -> np.ndarray:
-        return interval.partners[name].centre + interval.moved[name][:3]
+        return interval.solver_bodies[name].centre + interval.displacement[name][:3]
 
 
 def _solve(
-    contacts: Sequence[Touching], stiffness: np.ndarray, mobility: np.ndarray, away: np.ndarray, relative: np.ndarray, h: float
+    contacts: Sequence[CoupledContact],
+    stiffness: np.ndarray,
+    mobility: np.ndarray,
+    displacement: np.ndarray,
+    relative: np.ndarray,
+    h: float,
 ) -> np.ndarray:
-    """c of all contacts, (6 n,): those that would pull open, and lose what w₀ has of them too."""
+    """c of all contacts, (6 n,). A contact that would pull opens, and loses its share of w₀ too."""
     closed, fixed = np.ones(len(contacts), bool), np.zeros(6 * len(contacts))
     while True:
-        shut = np.repeat(closed, 6)
-        rows = stiffness * shut[:, None]
-        c = np.linalg.solve(np.eye(len(fixed)) + h * h * rows @ mobility, fixed - rows @ (away + h * relative))
-        pulls = [
-            bool(closed[k]) and contact.push is not None and float((c[6 * k : 6 * k + 3] + contact.push) @ contact.push) < 0.0
-            for k, contact in enumerate(contacts)
-        ]
+        rows = stiffness * np.repeat(closed, 6)[:, None]
+        c = np.linalg.solve(np.eye(len(fixed)) + h * h * rows @ mobility, fixed - rows @ (displacement + h * relative))
+        pulls = [bool(closed[k]) and _pulls(contact, c[6 * k : 6 * k + 3]) for k, contact in enumerate(contacts)]
         if not any(pulls):
             return c
         for k in np.flatnonzero(pulls).tolist():
@@ -273,20 +288,95 @@ def _solve(
             fixed[6 * k : 6 * k + 6] = contacts[k].released
 
 
-def _inertia(partner: FreePartner) -> np.ndarray:
-    found = np.zeros((6, 6))
-    found[:3, :3], found[3:, 3:] = partner.mass * np.eye(3), partner.inertia
-    return found
+def _pulls(contact: CoupledContact, change: np.ndarray) -> bool:
+    """True if the normal force, changed by a force (3,) [N], pulls."""
+    normal_force = contact.normal_force
+    return normal_force is not None and float((change + normal_force) @ normal_force) < 0.0
 
 
-def _lever(arm: np.ndarray) -> np.ndarray:
-    """Motion (6, 6) of a point at ``arm`` from the centre of a rigid body, from the body's: v + ω × arm, ω."""
+def _inertia(body: SolverBody) -> np.ndarray:
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3], matrix[3:, 3:] = body.mass * np.eye(3), body.inertia
+    return matrix
+
+
+def _point_jacobian(arm: np.ndarray) -> np.ndarray:
+    """Matrix (6, 6) from a rigid body's velocity (v, ω) to that of its point at ``arm`` from the centre: (v + ω × arm, ω)."""
     x, y, z = arm
-    found = np.eye(6)
-    found[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-    return found
+    matrix = np.eye(6)
+    matrix[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    return matrix
 
 
-def _moved_to(wrench: np.ndarray, point: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """A wrench (6,) about ``point``, about ``origin``."""
-    return np.concatenate([wrench[:3], wrench[3:] + np.cross(point - origin, wrench[:3])])
+def coupling_inputs(scene: SoftScene, links: Mapping[str, int]) -> list[CouplingInput]:
+    """Input of ``Coupling.update`` for every environment, after a step of ``scene``.
+
+    Args:
+        links: MuJoCo's body under the frame of every pad and driven body that MuJoCo moves, by name; the order is that of the
+            wrenches. Driven bodies that are not named stand still.
+    """
+    wrench = np.stack([scene.wrench(name) if name in scene.pads else scene.body_wrench(name) for name in links], axis=1)
+    pressing = scene.world.pressing()
+    bounds = {name: scene.stiffness(name) for name in scene.pads if any(name in pair for pair in pressing)}
+    touched = {name: body for name, body in scene.bodies.items() if any(name in pair for pair in pressing)}
+    free = {name: _free_bodies(scene, name) for name, body in touched.items() if not body.is_driven}
+    bonded = [name for name, body in touched.items() if body.is_driven and body.is_soft]
+    inputs: list[CouplingInput] = []
+    for b in range(scene.num_envs):
+        contacts, solver_bodies = [], {name: motions[b] for name, motions in free.items()}
+        for name in bonded:
+            _add_bonded_patch(scene, name, b, contacts, solver_bodies)
+        for (one, two), contact in pressing.items():
+            if one == two:  # folds of one gel
+                continue
+            sides = [links.get(name, name if name in solver_bodies else None) for name in (one, two)]
+            if not contact.normal[b].any() or sides == [None, None] or (None in sides and any(side in bonded for side in sides)):
+                continue
+            first, other, sign = sides[0], sides[1], 1.0
+            if first is None:
+                first, other, sign = sides[1], None, -1.0
+            pads = [bounds[name][b] for name in (one, two) if name in bounds]
+            stiffness = _weakest(pads) if pads else np.diag([_HARD] * 3 + [0.0] * 3)
+            assert first is not None
+            contacts.append(
+                CoupledContact(first, stiffness, contact.place[b], other, sign * contact.normal[b], sign * contact.wrench[b])
+            )
+        inputs.append((wrench[b], contacts, solver_bodies))
+    return inputs
+
+
+def _weakest(bounds: list[np.ndarray]) -> np.ndarray:
+    """Smallest bound: two pads in contact are springs in series, so the bound of either holds for both."""
+    return min(bounds, key=np.trace)
+
+
+def _add_bonded_patch(
+    scene: SoftScene, name: str, b: int, contacts: list[CoupledContact], solver_bodies: dict[str, SolverBody]
+) -> None:
+    """Add a bonded soft body: its patch in contact as a rigid body on a spring, which is the body's stiffness at that patch.
+
+    The forces on the patch are in balance; its inertial force is neglected.
+    """
+    patch = scene.world.held_patch(name, b)
+    if patch is None:
+        return
+    solver_bodies[name] = SolverBody(patch.mass, patch.inertia, patch.centre, patch.velocity, np.zeros(6))
+    contacts.append(CoupledContact(name, STIFFENING * patch.stiffness, patch.centre))
+
+
+def _free_bodies(scene: SoftScene, name: str) -> list[SolverBody]:
+    """A free body of the solver in every environment."""
+    motion, gravity = scene.world.rigid_motion(name), scene.gravity
+    wrench = scene.body_wrench(name)
+    force = wrench[:, :3] + motion.mass * gravity
+    torque = wrench[:, 3:] + np.cross(scene.pose(name)[:, :3, 3] - motion.centre, wrench[:, :3])
+    return [
+        SolverBody(
+            motion.mass,
+            motion.inertia[b],
+            motion.centre[b],
+            np.concatenate([motion.velocity[b], motion.spin[b]]),
+            np.concatenate([force[b], torque[b]]),
+        )
+        for b in range(scene.num_envs)
+    ]

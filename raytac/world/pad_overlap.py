@@ -1,4 +1,4 @@
-"""Overlap of a body and a resting pad, found on a grid of nodes, and the load law that goes with it; all environments at once."""
+"""Overlap of a body and a resting pad on a grid of nodes, and its load law; all environments at once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Touches:
     """Overlaps of one body and one resting pad in n environments that touch, pad frame."""
 
     env: np.ndarray
-    """Which of the poses given, (n,), ascending."""
+    """Indices of the poses that touch, (n,), ascending."""
     depth: np.ndarray
     """Greatest overlap [m], (n,)."""
     centre: np.ndarray
@@ -48,12 +48,12 @@ class Touches:
     """Up to where each ``gap`` is known [m], (n,)."""
 
     def known_depth(self, k: int) -> float:
-        """Depth [m] up to which a load law of the k-th can be told from its gap: that law counts what is nearer than half the depth."""
+        """Depth [m] up to which a load law of the k-th follows from its gap: that law uses nodes within half the depth."""
         return 2.0 * float(self.depth[k] + self.clear[k])
 
 
 class PadOverlap:
-    """One pad at rest; bodies are held against it."""
+    """One pad at rest, with which bodies are overlapped."""
 
     def __init__(self, gelpad: GelpadSpec) -> None:
         self._gelpad = gelpad
@@ -62,7 +62,7 @@ class PadOverlap:
         self.highest = self._grids[-1].highest
 
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
-        """How a body at poses (B, 4, 4) overlaps the pad. ``radius`` [m] of a ball about the body's origin that holds it."""
+        """Overlaps of a body at poses (B, 4, 4) with the pad; ``radius`` [m]: bounding ball about the body's origin."""
         found: list[Touches] = []
         ball, last = _Ball(pad_from_body, radius), len(self._grids) - 1
         following = self._first_grid(ball)
@@ -109,7 +109,7 @@ class _Ball:
     """[m], inf for a half-space."""
 
     def reach(self, below: float) -> np.ndarray:
-        """How far from their centres along x and y what is lower than ``below`` [m] can be [m], (n,)."""
+        """Greatest distance along x and y from the balls' centres to points lower than ``below`` [m], (n,) [m]."""
         above = np.maximum(self.pad_from_body[:, 2, 3] - below, 0.0)
         return np.sqrt(np.maximum(self.radius**2 - above * above, 0.0))
 
@@ -148,7 +148,7 @@ class _Nodes:
         ]
 
     def windows(self, ball: _Ball) -> list[tuple[np.ndarray, int]]:
-        """Which of the balls need a window of which of ``_WINDOWS``, by its place there, for what ``gaps`` shows."""
+        """Balls by the window that they need in ``gaps``: their rows, and the index of the window into ``_WINDOWS``."""
         need = 2.0 / self.pitch * ball.reach(self.highest + self.near) + 2.0
         size = _WINDOWS.searchsorted(need)
         return [(np.flatnonzero(size == one), one) for one in sorted(set(size.tolist()))]

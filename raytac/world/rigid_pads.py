@@ -1,21 +1,21 @@
-"""Rigid pads in a MuJoCo world: contact by geometry and load law, as in a press, handed to MuJoCo as one compliant contact a body.
+"""Rigid pads in a MuJoCo world: contact by geometry and load law, as in a press, given to MuJoCo as one compliant contact a body.
 
-MuJoCo's own collision would meet the gel with a convex hull of what touches it and with a number of points that sets the stiffness. Here
-contact is found as ``RigidPad`` finds it: from the overlap of the resting gel with the body's underside. Of that overlap, seen as an
-elastic foundation, one contact is made and put among MuJoCo's own:
+MuJoCo's own collision uses a convex hull of the body, and its number of contact points sets the stiffness. Here contact is computed as in
+``RigidPad``, from the overlap of the resting gel with the body's underside. That overlap, as an elastic foundation, gives one contact
+among MuJoCo's own:
 
 - depth δ: the greatest overlap;
-- place: the overlap's centroid, so that a flat face that tilts is pushed back by the edge that sinks in;
-- normal: the gel's there. Its line goes through the centre of a ball wherever on the dome the ball lies;
+- position: the overlap's centroid, so that a tilted flat face is pushed back at the edge that is deepest;
+- normal: that of the gel at this position. Its line goes through the centre of a ball anywhere on the dome;
 - stiffness: F(δ) / δ of the load law of this body at this place, by ``solref`` in direct form;
-- friction: Coulomb's; about the normal 3π/16 μ a with a the contact's radius (Hertz contact that slips as a whole, as in a press); against
-  rolling 3/16 α a (J. A. Greenwood, H. Minshall, D. Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259,
+- friction: Coulomb's; torsional 3π/16 μ a with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling
+  3/16 α a (J. A. Greenwood, H. Minshall, D. Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259,
   1961) with α the share of energy that the gel loses.
 
 MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad carries a tangential force without shearing first.
 
-All environments go in lock-step: in every step of MuJoCo the contacts of all of them are found at once, and MuJoCo is called for one after
-the other, since its own share of the time is small (docs/rl.md, Speed).
+All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other,
+since its share of the time is small (docs/rl.md, Speed).
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.load_law import LoadLaw
+from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
-from raytac.robots.pose import body_poses, site_poses
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
-from raytac.world.bonded_face import BondedFace
 from raytac.world.compose import ComposedScene
+from raytac.world.environment_models import EnvironmentModels
+from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.pad_overlap import PadOverlap, Touches
-from raytac.world.state import Drive, lost
-from raytac.world.variation import EnvironmentModels
+from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
 
 _HYSTERESIS = 0.1
 """α, share of the energy that the gel loses in a cycle: a guess; silicone elastomers lose some per cent to some tens of per cent."""
 _RATE = 0.2
-"""Greatest ω Δt of a contact: ω = √s with s the direct form's stiffness. What the true contact has beyond it is taken off by the
-impedance d, which keeps the force at rest: K = s / ((1 − d) A)."""
+"""Greatest ω Δt of a contact: ω = √s with s the direct form's stiffness. A stiffer contact gets a smaller impedance d, which keeps the
+force at rest: K = s / ((1 − d) A)."""
 _SLIP_RATE = 0.5
 """Rate at which friction takes away sliding, per step of MuJoCo."""
 
@@ -58,7 +58,7 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class _Pad:
-    """One sensor's pad: where contact is looked for, and where it is shown."""
+    """Pad of one sensor, with the geometry of its contact search."""
 
     def __init__(self, mounted: MountedSensor, spec: SensorSpec, model: mujoco.MjModel) -> None:
         self.mounted, self.spec = mounted, spec
@@ -75,7 +75,7 @@ _PadPoses = tuple[str, _Pad, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class _Contact:
-    """A pad's contact among MuJoCo's."""
+    """Contact of a pad among MuJoCo's."""
 
     env: int
     sensor: str
@@ -85,7 +85,12 @@ class _Contact:
 class RigidPads:
     """All pads of a world, B environments; MuJoCo moves every body."""
 
-    def __init__(self, composed: ComposedScene, models: EnvironmentModels, num_envs: int) -> None:
+    soft = None
+    meshes: tuple[str, ...] = ()
+
+    def __init__(self, composed: ComposedScene, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
+        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here."""
+        num_envs = len(datas)
         self.composed, self.model, self._models = composed, composed.model, models
         self.pads = {
             mounted.name: _Pad(mounted, spec, composed.model)
@@ -215,7 +220,7 @@ class RigidPads:
         surface = without_pierced(self._shown[name][1].surface(height, poses), pad.spec.gelpad)
         failed = np.isnan(surface.height[:, 0, 0])
         wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
-        return PadReading(surface, wrench, failed, lambda: _traction(surface, wrench))
+        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench))
 
     def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
         """Every pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
@@ -224,7 +229,7 @@ class RigidPads:
             yield name, pad, world_from_pad[:, k], _relative(world_from_pad[:, k, None], world_from_body)
 
     def _near(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
-        """Which bodies at poses (n, bodies, 4, 4) may reach the pad's box, (n, bodies)."""
+        """True (n, bodies) where bodies at poses (n, bodies, 4, 4) may reach the pad's box."""
         at, radius = pad_from_body[..., :3, 3], self._radius
         near = (at[..., 2] - radius < pad.highest) & (np.abs(at[..., :2]) - radius[:, None] < pad.reach).all(axis=-1)
         if len(self._planes):
@@ -235,7 +240,7 @@ class RigidPads:
         return near
 
     def _pierced(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
-        """Which bodies at poses (n, bodies, 4, 4) lie beyond the pad's bonded face, (n, bodies)."""
+        """True (n, bodies) where bodies at poses (n, bodies, 4, 4) lie beyond the pad's bonded face."""
         result = self._near(pad, pad_from_body)
         for i, body in enumerate(self.bodies):
             rows = np.flatnonzero(result[:, i])
@@ -294,14 +299,14 @@ class RigidPads:
         return found
 
     def _law(self, env: int, name: str, i: int, touches: Touches, k: int) -> LoadLaw:
-        """Load law of a pad and a body: the k-th that touch, unless it was told before in this control step and reaches as deep."""
+        """Load law of a pad and a body, the k-th in contact; reused within a control step while it covers the depth."""
         known = self._laws[env].get((name, i))
         if known is None or touches.depth[k] > known[1]:
             known = self._laws[env][name, i] = self.pads[name].overlap.law(touches, k), touches.known_depth(k)
         return known[0]
 
     def _form(self, name: str, i: int) -> mujoco.MjContact:
-        """What all contacts between a pad and a body have in common."""
+        """Common part of all contacts between a pad and a body."""
         contact, gel = mujoco.MjContact(), self.pads[name].gel
         contact.includemargin, contact.dim, contact.exclude = 0.0, 6, 0
         contact.solreffriction[:] = 0.0, -_SLIP_RATE / float(self.model.opt.timestep)
@@ -367,7 +372,7 @@ def _frames(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:
-    """The pads' totals shared out over their contacts (see ``foundation_traction``)."""
+    """Total forces of the pads distributed over their contacts (see ``foundation_traction``)."""
     x, y = np.nan_to_num(surface.contact_centre).T
     twist = wrench[:, 5] - (x * wrench[:, 1] - y * wrench[:, 0])
     return foundation_traction(surface, wrench[:, :3], twist)

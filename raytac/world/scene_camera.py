@@ -1,4 +1,4 @@
-"""Pictures of a world by MuJoCo's own renderer: the robot and the bodies, not what a sensor's camera sees."""
+"""Pictures of a world by MuJoCo's renderer: the robot and the bodies, not the image of a sensor."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
 
 
 class SceneCamera:
-    """A camera that stands still in every environment of a world.
+    """Camera at a fixed pose in every environment of a world.
 
     Needs OpenGL without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
-    With simulated pads the gel is not drawn, since MuJoCo does not have it.
+    Soft pads are not drawn, since MuJoCo does not have their gel.
     """
 
     def __init__(
@@ -38,20 +38,20 @@ class SceneCamera:
         """Open the renderer.
 
         Args:
-            world: whose model and states are drawn; the brightness of its model's headlight is raised, which only pictures show.
+            world: world to draw. The headlight of its model is made brighter, which only pictures show.
             resolution: (width, height) [px], at most 640 x 480.
-            distance: from what is looked at [m].
-            azimuth, elevation: of the view [°].
-            lookat: the point (3,) that is looked at [m]; None is the middle of the pads as they are now.
+            distance: from the camera to ``lookat`` [m].
+            azimuth, elevation: direction of the view [°].
+            lookat: point (3,) in the centre of the picture [m]; None is the mean position of the pads.
 
         Raises:
             InputError: a resolution out of range.
             BackendError: there is no OpenGL here.
         """
         width, height = resolution
-        most = world.model.vis.global_.offwidth, world.model.vis.global_.offheight
-        if not (1 <= width <= most[0] and 1 <= height <= most[1]):
-            raise InputError("resolution", value=resolution, rule=f"must be from 1x1 to {most[0]}x{most[1]} pixels")
+        largest = world.model.vis.global_.offwidth, world.model.vis.global_.offheight
+        if not (1 <= width <= largest[0] and 1 <= height <= largest[1]):
+            raise InputError("resolution", value=resolution, rule=f"must be from 1x1 to {largest[0]}x{largest[1]} pixels")
         self.world, self.resolution = world, (width, height)
         light = world.model.vis.headlight
         light.ambient[:], light.diffuse[:] = 0.35, 0.6
@@ -67,7 +67,7 @@ class SceneCamera:
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
 
     def draw(self, env: int = 0, points: Sequence[np.ndarray] = ()) -> np.ndarray:
-        """8-bit picture (H, W, 3) of an environment as it is; ``points`` (3,) [m] are marked by small green balls.
+        """8-bit picture (H, W, 3) of the present state of an environment; small green balls mark ``points`` (3,) [m].
 
         Raises ``InputError`` for an environment that does not exist.
         """

@@ -1,7 +1,7 @@
-"""Simulated pads in a MuJoCo world: one contact solver for all gels and what touches them, MuJoCo for robot and the rest.
+"""Soft pads in a MuJoCo world: one contact solver for all gels and the bodies in contact, MuJoCo for the robot and the rest.
 
-Every ``soft_timestep`` MuJoCo goes ahead with what the pads did to the robot, then the solver follows: cases and MuJoCo's bodies are led to
-where MuJoCo has them, what belongs to the solver moves by itself and is mirrored in MuJoCo as mocap bodies.
+Every ``soft_timestep`` MuJoCo steps first, with the forces of the pads on the robot. Then the solver follows: cases and MuJoCo's bodies are
+driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap bodies.
 """
 
 from __future__ import annotations
@@ -14,36 +14,39 @@ import mujoco
 import numpy as np
 
 import ipc
+from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.gel.surface import PadGrid
+from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import CoatTraction
 from raytac.physics.base import PadReading
+from raytac.physics.configs import Ipc
 from raytac.physics.objects import object_parts
-from raytac.physics.soft.bodies import SceneBody, scene_body
-from raytac.physics.soft.mesh import pad_mesh
-from raytac.physics.soft.scene import ScenePad, SceneReport, SoftScene
-from raytac.robots.pose import body_poses, site_poses
-from raytac.se3 import quaternion
+from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
+from raytac.physics.soft.mesh import PadMesh, pad_mesh
+from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.scene_state import SceneReport
+from raytac.robots.frames import body_poses, site_poses
+from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
+from raytac.specs.press import PADS
 from raytac.specs.task import PAIR_FRICTION, TaskScene
-from raytac.world.compose import ComposedScene, pose_of
-from raytac.world.coupling import Coupling
-from raytac.world.robot_overlap import Inside, RobotOverlap
-from raytac.world.soft_answers import soft_answers
-from raytac.world.state import Drive, lost
-from raytac.world.variation import EnvironmentModels
+from raytac.world.compose import ComposedScene
+from raytac.world.coupling import Coupling, coupling_inputs
+from raytac.world.environment_models import EnvironmentModels
+from raytac.world.forbidden_overlap import Inside, RobotOverlap
+from raytac.world.world_state import Drive, lost
 
 __all__ = ["SoftPads"]
 
 _TOUCH = 1e-5
-"""A vertex of a soft body so near to the body that holds it is held [m]."""
+"""Distance from a soft body's holder within which its vertices are bonded to it [m]."""
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
 _INSIDE = 1e-4
-"""How far a body may lie inside a case or a link unsaid [m]: rounding of a scene's lengths."""
+"""Greatest overlap of a body with a case or a link that is not reported [m]: rounding of a scene's lengths."""
 
 _AT_REST = {
     "min_gap": np.inf,
@@ -55,7 +58,7 @@ _AT_REST = {
     "substeps": 0,
     "inside_robot": 0.0,
 }
-"""What the report says after a reset, before any step."""
+"""Report after a reset, before any step."""
 
 
 class SoftPads:
@@ -67,7 +70,7 @@ class SoftPads:
         models: EnvironmentModels,
         datas: Sequence[mujoco.MjData],
         *,
-        level: str,
+        physics: Ipc,
         coupling: str,
         device: str,
     ) -> None:
@@ -75,25 +78,26 @@ class SoftPads:
 
         Args:
             composed: the scene; ``models``, ``datas``: MuJoCo's of every environment.
-            level: how finely pads are cut, one of ``PADS``.
+            physics: gives the mesh.
             coupling: one of ``COUPLINGS``.
-            device: of the solver.
+            device: of the solver, ``auto``, ``cpu`` or ``cuda``.
 
         Raises:
+            BackendError: the solver is not installed, or the device does not work here.
             SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model, self._models = composed, composed.model, models
-        scene = composed.scene
+        scene, level = composed.scene, physics.level or PADS[0]
         pads = [
-            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level))
+            ScenePad(mounted.name, spec, level if isinstance(level, PadMesh) else pad_mesh(spec.gelpad, level))
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
         self._sites = [int(self.model.site(m.site).id) for m in composed.sensors]
         self._own = [b for b in composed.bodies.values() if b.mocap >= 0]
         """Bodies that belong to the solver."""
-        self._led = [b for b in composed.bodies.values() if b.is_free]
+        self._driven = [b for b in composed.bodies.values() if b.is_free]
         """Bodies that belong to MuJoCo."""
         bodies = [_solver_body(scene, i) for i in range(len(scene.bodies))]
         starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
@@ -107,19 +111,19 @@ class SoftPads:
             friction=_pair_friction(scene),
             ignored=[(b.name, b.held_by) for b in scene.bodies if b.held_by is not None],
             num_envs=len(datas),
-            device=device,
+            device=resolve_device(device, ray_tracing=False),
         )
         self._robot = RobotOverlap(composed)
-        self._told: set[tuple[str, str]] = set()
+        self._warned: set[tuple[str, str]] = set()
         self._refuse_inside(datas, range(len(datas)))
         self._coupling = None
         if coupling == "two_way":
-            felt = self._links + [b.index for b in self._led]
-            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._led)], felt, strict=True))
+            felt = self._links + [b.index for b in self._driven]
+            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._driven)], felt, strict=True))
             self._coupling = Coupling(self.model, felt, len(datas))
-            self._prepare_held()
+            self._prepare_bonded()
         self._last_cases = self._pad_poses(datas)
-        self._last_led = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._led}
+        self._last_driven = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
         self._unconverged = np.zeros(len(datas), int)
@@ -149,8 +153,8 @@ class SoftPads:
             self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
         for b in envs:
             self._last_cases[b] = cases[b]
-            for body in self._led:
-                self._last_led[body.spec.name][b] = starts[body.spec.name][b]
+            for body in self._driven:
+                self._last_driven[body.spec.name][b] = starts[body.spec.name][b]
             self._unconverged[b] = 0
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
@@ -161,13 +165,13 @@ class SoftPads:
             self._mirror(datas, [b])
 
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
-        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
+        """Take one control step of all environments; those that fail are marked in ``failed`` (B,) and stand still.
 
-        So are those whose last step did not meet the solver's tolerance: forces and places of such a step are not those of the physics.
-        So are those that move too fast to be resolved near something that they may touch, with a ``RuntimeWarning``.
+        An environment fails if its state is not finite, if its last step did not meet the solver's tolerance, or, with a
+        ``RuntimeWarning``, if it moves too fast to be resolved near a contact.
 
         Raises:
-            InputError: the same of the only environment; it has failed then, until it is reset.
+            InputError: the only environment moves too fast; it has failed then, until it is reset.
         """
         scene = self.composed.scene
         interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
@@ -177,16 +181,16 @@ class SoftPads:
                 if not failed[b]:
                     failed[b] = not self._ahead(data, b, drive)
             since += 1
-            cases, led = self._now(datas, failed)
-            # Where something is about to touch, MuJoCo must learn of it before it has gone far into it.
+            cases, driven = self._now(datas, failed)
+            # Before a contact begins, the solver steps early, so that MuJoCo has the contact's force before the bodies overlap far.
             early = (
                 self._coupling is not None
                 and since < interval
                 and step < steps
-                and not self.soft.is_small(cases, led, since * scene.timestep)
+                and not self.soft.is_small(cases, driven, since * scene.timestep)
             )
             if since == interval or step == steps or early:
-                reports.append(self._follow(datas, failed, cases, led, since * scene.timestep))
+                reports.append(self._follow(datas, failed, cases, driven, since * scene.timestep))
                 since = 0
         failed |= ~reports[-1].last_converged
         if (failed & ~self.soft.failed).any():
@@ -196,11 +200,11 @@ class SoftPads:
 
     @property
     def meshes(self) -> tuple[str, ...]:
-        """Names of all that the solver has a surface of."""
+        """Names of the pads and bodies whose surface the solver has."""
         return (*self.soft.pads, *(name for name, body in self.soft.bodies.items() if not isinstance(body.solid, ipc.HalfSpace)))
 
     def wrench(self, name: str) -> np.ndarray:
-        """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
+        """Wrench (B, 6) of all contacts on a pad, about its origin, pad frame."""
         return self._wrench[name].copy()
 
     def reading(
@@ -212,20 +216,20 @@ class SoftPads:
         failed = failed | (reading.failed & ~left_out)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
-        def traction() -> np.ndarray:
+        def traction(_: GelSurface) -> np.ndarray:
             if name not in self._traction:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        found = PadReading(reading.surface, wrench, failed, traction, self._unconverged.copy())
+        found = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
         return found if envs is None else found.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
-        """None: the solver refuses a start in which bodies overlap."""
+        """Overlaps at the start: an empty list, since the solver raises an error for them."""
         return []
 
-    def _prepare_held(self) -> None:
-        """Invert the stiffness of soft bodies that are held now, not in the step that first touches them (see ``soft_answers``)."""
+    def _prepare_bonded(self) -> None:
+        """Invert the stiffness of bonded soft bodies here, not in the step that first touches them (see ``coupling_inputs``)."""
         scene = self.composed.scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
@@ -237,7 +241,7 @@ class SoftPads:
                 raise SpecError(str(error), file=scene.source, key=f"body[{i}].cell_mm", value=cell) from error
 
     def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
-        """One step of MuJoCo; returns whether the state is still sound."""
+        """Take one step of MuJoCo; False if the state is no longer valid."""
         mujoco.mj_step1(self._models[b], data)
         drive([b])
         if self._coupling is not None:
@@ -250,32 +254,34 @@ class SoftPads:
         return True
 
     def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Where MuJoCo has cases and its own bodies; an environment that failed stays where it was last."""
+        """MuJoCo's poses of cases and of its own bodies; an environment that failed keeps its last ones."""
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        led = {}
-        for body in self._led:
-            led[body.spec.name] = np.where(failed[:, None, None], self._last_led[body.spec.name], body_poses(datas, body.index))
-        return cases, led
+        driven = {}
+        for body in self._driven:
+            driven[body.spec.name] = np.where(
+                failed[:, None, None], self._last_driven[body.spec.name], body_poses(datas, body.index)
+            )
+        return cases, driven
 
     def _follow(
-        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, led: dict[str, np.ndarray], dt: float
+        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: float
     ) -> SceneReport:
-        """The solver's step to where MuJoCo is now."""
+        """Step the solver to MuJoCo's present poses."""
         try:
-            report = self.soft.step(cases, led, dt)
+            report = self.soft.step(cases, driven, dt)
         except InputError:
             failed[:] = True  # MuJoCo is ahead of the solver
             raise
-        self._last_cases, self._last_led = cases, led
+        self._last_cases, self._last_driven = cases, driven
         failed |= report.failed
         alive = np.flatnonzero(~failed).tolist()
         self._mirror(datas, alive)
         if self._coupling is not None:
-            answers = soft_answers(self.soft, self._felt)
+            inputs = coupling_inputs(self.soft, self._felt)
             for b in alive:
-                failed[b] = not np.isfinite(answers[b][0]).all()
+                failed[b] = not np.isfinite(inputs[b][0]).all()
                 if not failed[b]:
-                    self._coupling.update(datas[b], b, *answers[b])
+                    self._coupling.update(datas[b], b, *inputs[b])
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
@@ -283,7 +289,7 @@ class SoftPads:
         return report
 
     def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
-        """Show MuJoCo where the solver has its bodies."""
+        """Set the mocap bodies to the poses of the solver's bodies."""
         self._show(datas, envs, {body.spec.name: self.soft.pose(body.spec.name) for body in self._own})
 
     def _show(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray, poses: Mapping[str, np.ndarray]) -> None:
@@ -299,13 +305,13 @@ class SoftPads:
     def _inside(
         self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False
     ) -> Iterator[tuple[int, Inside]]:
-        """What lies inside cases and links, by environment; rigid bodies as MuJoCo shows them, soft ones as they are."""
+        """Overlaps with cases and links, by environment: of rigid bodies as mirrored in MuJoCo, of soft ones by their vertices."""
         soft = {name: self.soft.mesh(name)[0] for name, body in self.soft.bodies.items() if body.is_soft and not only_rigid}
         for b in envs:
-            found = self._robot.rigid(datas[b])
+            overlaps = self._robot.rigid(datas[b])
             for name, vertices in soft.items():
-                found += self._robot.soft(datas[b], name, vertices[b])
-            yield from ((int(b), one) for one in found if one.depth > _INSIDE)
+                overlaps += self._robot.soft(datas[b], name, vertices[b])
+            yield from ((int(b), one) for one in overlaps if one.depth > _INSIDE)
 
     def _refuse_inside(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range, *, only_rigid: bool = False) -> None:
         for b, one in self._inside(datas, envs, only_rigid=only_rigid):
@@ -313,15 +319,13 @@ class SoftPads:
             raise OverlapError(f"{one.body!r} starts {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}")
 
     def _depth_inside(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
-        """The deepest [m], (B,); the first time for every body and geom a warning."""
+        """Greatest depth inside the robot [m], (B,); warns once for every pair of body and geom."""
         depth = np.zeros(len(datas))
         for b, one in self._inside(datas, np.flatnonzero(~failed)):
             depth[b] = max(depth[b], one.depth)
-            if (one.body, one.geom) not in self._told:
-                self._told.add((one.body, one.geom))
-                rule = (
-                    "simulated bodies meet gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
-                )
+            if (one.body, one.geom) not in self._warned:
+                self._warned.add((one.body, one.geom))
+                rule = "bodies of the solver touch gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
                 where = f" in environment {b} at {datas[b].time:.3f} s"
                 warnings.warn(
                     f"{one.body!r} is {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}: {rule}",
@@ -345,7 +349,7 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
     if body.dynamics == "free":
         density = body.density if body.mass is None else body.mass / enclosed_volume(object_surface(parts))
         return scene_body(body.name, parts, "affine", density=density, friction=body.friction_on_gel)
-    held = None if body.held_by is None else _holder(scene, index)
+    bonded = None if body.held_by is None else _bonded_vertices(scene, index)
     low, high = _extent(parts)
     return scene_body(
         body.name,
@@ -355,13 +359,13 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
         youngs_modulus=body.youngs_modulus,
         poisson_ratio=body.poisson_ratio,
         cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
-        held=held,
+        bonded=bonded,
         friction=body.friction_on_gel,
     )
 
 
 def _pair_friction(scene: TaskScene) -> dict[tuple[str, str], float]:
-    """Between bodies the larger of both, as MuJoCo has it; with pads the solver's own rule."""
+    """Coefficients between bodies: the larger of both, as in MuJoCo; with pads the solver's own rule applies."""
     known = {b.name: PAIR_FRICTION if b.friction is None else b.friction for b in scene.bodies}
     return {(a, b): max(known[a], known[b]) for a, b in combinations(known, 2)}
 
@@ -371,8 +375,8 @@ def _extent(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Which vertices (n, 3) of a soft body, in its frame, are held by the fixed body that it names."""
+def _bonded_vertices(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Function that selects the vertices (n, 3) of a soft body, in its frame, that are bonded to its holder."""
     body = scene.bodies[index]
     fixed = scene.body(str(body.held_by))
     fixed_from_body = np.linalg.inv(pose_of(fixed.position, fixed.quaternion)) @ pose_of(body.position, body.quaternion)
@@ -382,17 +386,17 @@ def _holder(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
             rule = "cannot hold a soft body: its shape must be made of these"
             raise SpecError(rule, file=scene.source, key=f"body[{index}].held_by", value=fixed.name, choices=SOLIDS)
 
-    def held(vertices: np.ndarray) -> np.ndarray:
+    def is_bonded(vertices: np.ndarray) -> np.ndarray:
         inside = np.zeros(len(vertices), bool)
         for part in parts:
             inside |= point_depth(part, vertices @ fixed_from_body[:3, :3].T + fixed_from_body[:3, 3]) >= -_TOUCH
         return inside
 
-    return held
+    return is_bonded
 
 
 def _joined(reports: Sequence[SceneReport]) -> dict[str, np.ndarray]:
-    """One report of several steps."""
+    """Join the reports of several steps."""
     return {
         "min_gap": np.min([r.min_gap for r in reports], axis=0),
         "min_det": np.min([r.min_det for r in reports], axis=0),

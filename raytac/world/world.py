@@ -11,36 +11,36 @@ import mujoco
 import numpy as np
 
 from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_whole
-from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.physics.base import PhysicsConfig
+from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
+from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.pose import body_poses, site_poses
 from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import check_physics
-from raytac.specs.press import PADS, chosen_physics
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
-from raytac.world.rigid_pads import RigidPads
-from raytac.world.state import BatchController, Control, Drive, WorldState
-from raytac.world.variation import EnvironmentModels, Variation
+from raytac.world.environment_models import EnvironmentModels, Variation
+from raytac.world.pads import WORLD_PADS, WorldPads
+from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
+    from raytac.markers import MarkersConfig
+    from raytac.optics.base import OpticsConfig
     from raytac.physics.soft.scene import SoftScene
-    from raytac.world.soft_pads import SoftPads
 
 __all__ = ["TactileWorld"]
 
 _OVERLAP = 1e-4
-"""How far rigid bodies may overlap at the start [m]: rounding of a scene's lengths."""
+"""Greatest overlap of rigid bodies at the start [m]: rounding of a scene's lengths."""
 
 _BEYOND = 1e-2
-"""How far joints may start beyond their range [rad or m]: MuJoCo's limits give way, and a start may be recorded at one (a guess)."""
+"""Greatest excess of joints over their range at the start [rad or m]. MuJoCo's limits are soft, and a start may be recorded at one."""
 
 
 class TactileWorld:
@@ -55,53 +55,53 @@ class TactileWorld:
 
     Attributes:
         scene: the task scene.
-        physics: ``rigid`` or ``ipc``.
+        physics: configuration that is used.
         model, data: MuJoCo's model of the scene, and its state in every environment.
-        models: the model of every environment: the scene's own, but where ``reset`` was told of a variation.
-        arm: the joints that move the robot's site; None without.
-        composed: names and indices of what the scene is made of.
+        models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
+        arm: the joints that move the robot's site; None without joints.
+        composed: names and indices of the scene's parts in the model.
     """
 
     def __init__(
         self,
         scene: str | Path | TaskScene,
         *,
-        physics: str | None = None,
-        pad: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
-        markers: str | None = None,
-        optics: str = "raytrace",
+        markers: str | MarkersConfig | None = None,
+        optics: str | OpticsConfig[Any] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
         device: str = "auto",
         seed: int = 0,
-        sensor_options: dict[str, Any] | None = None,
+        pitch: float | None = None,
     ) -> None:
-        """Compose the scene and put it at its start; sensors are made when they are asked for.
+        """Compose the scene and put it at its start; sensors are made on first use.
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene.
-            physics: ``rigid`` or ``ipc``; None is as the scene says, else ``rigid``.
-            pad: how finely a simulated pad is cut, one of ``PADS``; None is as the scene says, else ``coarse``.
+            physics: name or configuration, as ``TactileSensor`` takes it; None is as the scene says, else ``rigid``.
             coupling: ``two_way`` or ``one_way``; None is as the scene says. The rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
             seed: of every random number.
-            sensor_options: further keyword arguments of ``TactileSensor``, such as ``integrator``.
+            pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
 
         Raises:
             InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses.
             SpecError: the scene breaks a rule.
             BackendError: the solver or a renderer is not installed.
         """
-        check_physics(physics, pad)
+        asked = checked_physics(physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         if coupling is not None:
             check_known("coupling", coupling, COUPLINGS)
         self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
-        self.physics = chosen_physics(physics, pad, self.scene.physics)
-        self.pad = "" if self.physics == "rigid" else pad or self.scene.pad or PADS[0]
+        self.physics = scene_physics(asked, self.scene)
+        name = PHYSICS.name_of(self.physics)
+        if name not in WORLD_PADS.names:
+            raise InputError("physics", value=name, rule="has pads for presses only, none for worlds", choices=WORLD_PADS.names)
         self.coupling = coupling or self.scene.coupling
         self.num_envs, self.device, self.seed = num_envs, device, seed
         self._sensor_settings: dict[str, Any] = {
@@ -112,10 +112,10 @@ class TactileWorld:
             "device": device,
             "num_envs": num_envs,
             "physics": self.physics,
-            **(sensor_options or {}),
+            "pitch": pitch,
         }
         self._sensors: dict[str, TactileSensor] = {}
-        self.composed = compose(self.scene, self.physics)
+        self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
         self.model = self.composed.model
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.models = EnvironmentModels(self.composed, num_envs)
@@ -123,23 +123,12 @@ class TactileWorld:
         self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
         self._failed = np.zeros(num_envs, bool)
         self._start_over(range(num_envs))
-        self._pads = self._make_pads()
-        self._check_start()
-
-    def _make_pads(self) -> RigidPads | SoftPads:
-        if self.physics == "rigid":
-            return RigidPads(self.composed, self.models, self.num_envs)
-        check_solver("physics='ipc'")
-        from raytac.world.soft_pads import SoftPads
-
-        return SoftPads(
-            self.composed,
-            self.models,
-            self.data,
-            level=self.pad,
-            coupling=self.coupling,
-            device=resolve_device(self.device, ray_tracing=False),
+        if self.physics.is_simulated:
+            check_solver(f"physics={name!r}")
+        self._pads: WorldPads = WORLD_PADS.config_class(name)(
+            self.composed, self.models, self.data, physics=self.physics, coupling=self.coupling, device=device
         )
+        self._check_start()
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -152,11 +141,11 @@ class TactileWorld:
     @property
     def soft(self) -> SoftScene | None:
         """The contact solver's scene, with everything that it knows; None with the rigid pad."""
-        return None if isinstance(self._pads, RigidPads) else self._pads.soft
+        return self._pads.soft
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
-        """Names of the sensors; asking for them makes none."""
+        """Names of the sensors, without making them."""
         return tuple(mounted.name for mounted in self.composed.sensors)
 
     def reset(
@@ -171,34 +160,36 @@ class TactileWorld:
 
         Args:
             envs: n environments.
-            joints: where the arm's joints start instead (n, joints) [rad or m].
-            bodies: where free bodies start instead: name to ``world_from_body`` (n, 4, 4).
-            variation: what these environments have otherwise than the scene from now on; None leaves them as they are, and
-                ``Variation()`` makes them the scene's again.
+            joints: other starts of the arm's joints (n, joints) [rad or m].
+            bodies: other starts of free bodies: name to ``world_from_body`` (n, 4, 4).
+            variation: differences of these environments from the scene from now on. None keeps the present ones, ``Variation()`` removes
+                them.
 
         Raises:
             InputError: an environment or a body that does not exist, a start of the wrong shape, not finite or not rigid, joints out of
-                their range, or a variation that cannot be (see ``EnvironmentModels.check``).
-            OverlapError: bodies overlap at a start that is given, with simulated pads. With the rigid pad a start may be one in contact, as
-                it was recorded, but no body may lie beyond a gel's bonded face. After an error nothing has changed.
+                their range, or a variation that is not possible (see ``EnvironmentModels.check``).
+            OverlapError: with soft pads, bodies that overlap at a start that is given. With the rigid pad a start may be in contact, as it
+                was recorded, but no body may lie beyond a gel's bonded face. After an error nothing has changed.
         """
         chosen = chosen_envs(envs, self.num_envs)
-        places = {name: self._checked_start(f"bodies[{name!r}]", at, (len(chosen), 4, 4)) for name, at in (bodies or {}).items()}
+        starts = {
+            name: self._checked_start(f"bodies[{name!r}]", poses, (len(chosen), 4, 4)) for name, poses in (bodies or {}).items()
+        }
         free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
-        for name in places:
+        for name in starts:
             if name not in free:
                 raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=free)
-            rigid_poses(f"bodies[{name!r}]", places[name], len(chosen))
+            rigid_poses(f"bodies[{name!r}]", starts[name], len(chosen))
         if joints is not None:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
             self._check_joints(joints, chosen)
         if variation is not None:
-            self.models.check(variation, len(chosen), rigid=self.physics == "rigid")
-        if joints is None and not places and variation is None and not self.models.differ(chosen):
+            self.models.check(variation, len(chosen), rigid=not self.physics.is_simulated)
+        if joints is None and not starts and variation is None and not self.models.differ(chosen):
             self._start_over(chosen)
             self._pads.reset(chosen, self.data)
         else:
-            self._start_elsewhere(chosen, joints, places, variation)
+            self._start_elsewhere(chosen, joints, starts, variation)
         for sensor in self._sensors.values():
             if sensor.markers is not None:
                 sensor.reset_markers(chosen)
@@ -207,7 +198,7 @@ class TactileWorld:
     def _start_elsewhere(
         self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
     ) -> None:
-        """A reset to starts or with models that are given; as before if they cannot be."""
+        """Reset to given starts or models; nothing changes if bodies overlap there."""
         before, failed, models = [copy(self.data[b]) for b in envs], self._failed.copy(), self.models.snapshot()
         if variation is not None:
             self.models.vary(envs, variation)
@@ -249,11 +240,11 @@ class TactileWorld:
             data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
             if joints is not None and self.arm is not None:
                 data.qpos[self.arm.qpos] = joints[row]
-            for name, at in (bodies or {}).items():
+            for name, poses in (bodies or {}).items():
                 body = self.composed.bodies[name]
-                if body.is_free:  # the solver's are mirrored when it has its own
-                    data.qpos[body.qpos : body.qpos + 3] = at[row, :3, 3]
-                    data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(at[row, :3, :3])
+                if body.is_free:  # a body of the solver is mirrored once the solver has reset it
+                    data.qpos[body.qpos : body.qpos + 3] = poses[row, :3, 3]
+                    data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(poses[row, :3, :3])
             mujoco.mj_forward(self.models[b], data)
             self._failed[b] = False
 
@@ -261,12 +252,12 @@ class TactileWorld:
         """Advance every environment by ``scene.control_timestep``.
 
         Args:
-            control: how the actuators are driven (see ``Control``); None is ``hold``.
+            control: controllers of the actuators (see ``Control``); None is ``hold``.
 
         Raises:
-            InputError: controls of the wrong shape or number, or not finite; with simulated pads a motion too fast to be resolved near
-                something that it may touch, in the only environment (it has failed then). Of several environments the one that moves so
-                is marked in ``failed``, with a ``RuntimeWarning``.
+            InputError: controls of the wrong shape or number, or not finite; with soft pads, a motion too fast to be resolved near a
+                contact, in the only environment, which has failed then. Of several environments the one that moves so fast is marked in
+                ``failed``, with a ``RuntimeWarning``.
         """
         self._pads.advance(self.data, self._drive(self.hold if control is None else control), self._failed)
         return self.state()
@@ -277,13 +268,13 @@ class TactileWorld:
         return self._failed.copy()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
-        """The controller that keeps the robot where it starts."""
+        """Controller that keeps the robot at its start."""
         data.ctrl[:] = self.composed.ctrl
         if self._law is not None and self.arm is not None:
             self.arm.drive(data, self._law.torque(data, self.composed.start[self.arm.qpos]).torque)
 
     def state(self) -> WorldState:
-        """What the world is like now."""
+        """Present state of all environments."""
         arm, lost = self.arm, self._failed
         pads = {m.name: site_poses(self.data, int(self.model.site(m.site).id)) for m in self.composed.sensors}
         bodies = {name: body_poses(self.data, body.index) for name, body in self.composed.bodies.items()}
@@ -298,12 +289,12 @@ class TactileWorld:
     def observe(
         self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (all if None), of all environments at once; images and markers are computed now and not before.
+        """Frames of the sensors named (all if None), of all environments at once; images and markers are computed here.
 
-        Markers that follow a contact's history (``fots``) see only what is observed: call it every control step if they are asked for.
+        Markers that depend on a contact's history (``fots``) use only the states that are observed: observe them in every control step.
 
-        ``envs`` (a mask (B,) or a list) gives frames with one row an environment named, and nothing of the others goes on: no noise is
-        drawn for them and no history written. One that is named twice has two rows that are the same.
+        ``envs`` (a mask (B,) or a list) gives frames with one row for each environment named. For the others no noise is drawn and no
+        history is written. One that is named twice has two equal rows.
 
         Raises:
             InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
@@ -324,17 +315,17 @@ class TactileWorld:
         return frames
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Surface of a body or of a simulated pad as it is: vertices (B, n, 3) [m], world frame, and faces (F, 3).
+        """Present surface of a body or of a soft pad: vertices (B, n, 3) [m], world frame, and faces (F, 3).
 
-        Raises ``InputError`` for a name that is not there, or a half-space, which has no end.
+        Raises ``InputError`` for an unknown name, or a half-space, which is unbounded.
         """
-        if self.physics == "ipc" and name in self._pads.meshes:  # type: ignore[union-attr]
-            return self._pads.soft.mesh(name)  # type: ignore[union-attr]
+        if self._pads.soft is not None and name in self._pads.meshes:
+            return self._pads.soft.mesh(name)
         body = self.composed.bodies.get(name)
         if body is None or body.spec.kind == "plane":
             there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
-            there += self._pads.meshes if self.physics == "ipc" else []  # type: ignore[union-attr]
-            rule = "must be the name of a body or a simulated pad, and no half-space"
+            there += self._pads.meshes
+            rule = "must be the name of a body or a soft pad, and no half-space"
             raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
         from raytac.shapes.triangulate import object_surface
 
@@ -343,7 +334,7 @@ class TactileWorld:
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
 
     def _drive(self, control: Control) -> Drive:
-        """What writes the controls of environments, from any way to say it."""
+        """Function that writes the controls of environments, from any form of ``Control``."""
         if isinstance(control, BatchController):
             return lambda envs: control.drive(self.data, envs)
         if isinstance(control, np.ndarray):
@@ -375,7 +366,7 @@ class TactileWorld:
         return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
     def _check_start(self) -> None:
-        """Refuse a start in which bodies overlap."""
+        """Raise ``InputError`` for a start in which bodies overlap."""
         data, model = self.data[0], self.model
         for contact in data.contact[: data.ncon]:
             if contact.dist < -_OVERLAP:

@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytac.calibrate.image_fits import PressSamples, fit_mlp, fit_table, press_samples, with_cast_shadows
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.mlp_fit import fit_mlp
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.press_samples import PressSamples, press_samples
-from raytac.calibrate.table_fit import fit_table, with_cast_shadows
 from raytac.gel.surface import make_grid
-from raytac.optics.image.mlp import MlpMode
+from raytac.optics import Mlp, Taxim
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.shadow import NOTHING
 from raytac.optics.taxim.folder import load_calibration, save_calibration
-from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.taxim.table import PolyTable, polynomial_basis, slope_bins
 from raytac.specs import load_sensor
 
@@ -58,9 +55,9 @@ def every(samples: PressSamples, step: int) -> PressSamples:
 def test_a_known_law_of_slopes_is_found(samples: PressSamples, kind: str) -> None:
     background = np.full((240, 320, 3), 90.0)
     if kind == "table":
-        mode = TaximMode(SENSOR, calibration=fit_table(SENSOR, background, samples), device="cpu")
+        mode = Taxim(calibration=fit_table(SENSOR, background, samples)).build(SENSOR, device="cpu")
     else:
-        mode = MlpMode(SENSOR, calibration=fit_mlp(SENSOR, background, every(samples, 5)), device="cpu")
+        mode = Mlp(weights=fit_mlp(SENSOR, background, every(samples, 5))).build(SENSOR, device="cpu")
     at = presses(2, 1)
     surface = press_surface(SENSOR, make_grid(SENSOR.gelpad, 0.06e-3), at, np.full(2, RADIUS), RIGID_PAD)
     levels = mode.render_levels(surface)

@@ -10,14 +10,13 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.led_layers import ExtraLight, Light
-from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
-from raytac.calibrate.symmetry import side_ties
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics import RayTraced
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor_check import validate_sensor
 
@@ -44,7 +43,7 @@ def circles(count: int) -> np.ndarray:
 
 def traced(sensor: SensorSpec, at: np.ndarray, noise: float = 0.0) -> Photographs:
     """Photographs by the ray tracer, full size."""
-    tracer = RayTracer(sensor, outputs=("layers",), device="cpu")
+    tracer = RayTraced().build(sensor, outputs=("layers",), device="cpu")
     grid = make_grid(sensor.gelpad, 0.12e-3)
 
     def levels(surface: GelSurface) -> np.ndarray:
@@ -156,7 +155,7 @@ def test_the_ray_tracers_own_photographs_are_explained(sensor: SensorSpec) -> No
     at = refine_circles(fitted.sensor, test, fitted.state, device="cpu")
     assert np.abs(at - test.circles).max() < 0.5
     grid = make_grid(sensor.gelpad, 0.12e-3)
-    tracer = RayTracer(fitted.sensor, device="cpu", flat_field=np.rint(shots.background.clip(0, 255)).astype(np.uint8))
+    tracer = RayTraced(flat_field=np.rint(shots.background.clip(0, 255)).astype(np.uint8)).build(fitted.sensor, device="cpu")
     image = tracer.render(press_surface(sensor, grid, at, test.radius, fitted.state.slopes)).rgb
     assert image is not None
     inside = test.distance(sensor) < 1
@@ -256,14 +255,14 @@ def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
     blank = Photographs(np.full((240, 320, 3), 100.0), np.full((3, 240, 320, 3), 100.0), at, np.full(3, RADIUS))
     state = FitState(LightParameters.of(low, blank.background), RIGID_PAD.copy(), at)
     problem = DirectFit(low, blank, state, FitSettings(samples=(400, 400)), factor=2)
-    grid, options = make_grid(low.gelpad, 0.12e-3), {"bounce": False}
-    extra = extra_light(problem, state, grid, "cpu", options)
+    grid, tracing = make_grid(low.gelpad, 0.12e-3), RayTraced(bounce=False)
+    extra = extra_light(problem, state, grid, "cpu", tracing)
     assert sorted(extra.by_led) == [0, 1, 2, HEIGHT]
     for column, step in (*((k, sign * 0.4) for k in range(3) for sign in (1, -1)), (HEIGHT, -0.5)):
         moved_leds = state.p.leds.copy()
         moved_leds[:, column] += step
         moved = dataclasses.replace(state, p=dataclasses.replace(state.p, leds=moved_leds))
-        true = extra_light(problem, moved, grid, "cpu", options, slopes=False).light.pressed
+        true = extra_light(problem, moved, grid, "cpu", tracing, slopes=False).light.pressed
         held, followed = (np.abs(true - one.pressed).mean() for one in (extra.light, extra.of(moved_leds)))
         assert held > 5e-5, f"column {column}: shadows must change"
         assert followed < held / 2, f"column {column} by {step}: {followed / held:.2f} of the change is missed"
@@ -271,12 +270,12 @@ def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
         dataclasses.replace(state, p=dataclasses.replace(state.p, leds=np.column_stack([state.p.leds[:, :HEIGHT], [height] * 3])))
         for height in (0.1, 0.6)
     )
-    flat = extra_light(problem, thin, grid, "cpu", options)
-    higher = extra_light(problem, thick, grid, "cpu", options, slopes=False)
+    flat = extra_light(problem, thin, grid, "cpu", tracing)
+    higher = extra_light(problem, thick, grid, "cpu", tracing, slopes=False)
     expected = (higher.light.pressed - flat.light.pressed) / 0.5
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(flat.by_led[HEIGHT].pressed, expected, atol=1e-6, err_msg="no height below the least is rendered")
-    none = extra_light(problem, state, grid, "cpu", {"bounce": False, "shadows": False})
+    none = extra_light(problem, state, grid, "cpu", RayTraced(bounce=False, shadows=False))
     assert not none.by_led, "without shadows the rest changes slowly"
 
 

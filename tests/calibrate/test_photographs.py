@@ -10,7 +10,7 @@ import pytest
 
 from raytac.calibrate.photographs import Photographs, read_photographs
 from raytac.errors import InputError
-from raytac.io.png import write_png
+from raytac.io.images import write_png
 from raytac.specs import SensorSpec, load_sensor
 
 RADIUS = 3.155e-3

@@ -9,7 +9,7 @@ import pytest
 
 from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.errors import CalibrationError, InputError
-from raytac.io.png import write_png
+from raytac.io.images import write_png
 
 SHAPE = (24, 32, 3)
 LABELS = "diameter,index,cx_px,cy_px,r_px,edge_score,fully_visible\n6.310mm,0,12,10,6,9,1\n6.310mm,7,28,10,5,9,0\n9.500mm,1,16,12,9,9,1\n"

@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
 
+from raytac.calibrate.image_fits import ShadingSettings, with_shading
 from raytac.calibrate.photographs import encode
-from raytac.calibrate.shading_fit import DEGREE, with_shading
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
+from raytac.optics import RayTraced
 from raytac.optics.response import shading_gain
-from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec, load_sensor, validate_sensor
 from raytac.specs.sensor_file import response_text
 
 SIZE = (80, 60)
-OPTIONS: dict[str, Any] = {"bounce": False}
+TRACING = RayTraced(bounce=False)
 MINI = load_sensor("gelsight_mini")
 BARE = dataclasses.replace(MINI, response=dataclasses.replace(MINI.response, shading_red=(), shading_green=(), shading_blue=()))
 
 
 def at_rest(sensor: SensorSpec) -> np.ndarray:
     grid = make_grid(sensor.gelpad, 0.12e-3)
-    rgb = RayTracer(sensor, resolution=SIZE, device="cpu", **OPTIONS).render(GelSurface.at_rest(grid)).rgb
+    rgb = TRACING.build(sensor, resolution=SIZE, device="cpu").render(GelSurface.at_rest(grid)).rgb
     assert rgb is not None
     return rgb[0].astype(float)
 
@@ -34,12 +33,13 @@ def at_rest(sensor: SensorSpec) -> np.ndarray:
 def test_known_shading_is_found_again() -> None:
     """A photograph that the sensor itself took under a known shading, but for rounding to whole levels."""
     rng = np.random.default_rng(0)
-    known = [tuple(map(float, rng.normal(0, 0.08, (DEGREE + 1) * (DEGREE + 2) // 2))) for _ in range(3)]
+    degree = ShadingSettings().degree
+    known = [tuple(map(float, rng.normal(0, 0.08, (degree + 1) * (degree + 2) // 2))) for _ in range(3)]
     response = dataclasses.replace(
         BARE.response, **dict(zip(("shading_red", "shading_green", "shading_blue"), known, strict=True))
     )
     photograph = at_rest(dataclasses.replace(BARE, response=response))
-    found = with_shading(MINI, photograph, device="cpu", options=OPTIONS)
+    found = with_shading(MINI, photograph, device="cpu", tracing=TRACING)
     ratio = shading_gain(found.response.shading, SIZE) / shading_gain(known, SIZE)
     assert np.abs(np.log(ratio)).mean() < 0.005, np.abs(np.log(ratio)).mean()
     assert np.abs(at_rest(found) - photograph).max() <= 2
@@ -53,7 +53,7 @@ def test_a_higher_degree_comes_nearer_to_a_photograph_with_a_spot() -> None:
     photograph = np.rint(encode(black + 0.1 + 0.2 * spot[..., None] * np.array([1.0, 0.5, 0.8]), gamma))
     off = []
     for degree in (0, 2, 4, 6):
-        shaded = with_shading(BARE, photograph, degree=degree, device="cpu", options=OPTIONS)
+        shaded = with_shading(BARE, photograph, settings=ShadingSettings(degree), device="cpu", tracing=TRACING)
         off.append(float(np.sqrt(((at_rest(shaded) - photograph) ** 2).mean())))
     assert all(finer < 0.75 * coarser for coarser, finer in itertools.pairwise(off)), off
     assert off[-1] < 4, off
@@ -69,7 +69,7 @@ def test_what_is_written_loads_again(tmp_path) -> None:  # type: ignore[no-untyp
 
 def test_a_photograph_as_dark_as_the_black_level_is_refused() -> None:
     with pytest.raises(InputError, match="brighter than the black level"):
-        with_shading(BARE, np.full((*SIZE[::-1], 3), 5.0), device="cpu", options=OPTIONS)
+        with_shading(BARE, np.full((*SIZE[::-1], 3), 5.0), device="cpu", tracing=TRACING)
 
 
 def test_lights_that_leave_pixels_dark_are_refused() -> None:
@@ -83,4 +83,4 @@ def test_lights_that_leave_pixels_dark_are_refused() -> None:
         ),
     )
     with pytest.raises(InputError, match=r"lights = \d+: leave this many values"):
-        with_shading(dark, np.full((*SIZE[::-1], 3), 120.0), device="cpu", options=OPTIONS)
+        with_shading(dark, np.full((*SIZE[::-1], 3), 120.0), device="cpu", tracing=TRACING)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.calibrate.presses import RealPresses
-from raytac.calibrate.splits import by_half, by_press, shallow_to_deep
+from raytac.calibrate.presses import RealPresses, by_half, by_press, shallow_to_deep
 from raytac.errors import InputError
 
 

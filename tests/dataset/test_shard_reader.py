@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from raytac.dataset.arrays import ArrayKind
-from raytac.dataset.shard_reader import open_shard
+from raytac.dataset.shard import open_shard
 from raytac.errors import InputError
 from raytac.io.arrays import npz_bytes
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -30,6 +32,7 @@ from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
+from raytac.optics import RayTraced
 
 ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
 
@@ -72,9 +75,9 @@ def test_the_docstring_says_the_shapes_that_there_are() -> None:
         lengths = [1e3 * step for step in motion.step] + [1e3 * motion.leash]
         bounds = [abs(bound[i]) for i in moved for bound in (motion.low, motion.high)]
         assert {round(value, 6) for value in (*lengths, *bounds)} <= told, kind
-        assert f"Box(-1, 1, ({env.batch.steering.size},))" in text and f"{kind.task.max_episode_steps} steps" in text
+        assert f"Box(-1, 1, ({env.batch.control.size},))" in text and f"{kind.task.max_episode_steps} steps" in text
         env.reset(seed=0)
-        info = env.step(np.zeros(env.batch.steering.size, np.float32))[4]
+        info = env.step(np.zeros(env.batch.control.size, np.float32))[4]
         assert all(f"`{term}`" in text for term in info["reward_terms"])
 
 
@@ -128,7 +131,7 @@ def test_no_two_sensors_of_a_vector_have_the_same_noise() -> None:
 @pytest.mark.renderer
 def test_with_noise_in_every_frame_too_when_they_begin_anew_at_different_times(mode: AutoresetMode) -> None:
     disturbed = MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=5e-5)
-    direct = {"optics": "raytrace", "optics_options": {"bounce": False}}  # quickest to build
+    direct = {"optics": RayTraced(bounce=False)}  # quickest to build
     tactile = ObservationSettings(("rgb", "markers", "wrench"), resolution=(16, 12), difference=True, stack=2, **direct)
     options = {
         "tactile": tactile,
@@ -198,10 +201,47 @@ def test_the_terms_add_up_and_are_what_their_formulas_say() -> None:
     cube, pad = state.world_from_body["cube"][:, :3, 3], state.world_from_pad["sensor"][:, :3, 3]
     away = np.linalg.norm(pad - cube - [0, 0, 0.02], axis=1)
     np.testing.assert_allclose(out.terms["reaching"], 1 - np.tanh(away / 0.1))
-    missing = np.linalg.norm((cube - batch._goal)[:, :2], axis=1)
+    missing = np.linalg.norm((cube - batch.goal)[:, :2], axis=1)
     np.testing.assert_allclose(out.terms["target_fine"], 4 * (1 - np.tanh(missing / 0.02)))
     np.testing.assert_allclose(out.terms["action_rate"], -3e-4)
     np.testing.assert_allclose(out.observation["body"][:, :3], (cube - pad) / 0.1, atol=1e-6)
+
+
+def test_a_policy_reads_the_state_of_the_batch_and_cannot_change_it() -> None:
+    batch = TaskBatch(PushCube(), num_envs=2, tactile=None)
+    first = batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    np.testing.assert_allclose(first["goal"], (batch.goal - batch.tool[:, :3, 3]) / 0.1, rtol=1e-6)
+    lead = batch.target[:, :3, 3] - batch.tool[:, :3, 3]
+    np.testing.assert_array_equal(lead, 0.0)
+    actions = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    batch.step(actions)
+    np.testing.assert_array_equal(batch.action, actions)
+    assert batch.target[0, 0, 3] > batch.tool[0, 0, 3] and batch.target[1, 1, 3] < batch.tool[1, 1, 3]
+    for name in ("tool", "body", "body_speed", "goal", "action", "target"):
+        getattr(batch, name)[:] = np.nan
+        assert np.isfinite(getattr(batch, name)).all(), name
+
+
+def test_steps_of_joint_actions_are_the_motions() -> None:
+    class Slow(RollBall):
+        motion = replace(RollBall.motion, joint_step=0.01)
+
+    moved = []
+    for task in (RollBall(), Slow()):
+        batch = TaskBatch(task, tactile=None, action="joints")
+        batch.reset([0], [np.random.default_rng(0)])
+        start = batch.world.state().joints
+        assert start is not None
+        for _ in range(5):
+            batch.step(np.eye(7)[:1])
+        joints = batch.world.state().joints
+        assert joints is not None
+        moved.append(float(np.abs(joints - start)[0, 0]))
+    assert 0.01 < moved[1] < 0.4 * moved[0], moved
+
+
+def test_the_shipped_policies_read_public_names_only() -> None:
+    assert not re.findall(r"\w\._\w+", inspect.getsource(scripted))
 
 
 def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:

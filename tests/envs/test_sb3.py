@@ -132,7 +132,7 @@ def test_bad_input_comes_back_from_a_process() -> None:
 
 
 RECIPE = Recipe(
-    "RollBall", "wrench", 0, 64, num_envs=2, rollout=16, segment=1, history=2, epochs=2, minibatch=16, hidden=8
+    "RollBall", "wrench", 0, 64, num_envs=2, n_steps=16, segment=1, history=2, n_epochs=2, batch_size=16, hidden=8
 )  # two segments
 
 
@@ -204,7 +204,7 @@ def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path) -> No
 
 
 def test_a_pupil_learns_what_it_is_shown_and_in_the_same_way_each_time() -> None:
-    recipe = replace(RECIPE, teacher_steps=64, steps=64, epochs=20, hidden=32, learning_rate=3e-3)
+    recipe = replace(RECIPE, imitation_steps=64, total_timesteps=64, n_epochs=20, hidden=32, learning_rate=3e-3)
     one, two = Learner(recipe), Learner(recipe)
     for learner in (one, two):
         learner.normaliser.seed(1)
@@ -226,7 +226,7 @@ def test_a_pupil_learns_what_it_is_shown_and_in_the_same_way_each_time() -> None
 
 
 def test_time_of_imitation_counts_after_a_resume(tmp_path: Path) -> None:
-    recipe = replace(RECIPE, tactile="none", teacher_steps=64)
+    recipe = replace(RECIPE, tactile="none", imitation_steps=64)
     first = Training(recipe, tmp_path, evaluation=2, say=lambda _: None)
     first.run_segment()
     assert not (tmp_path / "progress.csv").exists(), "no rollout of PPO yet"

@@ -8,9 +8,9 @@ import pytest
 
 from experiments import bench_optics as bench
 from raytac.errors import InputError
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
-from raytac.report import timing
+from raytac.report import measure
 from tests.clock import steady_clock
 
 
@@ -25,7 +25,7 @@ def test_quick_run_measures_everything_and_keeps_its_reference(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # for the process that the benchmark starts
-    steady_clock(monkeypatch, timing, 1.0)
+    steady_clock(monkeypatch, measure, 1.0)
     bench.main(bench.Args(out=tmp_path, device="cpu", quick=True))
     metrics = read_metrics(tmp_path / "metrics.json")
     numbers = {key: float(value) for key, value in metrics.items() if not isinstance(value, str)}

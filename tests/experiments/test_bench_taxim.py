@@ -9,7 +9,7 @@ import pytest
 from experiments import bench_taxim as bench
 from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import read_metrics
-from raytac.report import timing
+from raytac.report import measure
 from tests.clock import steady_clock
 
 
@@ -27,7 +27,7 @@ def test_quick_run_measures_speed_and_error(
     monkeypatch.setattr(
         bench, "peer", lambda *_: {"peer.cpu.80x60.ms_per_frame": 50.0, "peer_shadow.cpu.80x60.ms_per_frame": 90.0}
     )
-    steady_clock(monkeypatch, timing, 20e-3)
+    steady_clock(monkeypatch, measure, 20e-3)
     bench.main(bench.Args(out=tmp_path / "out", device="cpu", quick=True))
     metrics = read_metrics(tmp_path / "out" / "metrics.json")
     numbers = {key: float(value) for key, value in metrics.items() if not isinstance(value, str)}

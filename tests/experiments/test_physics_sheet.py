@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import physics_sheet
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.sensor import TactileSensor
 from tests.conftest import Shader
 
@@ -16,7 +16,7 @@ def test_quick_is_one_scene_under_both_pads(tmp_path, monkeypatch):
     monkeypatch.setattr(TactileSensor, "optical_mode", property(lambda sensor: Shader(sensor.spec, sensor.resolution)))
     drawn, draw = [], physics_sheet.sheet_figure
     monkeypatch.setattr(physics_sheet, "sheet_figure", lambda *args: drawn.append(draw(*args)) or drawn[-1])
-    assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere,coin").run() == 0
+    physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere,coin").run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "sheet.png"]
     assert read_png(tmp_path / "sheet.png").shape[2] == 3
     maps = [axis.images[0] for axis in drawn[0].axes if axis.images and axis.images[0].get_array().ndim == 2]
@@ -50,7 +50,7 @@ def test_an_unknown_level_is_named(tmp_path):
 
 
 def test_levels_against_a_finer_one(tmp_path):
-    assert physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere", against="medium").run() == 0
+    physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere", against="medium").run()
     read = read_metrics(tmp_path / "metrics.json")
     found = {key: float(value) for key, value in read.items() if key.startswith("sphere")}
     assert found["sphere.coarse.contact_um"] < 2.0 < found["sphere.coarse.near_um"] < 20.0

@@ -30,7 +30,7 @@ from experiments.training_curves import draw_curves
 def test_the_rate_of_a_scripted_policy_and_of_a_checkpoint(tmp_path: Path) -> None:
     found = main(Args(policy="scripted", task="RollBall", episodes=2, num_envs=2, film=False, out=tmp_path / "scripted"))
     assert found["success"] == 1.0 and float(found["success_low"]) < 0.5 and found["length"] == 150
-    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4))
+    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, n_steps=2, hidden=4))
     learner.checkpoint().save(tmp_path / "policy.pt", resumable=False)
     found = main(Args(policy=str(tmp_path / "policy.pt"), episodes=2, num_envs=2, film=False, out=tmp_path / "trained"))
     assert found["task"] == "RollBall" and 0.0 <= found["success"] <= 1.0  # type: ignore[operator]
@@ -73,7 +73,7 @@ def test_policies_that_are_shipped_fit_their_environments() -> None:
 
 
 def test_what_is_shown_in_a_film_is_hidden_from_the_policy() -> None:
-    recipe = Recipe("RollBall", "wrench", 0, 10, num_envs=1, rollout=2, hidden=4)
+    recipe = Recipe("RollBall", "wrench", 0, 10, num_envs=1, n_steps=2, hidden=4)
     from raytac.observe import ObservationSettings
 
     rich = Learner(recipe, hidden=("markers",), tactile=ObservationSettings(("markers", "wrench")))
@@ -110,15 +110,15 @@ def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must hold trainings"):
         draw_curves(tmp_path)
     with pytest.raises(InputError, match="of this task and these observations"):
-        Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2)).restore(
-            Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4)).checkpoint()
+        Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, n_steps=2)).restore(
+            Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, n_steps=2, hidden=4)).checkpoint()
         )
 
 
 def test_a_checkpoint_of_another_shape_is_refused_and_changes_nothing(tmp_path: Path) -> None:
     import torch
 
-    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, rollout=2, hidden=4))
+    learner = Learner(Recipe("RollBall", "none", 0, 10, num_envs=1, n_steps=2, hidden=4))
     sound = learner.checkpoint()
     sound.save(tmp_path / "sound.pt")
     values = torch.load(tmp_path / "sound.pt", weights_only=True)

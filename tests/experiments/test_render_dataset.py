@@ -10,8 +10,8 @@ import pytest
 from experiments.render_dataset import Args, main
 from raytac.dataset import PressDataset
 from raytac.errors import InputError, SpecError
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 
 SWEEP = """
 objects = ["sphere"]

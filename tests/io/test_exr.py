@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from raytac.errors import InputError
-from raytac.io.exr import read_exr, vector_channels, write_exr
+from raytac.io.images import read_exr, vector_channels, write_exr
 
 NAMES = ("R", "G", "B", "led_red.R", "led_red.G", "led_red.B", "N.X", "N.Y", "N.Z", "P.X", "P.Y", "P.Z", "Z")
 

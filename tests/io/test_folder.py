@@ -171,10 +171,10 @@ def test_a_disk_that_fills_up_is_told_for_every_kind_of_file(tmp_path: Path, kin
         from pathlib import Path
         import numpy as np
         from raytac.errors import AssetError, InputError
-        from raytac.io.exr import write_exr
+        from raytac.io.images import write_exr
         from raytac.io.folder import result_folder
         from raytac.io.arrays import npy_bytes
-        from raytac.io.png import write_png
+        from raytac.io.images import write_png
 
         noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8)
         write = {

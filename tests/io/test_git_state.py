@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from raytac.io.git_state import git_state
+from raytac.io.code_digest import git_state
 
 
 def test_the_commit_is_that_of_this_checkout() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from raytac.errors import InputError
-from raytac.io.lock import FolderLock
+from raytac.io.folder import FolderLock
 
 
 def test_one_at_a_time(tmp_path: Path) -> None:
@@ -25,7 +25,7 @@ def test_one_at_a_time(tmp_path: Path) -> None:
 
 
 def test_it_goes_with_the_process_however_it_ends(tmp_path: Path) -> None:
-    code = "import sys, time; from pathlib import Path; from raytac.io.lock import FolderLock\n"
+    code = "import sys, time; from pathlib import Path; from raytac.io.folder import FolderLock\n"
     code += "lock = FolderLock(Path(sys.argv[1])); print('locked', flush=True); time.sleep(60)"
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=env)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc.layout import rotation_matrix
+from ipc.bodies import rotation_matrix
 
 wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
 wp.init()

@@ -1,4 +1,4 @@
-"""Bodies that are led: two bonded ends, affine bodies with a drive; and buffers that grow in the middle of a step."""
+"""Driven bodies: two bonded ends, affine bodies with a drive; and buffers that grow in the middle of a step."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc import dynamics
-from ipc.layout import rotation_matrix
+from ipc.bodies import rotation_matrix
+from ipc.solver import frames
 from tests.ipc.conftest import bonded_pad, small_pad
 
 LENGTH = 10e-3
@@ -53,8 +53,8 @@ def test_a_stretched_beam_pulls_its_ends_together_with_the_force_of_a_bar() -> N
     for _ in range(40):
         world.step()
     far, near = world.wrench("beam.far").force[0], world.wrench("beam").force[0]
-    held = world.positions("beam")[0][world.positions("beam")[0, :, 2] > LENGTH]
-    assert np.abs(held[:, 2] - (LENGTH + 4e-4)).max() < 1e-15
+    gripped = world.positions("beam")[0][world.positions("beam")[0, :, 2] > LENGTH]
+    assert np.abs(gripped[:, 2] - (LENGTH + 4e-4)).max() < 1e-15
     assert np.abs(far + near).max() < 1e-6 * np.abs(far).max()
     # Held ends cannot contract, which stiffens a bar of five widths a little.
     uniaxial = 1e5 * (2e-3) ** 2 * 4e-4 / LENGTH
@@ -62,7 +62,7 @@ def test_a_stretched_beam_pulls_its_ends_together_with_the_force_of_a_bar() -> N
 
 
 def test_a_twisted_beam_has_the_torque_of_saint_venant() -> None:
-    """Two meshes and second-order convergence give G · 0.1406 a⁴ · θ/L, within what held ends add."""
+    """Two meshes and second-order convergence give G · 0.1406 a⁴ · θ/L, within the effect of gripped ends."""
     torque = []
     for cells in (4, 8):
         world = beam(cells, dt=1.0)
@@ -98,7 +98,7 @@ def test_bonds_that_contradict_are_refused() -> None:
 
 @pytest.mark.parametrize("strength", [0.5, 9.0])
 def test_a_driven_affine_body_covers_its_share_of_the_way(strength: float) -> None:
-    """From rest, ½‖x − x₀‖² + ½ s ‖x − aim‖² has its minimum s/(1 + s) of the way to the aim."""
+    """From rest, ½‖x − x₀‖² + ½ s ‖x − aim‖² has its minimum s/(1 + s) of the distance to the aim."""
     peg = ipc.AffineBody("peg", ipc.box_surface((2e-3, 2e-3, 2e-3)), drive=strength)
     world = ipc.World([peg], ipc.Settings(velocity_tolerance=1e-9, linear_tolerance=1e-8), device="cpu")
     world.set_target("peg", (1e-3, 0.0, -2e-3))
@@ -119,13 +119,13 @@ def test_teleport_puts_a_driven_affine_body_at_its_pose() -> None:
 
 
 def test_a_turn_however_small_begins_where_the_frame_is() -> None:
-    """Half a turn of 1e-7 rad is half of it: no part of the way is made without a look at the gaps."""
+    """Half a turn of 1e-7 rad is half of it: no part of the motion is made without a check of the gaps."""
     start, end = wp.array([[(0.0, 0, 0, 1)]], dtype=wp.quatd), wp.array([[(0.0, 0, 5e-8, 1)]], dtype=wp.quatd)
     place, turn = wp.zeros((1, 1), dtype=wp.vec3d), wp.zeros((1, 1), dtype=wp.mat33d)
     for share in (0.0, 0.5, 1.0):
         shares = wp.array([share], dtype=wp.float64)
         inputs, outputs = [start, place, end, place, shares], [turn, wp.zeros_like(place), wp.zeros_like(start)]
-        wp.launch(dynamics.frames_at, dim=(1, 1), inputs=inputs, outputs=outputs, device="cpu")
+        wp.launch(frames.frames_at, dim=(1, 1), inputs=inputs, outputs=outputs, device="cpu")
         assert turn.numpy()[0, 0, 1, 0] == pytest.approx(share * 1e-7, rel=1e-9, abs=1e-16)
 
 

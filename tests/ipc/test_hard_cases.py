@@ -1,4 +1,4 @@
-"""The hard cases of experiments/hard_cases.py: surfaces apart after every step, elements upright, bounded iterations, what each says."""
+"""The hard cases: surfaces apart after every step, elements upright, bounded iterations, what each says."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import ipc
-from experiments.hard_run import MAX_NEWTON, Mechanics, Setup, Worst
-from experiments.hard_scenes import CASES, SOFT, random_presses
-from experiments.hard_shapes import cube
+from tests.ipc.hard.run import MAX_NEWTON, Mechanics, Setup, Worst
+from tests.ipc.hard.scenes import CASES, SOFT, random_presses
+from tests.ipc.hard.shapes import cube
 
 SLOW = ["crush", "beam_twist", "mat_twist", "squeeze_and_release", "edge_alignment", "wedge_out_of_crack"]
 """Those that take longer than some two seconds."""
@@ -56,7 +56,7 @@ def test_slow_cases_pass(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["beam_twist", "mat_twist"])
 def test_large_twists_pass(name: str) -> None:
-    """Where a mat snaps, rounding decides how many iterations it takes (173 to 321, for 1e-10 of its stiffness); the mean is steady."""
+    """A mat snaps: rounding decides the number of iterations (173 to 321, for 1e-10 of its stiffness); the mean is steady."""
     worst = CASES[name](Setup(large=True))
     check(name, worst, most=3 * MAX_NEWTON)
     assert worst.newton <= 30 * worst.steps, f"{worst.newton / worst.steps:.3g} Newton iterations a step"

@@ -1,11 +1,11 @@
-"""The oracles of the closed-form tests, checked by routes of their own: they must not be wrong in the way the solver might be."""
+"""The oracles of the closed-form tests, checked by routes of their own: they must not share an error with the solver."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from experiments.contact_oracles import (
+from tests.ipc.oracles.closed_forms import (
     BondedLayer,
     Elastic,
     boussinesq_displacement,

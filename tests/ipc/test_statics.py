@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import ipc
-from experiments.contact_meshes import equal_area, rim_block
-from experiments.contact_oracles import punch_force
-from experiments.ipc_validation import (
+from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
+from tests.ipc.oracles.closed_forms import punch_force
+from tests.ipc.oracles.meshes import equal_area, rim_block
+from tests.ipc.oracles.nodal_press import nodal_press
+from tests.ipc.oracles.presses import (
     CONTACT,
     SOLID,
     cantilever_error,
@@ -19,8 +21,6 @@ from experiments.ipc_validation import (
     punch_error,
     richardson,
 )
-from experiments.nodal_press import nodal_press
-from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
 
 
 def test_cantilever_converges_to_the_beam() -> None:
@@ -45,11 +45,11 @@ def test_hertz_force_is_met() -> None:
 def test_press_errs_by_its_mesh_alone() -> None:
     """A punch on a mesh of three cells to the radius: linear elasticity with exact contact at the vertices has the same force to 1 %."""
     cells, reach = 3, 6.0
-    mesh, held = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
+    mesh, outside = rim_block(CONTACT, cells, growth(cells), reach * CONTACT)
     rim = CONTACT * equal_area(round(2 * np.pi * cells))
     under = np.isclose(mesh.vertices[:, 2], 0) & (np.hypot(*mesh.vertices[:, :2].T) < 1.001 * rim)
     pressed = press_punch(cells, reach=reach)
-    nodal = nodal_press(mesh, held, SOLID, np.where(under, -pressed.depth, np.inf))
+    nodal = nodal_press(mesh, outside, SOLID, np.where(under, -pressed.depth, np.inf))
     assert pressed.force == pytest.approx(nodal, rel=0.01)
     assert 0.08 < nodal / float(punch_force(SOLID, CONTACT, pressed.depth)) - 1 < 0.16
 
@@ -68,9 +68,9 @@ def test_presses_converge_to_the_closed_forms() -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_forces_balance_to_the_residual(friction: float) -> None:
-    """Force on the ball + pull on the case + inertia of the pad is what Newton's method left, to rounding; torques likewise.
+    """Force on the ball + pull on the case + inertia of the pad is Newton's residual, to rounding; torques likewise.
 
-    With friction a torque is left over: the two sides of a pair are a stand-off apart, so f on one and −f on the other are a couple.
+    With friction a torque remains: the two sides of a pair are a stand-off apart, so f on one and −f on the other are a couple.
     """
     mesh = small_pad()
     ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((0.0, 0.0, 4.12e-3)))
@@ -86,11 +86,11 @@ def test_forces_balance_to_the_residual(friction: float) -> None:
             assert world.step().converged[0]
         inertia = mass * (world.velocities("pad")[0] - before) / settings.dt
         on_ball, on_case = world.wrench("ball"), world.wrench("pad")
-        size, left = np.linalg.norm(on_ball.force[0]), on_ball.force[0] + on_case.force[0] + inertia.sum(axis=0)
+        size, remainder = np.linalg.norm(on_ball.force[0]), on_ball.force[0] + on_case.force[0] + inertia.sum(axis=0)
         assert size > 0.1 and np.abs(inertia).sum() > 1e-5 * size
         residual = world._potential.residual.numpy()[0].sum(axis=0)
-        assert left == pytest.approx(-residual, abs=float(1e-13 * size))
-        assert np.abs(left).max() < relative * size
+        assert remainder == pytest.approx(-residual, abs=float(1e-13 * size))
+        assert np.abs(remainder).max() < relative * size
         couple = on_ball.torque[0] + np.cross(world.frame("ball")[1][0], on_ball.force[0]) + on_case.torque[0]
         couple += np.cross(world.positions("pad")[0], inertia).sum(axis=0)
         tangential = np.linalg.norm(on_ball.force[0, :2])

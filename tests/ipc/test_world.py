@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc.pcg import Pcg
 from ipc.reduce import BLOCK
+from ipc.solver.pcg import Pcg
 from tests.ipc.conftest import bonded_pad, small_pad
 
 RADIUS = 4e-3
@@ -28,8 +28,8 @@ def press(world: ipc.World, depth: float | np.ndarray, steps: int, side: float =
     start = world.frame("ball")[1]
     reports = []
     for k in range(1, steps + 1):
-        way = np.stack(np.broadcast_arrays(np.asarray(side) * 1.0, 0.0, -np.asarray(depth) * 1.0), axis=-1)
-        world.set_target("ball", start + way * k / steps)
+        path = np.stack(np.broadcast_arrays(np.asarray(side) * 1.0, 0.0, -np.asarray(depth) * 1.0), axis=-1)
+        world.set_target("ball", start + path * k / steps)
         reports.append(world.step())
     return reports
 
@@ -55,7 +55,7 @@ def test_press_balances_forces_and_stays_apart() -> None:
         report = world.step()  # at rest
     ball, pad = world.wrench("ball"), world.wrench("pad")
     assert ball.force[0, 2] > 0.05
-    # Bound: what Newton left, a node's unbalanced force being about its stiffness times the last step.
+    # Bound: Newton's residual, a node's unbalanced force being about its stiffness times the last step.
     assert np.abs(ball.force + pad.force).max() < 1e-3 * ball.force[0, 2]
     about_world = pad.torque[0] + np.cross(world.frame("pad")[1][0], pad.force[0])
     ball_about_world = ball.torque[0] + np.cross(world.frame("ball")[1][0], ball.force[0])
@@ -78,18 +78,18 @@ def test_forces_by_pair_add_up_to_those_of_each_body() -> None:
         world.set_target("left", start["left"] + k * np.array([[2e-5, 0.0, -8e-5], [0.0, 0.0, 1e-4]]))
         world.set_target("right", start["right"] + k * np.array([0.0, 3e-5, -6e-5]))
         assert world.step().converged.all()
-    found = world.pressing()
-    assert set(found) == {("pad", "left"), ("pad", "right")}
+    by_pair = world.pressing()
+    assert set(by_pair) == {("pad", "left"), ("pad", "right")}
     vertices = world.surface("pad")[0]
     at, forces = world.positions("pad")[:, vertices], world.contact_forces("pad")
     for name, mine in (("left", at[0, :, 0] < 0.0), ("right", at[0, :, 0] > 0.0)):
-        pair = found["pad", name]
+        pair = by_pair["pad", name]
         size = np.linalg.norm(world.wrench(name).force, axis=1).max()
         arm = at[:, mine] - np.nan_to_num(pair.place)[:, None]
         np.testing.assert_allclose(pair.wrench[:, :3], forces[:, mine].sum(axis=1), atol=1e-9 * size)
         np.testing.assert_allclose(pair.wrench[:, 3:], np.cross(arm, forces[:, mine]).sum(axis=1), atol=1e-9 * size)
         assert np.linalg.norm((pair.wrench[:, :3] - pair.normal)[0]) > 0.05 * size  # friction is in it
-    assert not found["pad", "left"].wrench[1].any() and np.isnan(found["pad", "left"].place[1]).all()
+    assert not by_pair["pad", "left"].wrench[1].any() and np.isnan(by_pair["pad", "left"].place[1]).all()
 
 
 def test_bonded_vertices_do_not_move_and_follow_their_frame() -> None:
@@ -213,7 +213,7 @@ def test_teleport_takes_the_pad_along() -> None:
 
 
 def test_infeasible_drive_is_reported_as_blocked() -> None:
-    """The ball is sent through the pad into the rigid case: it stops at the bonded base, and the report says how much was left."""
+    """The ball is sent through the pad into the rigid case: it stops at the bonded base, and the report says how much remained."""
     world = make_world()
     start = world.frame("ball")[1][0]
     total = 0
@@ -289,17 +289,15 @@ def test_bad_input_is_refused_before_anything_changes() -> None:
         world.set_target("ball", np.zeros((3, 3)))
     with pytest.raises(ipc.IpcError, match="finite"):
         world.set_target("ball", (0, 0, np.nan))
-    told = world._goal_p.copy()
+    goals = world._goal_p.copy()
     for ask in (world.set_target, world.teleport):
         with pytest.raises(ipc.IpcError, match="length 1"):
             ask("ball", (0, 0, 2 * RADIUS), (1, 1, 0, 0))
-    assert (world._goal_p == told).all() and (world.frame("ball")[1][:, 2] == RADIUS + GAP).all()
+    assert (world._goal_p == goals).all() and (world.frame("ball")[1][:, 2] == RADIUS + GAP).all()
     with pytest.raises(ipc.IpcError, match="environments 0 to 2"):
         world.reset([0, 2])
     with pytest.raises(ipc.IpcError, match="whole numbers"):
         world.reset([0.5])
-    with pytest.raises(ipc.IpcError, match="choose 'euler' or 'bdf2'"):
-        ipc.Settings(integrator="verlet")  # type: ignore[arg-type]
     with pytest.raises(ipc.IpcError, match="unique"):
         ipc.World([world.bodies[0], world.bodies[0]], device="cpu")
     with pytest.raises(ipc.IpcError, match="nothing can move"):
@@ -315,14 +313,14 @@ def test_blocks_of_threads_reach_all_lanes_of_rows(lanes: int) -> None:
 
 def test_batched_conjugate_gradients_match_the_one_kernel_form(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop for any preconditioner, given block-Jacobi, takes the iterations and gives the press of the kernel that knows it."""
-    from ipc import pcg
+    from ipc.solver import pcg
 
     ends, general = [], []
-    way = pcg.Pcg._solve_on_cpu
-    monkeypatch.setattr(pcg.Pcg, "_solve_on_cpu", lambda *args: general.append(1) or way(*args))
+    solve = pcg.Pcg._solve_by_launches
+    monkeypatch.setattr(pcg.Pcg, "_solve_by_launches", lambda *args: general.append(1) or solve(*args))
     for batched in (False, True):
         if batched:
-            monkeypatch.setattr(pcg, "BlockJacobi", type("Other", (), {}))  # solve() no longer knows it and takes the general way
+            monkeypatch.setattr(pcg, "BlockJacobi", type("Other", (), {}))  # so that solve() takes the general loop
         world = make_world(num_envs=2, friction=0.3)
         reports = press(world, np.array([0.3e-3, 0.4e-3]), 2)
         ends.append((world.positions("pad"), reports[-1].linear))

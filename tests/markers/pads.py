@@ -10,8 +10,8 @@ import numpy as np
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.calibration_presses import Press, PressFrame
+from raytac.markers.config import Fots
 from raytac.markers.contacts import ContactCells, ContactTracker
-from raytac.markers.fots import FotsMarkers
 from raytac.specs import MarkerMotionSpec, SensorSpec, load_sensor
 
 PITCH = 0.1e-3
@@ -48,9 +48,9 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, twist: float = 0.0, rol
     c, s = math.cos(twist), math.sin(twist)
     cr, sr = math.cos(roll), math.sin(roll)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = turn, (x, y, z)
-    return found
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = turn, (x, y, z)
+    return result
 
 
 def pressed(grid: PadGrid, *envs: list[tuple[float, float, float]], poses: list[np.ndarray] | None = None) -> GelSurface:
@@ -91,7 +91,7 @@ def with_coat(surface: GelSurface, mesh: CoatMesh, positions: np.ndarray) -> Gel
 
 def fots_presses(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
     """Presses whose coat is moved by FOTS itself, with the constants of ``MOTION``."""
-    mesh, found = coat_mesh(sensor, 76, 62), []
+    mesh, states = coat_mesh(sensor, 76, 62), []
     for name, x, y, deep, shear, twist in (
         ("a", 0.0, 0.0, 8e-4, (5e-4, 2e-4), 0.0), ("b", 1e-3, -2e-3, 6e-4, (-8e-4, 0.0), 0.0), ("c", -2e-3, 1e-3, 7e-4, (0.0, 0.0), 0.45)
     ):  # fmt: skip
@@ -102,13 +102,13 @@ def fots_presses(sensor: SensorSpec, grid: PadGrid) -> list[PressFrame]:
             px, py = x + share * shear[0], y + share * shear[1]
             balls = [(px, py, depth)] if depth > 0 else []
             surface = pressed(grid, balls, poses=[pose(px, py, -depth, share * twist)])
-            found.append((press, load, surface))
-    return _with_coats(sensor, grid, mesh, found)
+            states.append((press, load, surface))
+    return _with_coats(sensor, grid, mesh, states)
 
 
-def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh: CoatMesh, found: list) -> list[PressFrame]:
-    model, cells, frames, last = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid), [], None
-    for press, load, surface in found:
+def _with_coats(sensor: SensorSpec, grid: PadGrid, mesh: CoatMesh, states: list) -> list[PressFrame]:
+    model, cells, frames, last = Fots().build(sensor, grid, num_envs=1, device="cpu"), ContactCells.over(grid), [], None
+    for press, load, surface in states:
         if press is not last:
             tracker, last = ContactTracker(1), press
         samples = cells.sample(surface)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import PadGrid
-from raytac.markers.calibration import PUBLISHED, ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
+from raytac.markers.calibration import ProbeData, fit_motion, model_errors, pattern_search, probe_sensor
 from raytac.markers.calibration_presses import FIT, HELD_OUT, PressFrame
 from raytac.markers.pattern import MarkerPattern
+from raytac.markers.registry import models_without_coat
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import PunchSpec, SensorSpec, load_sensor, validate_press
 from raytac.specs.marker_motion import load_marker_motion, marker_motion_text
@@ -21,8 +22,8 @@ def test_pattern_search_finds_the_bottom_of_a_valley() -> None:
     def cost(x: np.ndarray) -> float:
         return abs(x[0] - 0.3) + 3 * (x[1] + 1.2 + 0.5 * x[0]) ** 2
 
-    found, least = pattern_search(cost, np.zeros(2))
-    assert found == pytest.approx((0.3, -1.35), abs=0.01) and least < 0.01
+    point, least = pattern_search(cost, np.zeros(2))
+    assert point == pytest.approx((0.3, -1.35), abs=0.01) and least < 0.01
 
 
 def test_presses_fit_the_sensor_and_are_held_out() -> None:
@@ -59,10 +60,10 @@ def test_the_fit_finds_the_punch_again(sensor: SensorSpec, grid: PadGrid) -> Non
     assert fitted.marker_motion is not None and fitted.marker_motion.punch is not None
     for name in ("anisotropy", "reach", "slip"):
         assert getattr(fitted.marker_motion.punch, name) == pytest.approx(getattr(punch, name), rel=0.1), name
-    errors, _ = model_errors(fitted, frames, grid, models=("fots", PUBLISHED), device="cpu")
+    errors, _ = model_errors(fitted, frames, grid, models=("fots", "fots_published"), device="cpu")
     by = {(e.model, e.load): e.mean for e in errors}
     for load in ("shear", "twist"):
-        assert by["fots", load] < 3e-6 and by["fots", load] < 0.3 * by[PUBLISHED, load]
+        assert by["fots", load] < 3e-6 and by["fots", load] < 0.3 * by["fots_published", load]
 
 
 def test_errors_are_small_for_the_model_that_made_the_data_only(
@@ -99,18 +100,18 @@ def test_the_file_of_a_fit_is_read_back(tmp_path) -> None:
 
 
 def test_the_report_tells_every_model_and_every_press(sensor: SensorSpec, frames: list[PressFrame]) -> None:
-    from raytac.report.markers import TESTED, calibrate_markers, error_table
+    from raytac.report.markers import calibrate_markers, error_table
 
     pytest.importorskip("warp")  # superposition's pad
     fit, held_out = frames[: len(frames) // 3], frames[len(frames) // 3 :]
-    report = calibrate_markers(sensor, fit, held_out, pad="coarse", device="cpu")
+    report = calibrate_markers(sensor, fit, held_out, level="coarse", device="cpu")
     names = list(dict.fromkeys(str(frame.press) for frame in frames))
     assert len(names) == 3 and [name for name, _ in report.by_press] == names
     # A press alone has the error that it has among others: all held-out twists are of the last press.
     (twist,) = (row for row in report.errors if (row.model, row.load) == ("fots", "twist"))
     assert report.by_press[-1][1].mean == pytest.approx(twist.mean, rel=1e-6)
     text = error_table(report)
-    for name in (*TESTED, *names):
+    for name in (*models_without_coat(), *names):
         assert f"| {name} |" in text
     assert text.count("| fit |") == 1 and text.count("| held out |") == 2
     assert f"{1e6 * twist.mean:.1f} um" in report.motion.provenance

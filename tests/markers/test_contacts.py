@@ -61,17 +61,17 @@ def test_centre_of_a_ball(grid: PadGrid) -> None:
 @pytest.mark.parametrize("radius", [0.5e-3, 2e-3, 5e-3])
 def test_the_radius_counts_every_cell_that_a_disc_touches(radius: float, grid: PadGrid) -> None:
     """Over places at random, cells touched × their area is the area of the disc swept by a cell's nodes: π R² + 2 R (a + b) + a b."""
-    cells, draw, found = ContactCells.over(grid), np.random.default_rng(0), []
+    cells, draw, radii = ContactCells.over(grid), np.random.default_rng(0), []
     for x, y in draw.uniform(-2e-3, 2e-3, (30, 2)):
         contact = (((grid.x - x) ** 2)[None, :] + ((grid.y - y) ** 2)[:, None] < radius**2)[None]
         height = (grid.rest - 1e-4 * contact).astype(np.float32)
         surface = GelSurface(grid, height, contact, np.array([[x, y]]), pose()[None])
-        found.append(ContactTracker(1).update(surface, cells.sample(surface)).radius[0, 0])
+        radii.append(ContactTracker(1).update(surface, cells.sample(surface)).radius[0, 0])
     a, b = ((count - 1) * pitch for count, pitch in zip(cells.nodes, grid.pitch, strict=True))
     swept = np.sqrt(radius**2 + (2.0 * radius * (a + b) + a * b) / np.pi)
-    assert np.mean(found) == pytest.approx(swept, abs=1e-5)
+    assert np.mean(radii) == pytest.approx(swept, abs=1e-5)
     assert 0.14e-3 < swept - radius < 0.17e-3  # the bias that it is, on this grid
-    assert np.ptp(found) < 0.15e-3
+    assert np.ptp(radii) < 0.15e-3
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 120.0])
@@ -85,10 +85,10 @@ def test_the_ellipse_of_an_elliptic_contact_is_its_own(angle_deg: float, grid: P
     height = (grid.rest - 1e-4 * contact).astype(np.float32)
     contacts = follow(grid, GelSurface(grid, height[None], contact[None], np.array([[1.1e-3, -0.7e-3]]), pose()[None]))
     xx, xy, yy = contacts.ellipse[0, 0]
-    found = np.array([[xx, xy], [xy, yy]])
+    ellipse = np.array([[xx, xy], [xy, yy]])
     expected = turn @ np.diag(np.square((4.15e-3, 1.65e-3))) @ turn.T
-    np.testing.assert_allclose(found, expected, atol=0.05 * expected.max())
-    assert np.sqrt(np.linalg.det(found)) == pytest.approx(contacts.radius[0, 0] ** 2)
+    np.testing.assert_allclose(ellipse, expected, atol=0.05 * expected.max())
+    assert np.sqrt(np.linalg.det(ellipse)) == pytest.approx(contacts.radius[0, 0] ** 2)
     volume = contact.sum() * 1e-4 * np.prod(grid.pitch)
     assert contacts.depth[0, 0] == pytest.approx(volume / (np.pi * contacts.radius[0, 0] ** 2), rel=1e-3)
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.skipif(bool(cuda_missing()), reason=f"CUDA for Mitsuba: {cuda_missing()}")
 def test_fots_on_cuda_equals_the_cpu(tmp_path: Path) -> None:
-    found = {}
+    result = {}
     for device in ("cpu", "cuda"):
         path = tmp_path / f"{device}.npz"
         command = [sys.executable, "-m", "tests.markers.track_on", device, str(path)]
@@ -28,8 +28,8 @@ def test_fots_on_cuda_equals_the_cpu(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         with np.load(path) as arrays:
             assert arrays["device"] == device
-            found[device] = arrays["displacement"], arrays["displacement_px"]
-    (cpu, cpu_px), (cuda, cuda_px) = found["cpu"], found["cuda"]
+            result[device] = arrays["displacement"], arrays["displacement_px"]
+    (cpu, cpu_px), (cuda, cuda_px) = result["cpu"], result["cuda"]
     assert (np.linalg.norm(cpu[-1], axis=-1).max(axis=-1) > 2e-5).all() and not cpu[:-1, 2].any()
     # float32 sums over some hundred samples, with another exp.
     np.testing.assert_allclose(cuda, cpu, rtol=1e-4, atol=1e-9)
@@ -46,9 +46,9 @@ def test_surface_markers_of_a_pad_simulated_on_cuda_equal_the_cpu() -> None:
     scene = PressScene("ball", target, (StageSpec("indent", depth=0.5e-3), StageSpec("shear", shear=(0.3e-3, 0.0))))
     moved = {}
     for device in ("cpu", "cuda"):
-        pad = SoftPad(sensor, scene, pitch=0.2e-3, pad="coarse", device=device)
+        pad = SoftPad(sensor, scene, pitch=0.2e-3, level="coarse", device=device)
         tracker = MarkerTracker(sensor, "surface", pad.grid)
-        frames = [tracker.update(pad.surface(state)) for state in pad.run(steps_per_stage=2)]
+        frames = [tracker.update(state.surface) for state in pad.run(steps_per_stage=2)]
         moved[device] = np.stack([frame.displacement[0] for frame in frames])
     length = np.linalg.norm(moved["cpu"], axis=-1)
     assert np.isfinite(moved["cuda"]).all() and length[-1].max() > 1e-4

@@ -9,10 +9,9 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.dots import dot_ink
-from raytac.markers.pattern import MarkerPattern
+from raytac.markers.pattern import MarkerPattern, dot_ink
+from raytac.optics import Phong, RayTraced
 from raytac.optics.image.phong import PhongMode
-from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import SensorSpec
 
 SIZE = (160, 120)
@@ -65,9 +64,9 @@ def test_ray_traced_dots(integrator: str, sensor: SensorSpec, dotted: tuple[GelS
     """On a Lambertian coat under direct light a dot returns its share of albedo, and nothing changes beside it."""
     lambertian = replace(sensor, coat=replace(sensor.coat, specular=0.0))
     spp, depth = (None, -1) if integrator == "fast" else (16, 1 if integrator == "reference" else 2)
-    tracer = RayTracer(
-        lambertian, integrator=integrator, spp=spp, max_depth=depth, bounce=False, resolution=SIZE, outputs=("layers",), device="cpu"
-    )  # fmt: skip
+    tracer = RayTraced(integrator=integrator, spp=spp, max_depth=depth, bounce=False).build(
+        lambertian, resolution=SIZE, outputs=("layers",), device="cpu"
+    )
     plain, dots, (u, v) = dotted[0], dotted[1], dotted[2].T
     before, after = (sum(tracer.render_layers(surface).values())[0] for surface in (plain, dots))  # type: ignore[index]
     share = sensor.markers.reflectance / sensor.coat.reflectance[0]
@@ -80,7 +79,7 @@ def test_ray_traced_dots(integrator: str, sensor: SensorSpec, dotted: tuple[GelS
 
 
 def test_a_batch_with_dots_is_single(sensor: SensorSpec, dotted: tuple[GelSurface, GelSurface, np.ndarray]) -> None:
-    tracer = RayTracer(sensor, bounce=False, resolution=SIZE, device="cpu")
+    tracer = RayTraced(bounce=False).build(sensor, resolution=SIZE, device="cpu")
     plain, dots, _ = dotted
     assert dots.ink is not None
     both = replace(
@@ -100,7 +99,7 @@ def test_a_batch_with_dots_is_single(sensor: SensorSpec, dotted: tuple[GelSurfac
 
 @pytest.fixture(scope="module")
 def mode(sensor: SensorSpec) -> PhongMode:
-    return PhongMode(sensor, resolution=SIZE, device="cpu")
+    return Phong().build(sensor, resolution=SIZE, device="cpu")
 
 
 def test_dots_of_a_mode_that_knows_levels_only(

@@ -10,6 +10,8 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.markers.base import MarkerModel
+from raytac.markers.config import Fots
 from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.pattern import marker_centres
 from raytac.markers.tracker import MarkerTracker
@@ -28,7 +30,7 @@ def by_loop(
     sensor: SensorSpec, grid: PadGrid, surface: GelSurface, contacts: list[tuple[float, float, float, float, float]]
 ) -> np.ndarray:
     """Thesis eq. 4.1 to 4.3, node by node and marker by marker; ``contacts``: G_x, G_y, Δs_x, Δs_y, Δθ, all before the caps."""
-    found = []
+    result = []
     dx, dy = grid.pitch
     ys, xs = np.nonzero(surface.contact[0])
     for mx, my in marker_centres(sensor.markers):
@@ -49,8 +51,8 @@ def by_loop(
             ex, ey = dragged_x - grid.x[i], dragged_y - grid.y[j]
             w = MOTION.dilate_gain * dx * dy * h * math.exp(-MOTION.dilate_lambda * (ex * ex + ey * ey))
             ux, uy = ux + w * ex, uy + w * ey
-        found.append((ux, uy))
-    return np.array(found)
+        result.append((ux, uy))
+    return np.array(result)
 
 
 @pytest.mark.parametrize(("shear", "twist"), [((3e-4, -4e-4), -0.2), ((-6e-4, 7e-4), 0.8)], ids=["within", "beyond the caps"])
@@ -68,15 +70,15 @@ def test_it_equals_a_loop(shear: tuple[float, float], twist: float, sensor: Sens
 def test_the_sum_over_cells_alone_equals_a_loop_over_cells(sensor: SensorSpec, grid: PadGrid) -> None:
     """To rounding, on the kernel's own samples."""
     from raytac.markers.contacts import ContactCells
-    from raytac.markers.fots_kernel import FotsConstants, FotsKernel
+    from raytac.markers.fots import FotsKernel
 
     cells = ContactCells.over(grid)
     samples = cells.sample(pressed(grid, [(1e-3, 0, DEEP), (-3e-3, 2e-3, 3e-4)]))
     kernel = FotsKernel(cells.x, cells.y, device="cpu")
     markers = marker_centres(sensor.markers)
-    constants = FotsConstants(2e8, 1e5, 1e5, 1e-3, 1e5, 0.5)
+    motion = replace(MOTION, dilate_gain=2e8, dilate_lambda=1e5)
     none = np.zeros((1, 1, 12))
-    moved = kernel.displacement(markers[None], samples.depth, samples.boxes, none, constants)[0]
+    moved = kernel.displacement(markers[None], samples.depth, samples.boxes, none, motion)[0]
     expected = np.zeros_like(markers)
     for j, i in zip(*np.nonzero(samples.contact[0]), strict=True):
         out = markers - (cells.x[i], cells.y[j])
@@ -117,9 +119,9 @@ def test_it_dilates_outwards(sensor: SensorSpec, grid: PadGrid) -> None:
 def test_caps(sensor: SensorSpec, grid: PadGrid) -> None:
     """The skin that is dragged to the contact's centre, where there is no dilation, follows to the cap and no further."""
     middle = int(np.linalg.norm(marker_centres(sensor.markers), axis=1).argmin())
-    for way in (2e-4, 5e-4, 9e-4, 1.4e-3):
-        followed = min(way, MOTION.shear_max)
-        start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (followed - way, followed))
+    for shear in (2e-4, 5e-4, 9e-4, 1.4e-3):
+        followed = min(shear, MOTION.shear_max)
+        start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (followed - shear, followed))
         assert run(sensor, grid, start, end)[0, middle] == pytest.approx((followed, 0.0), abs=2e-6)
 
     def twisted(angle: float) -> np.ndarray:
@@ -160,16 +162,18 @@ def test_a_sensor_that_nobody_calibrated_says_how(grid: PadGrid) -> None:
 
 def test_moved_places_at_rest_are_noticed(sensor: SensorSpec, grid: PadGrid) -> None:
     """The upload of places is kept from frame to frame: not when an array is another one, or was written to."""
-    from raytac.markers.fots import FotsMarkers
 
-    model, cells = FotsMarkers(sensor, grid, device="cpu"), ContactCells.over(grid)
+    def make() -> MarkerModel:
+        return Fots().build(sensor, grid, num_envs=1, device="cpu")
+
+    model, cells = make(), ContactCells.over(grid)
     surface = pressed(grid, [(1e-3, 0, DEEP)])
     samples = cells.sample(surface)
     contacts = ContactTracker(1).update(surface, samples)
     rest = np.concatenate([marker_centres(sensor.markers), np.zeros((sensor.markers.rows * sensor.markers.columns, 1))], axis=1)
     rest, moved = rest[None], rest[None] + (7e-4, 0, 0)
     first = model.displacement(rest, surface, samples, contacts)
-    expected = FotsMarkers(sensor, grid, device="cpu").displacement(moved, surface, samples, contacts)
+    expected = make().displacement(moved, surface, samples, contacts)
     assert np.abs(first - expected).max() > 1e-5
     np.testing.assert_array_equal(model.displacement(moved, surface, samples, contacts), expected)
     rest[:] = moved

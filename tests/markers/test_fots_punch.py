@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import PadGrid
-from raytac.markers.calibration import PUBLISHED, model_errors
+from raytac.markers.calibration import model_errors
 from raytac.markers.contacts import ContactCells
-from raytac.markers.fots_kernel import FotsConstants, FotsKernel
+from raytac.markers.fots import FotsKernel
 from raytac.specs import PunchSpec, SensorSpec
 from tests.markers.pads import MOTION, fots_presses
 
@@ -41,15 +41,15 @@ def moved(
     nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
     samples = nothing if depth is None else depth[None].astype(np.float32)
     box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
-    constants = FotsConstants(gain, 1e5, 0.8e5, 1e-3, 1.2e5, 0.5, punch)
-    return kernel.displacement(markers[None], samples, box, table, constants)[0].astype(float)
+    motion = replace(MOTION, dilate_gain=gain, dilate_lambda=1e5, shear_max=1e-3, twist_max=0.5, punch=punch)
+    return kernel.displacement(markers[None], samples, box, table, motion)[0].astype(float)
 
 
-def limited(way: np.ndarray, theta: float, most: float, widest: float) -> tuple[np.ndarray, float]:
+def limited(shear: np.ndarray, theta: float, most: float, widest: float) -> tuple[np.ndarray, float]:
     """The closest point of the ellipsoid in elastic energy, by bisection: K_t / K_f = A², as on incompressible rubber."""
-    x, y = np.hypot(*way) / most, abs(theta) / widest
+    x, y = np.hypot(*shear) / most, abs(theta) / widest
     if x * x + y * y <= 1:
-        return way, theta
+        return shear, theta
     low, high = 0.0, x + y
     for _ in range(80):
         middle = 0.5 * (low + high)
@@ -57,20 +57,20 @@ def limited(way: np.ndarray, theta: float, most: float, widest: float) -> tuple[
             low = middle
         else:
             high = middle
-    return way / (1 + low), theta / (1 + low / TURN**2)
+    return shear / (1 + low), theta / (1 + low / TURN**2)
 
 
 def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, gain: float, depth: np.ndarray) -> np.ndarray:
     """Contact by contact, marker by marker and cell by cell, with the confocal coordinate by bisection."""
-    cells, found = ContactCells.over(grid), []
+    cells, result = ContactCells.over(grid), []
     for mx, my in PLACES:
         shears, twists, es, et = np.zeros(2), np.zeros(2), 0.0, 0.0
         for gx, gy, sx, sy, theta, xx, xy, yy, mean in contacts:
             shape = np.array([[xx, xy], [xy, yy]])
             radius = np.linalg.det(shape) ** 0.25
             most = punch.slip * mean * radius
-            way, theta = limited(np.array([sx, sy]), theta, most, TURN * most / radius)
-            x = np.array([mx, my]) - (np.array([gx, gy]) - way)
+            shear, theta = limited(np.array([sx, sy]), theta, most, TURN * most / radius)
+            x = np.array([mx, my]) - (np.array([gx, gy]) - shear)
             low, high = 0.0, float(x @ x)
             for _ in range(80):
                 middle = 0.5 * (low + high)
@@ -84,7 +84,10 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
             fade = math.exp(-(r - radius) / punch.reach)
             hat = x / max(np.hypot(*x), 1e-12)
             shears += (
-                2 / math.pi * fade * ((math.asin(t) - punch.anisotropy * g) * way + 2 * punch.anisotropy * g * hat * (hat @ way))
+                2
+                / math.pi
+                * fade
+                * ((math.asin(t) - punch.anisotropy * g) * shear + 2 * punch.anisotropy * g * hat * (hat @ shear))
             )
             es += 2 / math.pi * fade * math.asin(t)
             w = 2 / math.pi * (math.asin(t) - g)
@@ -97,13 +100,13 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
         for j, i in zip(*np.nonzero(depth), strict=True):
             e = np.array([mx, my]) + drag - (cells.x[i], cells.y[j])
             total += gain * cells.area * depth[j, i] * e * math.exp(-1e5 * (e @ e))
-        found.append(total)
-    return np.array(found)
+        result.append(total)
+    return np.array(result)
 
 
-def disc(radius: float, *, way: tuple[float, float] = (0.0, 0.0), twist: float = 0.0, mean: float = 3e-4) -> tuple[float, ...]:
+def disc(radius: float, *, shear: tuple[float, float] = (0.0, 0.0), twist: float = 0.0, mean: float = 3e-4) -> tuple[float, ...]:
     """A round contact about the origin, where the skin was at rest."""
-    return way[0], way[1], *way, twist, radius**2, 0.0, radius**2, mean
+    return shear[0], shear[1], *shear, twist, radius**2, 0.0, radius**2, mean
 
 
 def test_it_equals_a_loop(grid: PadGrid) -> None:
@@ -124,8 +127,10 @@ def test_under_the_contact_the_skin_is_the_object(grid: PadGrid) -> None:
     inside = PLACES[np.linalg.norm(PLACES, axis=1) < 3e-3]
     assert len(inside) > 10
     still = PunchSpec(0.7, 6e-3, 1e5)
-    way = (3e-4, -2e-4)
-    np.testing.assert_allclose(moved(grid, still, [disc(3.4e-3, way=way)], inside), np.tile(way, (len(inside), 1)), atol=1e-9)
+    shear = (3e-4, -2e-4)
+    np.testing.assert_allclose(
+        moved(grid, still, [disc(3.4e-3, shear=shear)], inside), np.tile(shear, (len(inside), 1)), atol=1e-9
+    )
     c, s = math.cos(0.5), math.sin(0.5)
     turned = inside @ np.array([[c, s], [-s, c]]) - inside
     np.testing.assert_allclose(moved(grid, still, [disc(3.4e-3, twist=0.5)], inside), turned, atol=2e-9)
@@ -133,13 +138,13 @@ def test_under_the_contact_the_skin_is_the_object(grid: PadGrid) -> None:
 
 def test_far_away_it_is_the_point_load_of_cerruti(grid: PadGrid) -> None:
     """u = F / (2π G r) ((1 − ν) s + ν x̂ (x̂ · s)), with the force of the disc, F = 8 G A Δs / (2 − ν) (Johnson §3.2, 3.6)."""
-    radius, way = 0.4e-3, np.array([2e-4, 1e-4])
+    radius, shear = 0.4e-3, np.array([2e-4, 1e-4])
     far = PLACES[np.linalg.norm(PLACES, axis=1) > 5e-3]
     r = np.linalg.norm(far, axis=1, keepdims=True)
     hat = far / r
-    point = 8 * radius / (2 - NU) / (2 * math.pi * r) * ((1 - NU) * way + NU * hat * (hat @ way)[:, None])
-    found = moved(grid, HALF_SPACE, [disc(radius, way=(way[0], way[1]))], far)
-    np.testing.assert_allclose(found, point, atol=0.01 * np.linalg.norm(point, axis=1).max())
+    point = 8 * radius / (2 - NU) / (2 * math.pi * r) * ((1 - NU) * shear + NU * hat * (hat @ shear)[:, None])
+    result = moved(grid, HALF_SPACE, [disc(radius, shear=(shear[0], shear[1]))], far)
+    np.testing.assert_allclose(result, point, atol=0.01 * np.linalg.norm(point, axis=1).max())
 
 
 def test_far_away_a_twist_is_the_couple_on_a_point(grid: PadGrid) -> None:
@@ -147,25 +152,25 @@ def test_far_away_a_twist_is_the_couple_on_a_point(grid: PadGrid) -> None:
     radius, angle = 0.8e-3, 0.05
     far = PLACES[np.linalg.norm(PLACES, axis=1) > 6e-3]
     r = np.linalg.norm(far, axis=1)
-    found = moved(grid, HALF_SPACE, [disc(radius, twist=angle)], far)
-    around = (found * np.stack([-far[:, 1], far[:, 0]], axis=1)).sum(axis=1) / r
+    result = moved(grid, HALF_SPACE, [disc(radius, twist=angle)], far)
+    around = (result * np.stack([-far[:, 1], far[:, 0]], axis=1)).sum(axis=1) / r
     np.testing.assert_allclose(around, 16 / 3 * radius**3 * angle / (4 * math.pi * r**2), rtol=0.02)
 
 
 def test_turning_the_load_turns_the_field(grid: PadGrid) -> None:
     c, s = math.cos(0.9), math.sin(0.9)
     turn = np.array([[c, -s], [s, c]])
-    way, shape = np.array([4e-4, 1e-4]), np.diag((9e-6, 1e-6))
-    turned_way, turned_shape = turn @ way, turn @ shape @ turn.T
+    shear, shape = np.array([4e-4, 1e-4]), np.diag((9e-6, 1e-6))
+    turned_shear, turned_shape = turn @ shear, turn @ shape @ turn.T
 
-    def field(way: np.ndarray, shape: np.ndarray, markers: np.ndarray) -> np.ndarray:
-        return moved(grid, PAD, [(*way, *way, 0.1, shape[0, 0], shape[0, 1], shape[1, 1], 3e-4)], markers)
+    def field(shear: np.ndarray, shape: np.ndarray, markers: np.ndarray) -> np.ndarray:
+        return moved(grid, PAD, [(*shear, *shear, 0.1, shape[0, 0], shape[0, 1], shape[1, 1], 3e-4)], markers)
 
-    plain = field(way, shape, PLACES)
+    plain = field(shear, shape, PLACES)
     assert np.linalg.norm(plain, axis=1).max() > 3e-4
-    np.testing.assert_allclose(field(turned_way, turned_shape, PLACES @ turn.T), plain @ turn.T, atol=3e-9)
+    np.testing.assert_allclose(field(turned_shear, turned_shape, PLACES @ turn.T), plain @ turn.T, atol=3e-9)
     # Without it: a sheared disc alone already moves farther along than across.
-    assert np.abs(field(turned_way, shape, PLACES @ turn.T) - plain @ turn.T).max() > 1e-5
+    assert np.abs(field(turned_shear, shape, PLACES @ turn.T) - plain @ turn.T).max() > 1e-5
 
 
 @pytest.mark.parametrize("punch", [None, PAD, replace(PAD, anisotropy=0.0), replace(PAD, slip=0.0)])
@@ -174,18 +179,18 @@ def test_no_load_moves_nothing(punch: PunchSpec | None, grid: PadGrid) -> None:
     markers = np.concatenate([PLACES, np.zeros((1, 2))])
     for contact in (disc(2e-3), disc(2e-3, mean=0.0), disc(1e-5)):
         assert not moved(grid, punch, [contact], markers).any()
-    sheared = moved(grid, punch, [disc(2e-3, way=(1e-12, 0.0), twist=1e-12)], markers)
+    sheared = moved(grid, punch, [disc(2e-3, shear=(1e-12, 0.0), twist=1e-12)], markers)
     assert np.isfinite(sheared).all() and np.abs(sheared).max() < 2e-12
-    large = moved(grid, punch, [disc(2e-3, way=(1e-3, 0.0), twist=1.0)], markers)
+    large = moved(grid, punch, [disc(2e-3, shear=(1e-3, 0.0), twist=1.0)], markers)
     assert np.isfinite(large).all()
 
 
 def test_it_stops_where_it_slips(grid: PadGrid) -> None:
-    """Way up to c h̄ A, and half of that at half the indentation; a spin likewise."""
+    """Shear up to c h̄ A, and half of that at half the indentation; a spin likewise."""
     centre = np.zeros((1, 2))
     for mean, most in ((3e-4, 6e-4), (1.5e-4, 3e-4)):
-        for way, followed in ((0.5 * most, 0.5 * most), (most, most), (2 * most, most)):
-            contact = (way, 0.0, way, 0.0, 0.0, 4e-6, 0.0, 4e-6, mean)
+        for shear, followed in ((0.5 * most, 0.5 * most), (most, most), (2 * most, most)):
+            contact = (shear, 0.0, shear, 0.0, 0.0, 4e-6, 0.0, 4e-6, mean)
             assert moved(grid, PAD, [contact], centre)[0, 0] == pytest.approx(followed, rel=1e-5)
         edge = np.array([[1.9e-3, 0.0]])
         spun = [np.linalg.norm(moved(grid, PAD, [disc(2e-3, twist=t, mean=mean)], edge)) for t in (0.05, 0.8, 1.6)]
@@ -193,23 +198,23 @@ def test_it_stops_where_it_slips(grid: PadGrid) -> None:
         assert spun[1] == pytest.approx(2 * math.sin(0.5 * 3 * math.pi / 16 * most / 2e-3) * 1.9e-3, rel=1e-4)
 
 
-def test_a_contact_that_spins_gives_way_sideways(grid: PadGrid) -> None:
-    """Shear and spin share one friction: far past the limit the shear that is left goes to 0 as the spin grows, and the other way round."""
+def test_a_contact_that_spins_slides_sideways(grid: PadGrid) -> None:
+    """Shear and spin share one friction: far past the limit the remaining shear goes to 0 as the spin grows, and vice versa."""
     centre, edge = np.zeros((1, 2)), np.array([[1.9e-3, 0.0]])
     most = PAD.slip * 3e-4 * 2e-3
     widest = TURN * most / 2e-3
 
-    def left(way: float, turn: float) -> tuple[float, float]:
-        dragged, theta = limited(np.array([way, 0.0]), turn, most, widest)
-        contact = (dragged[0], 0.0, way, 0.0, turn, 4e-6, 0.0, 4e-6, 3e-4)
+    def after_slip(shear: float, turn: float) -> tuple[float, float]:
+        dragged, theta = limited(np.array([shear, 0.0]), turn, most, widest)
+        contact = (dragged[0], 0.0, shear, 0.0, turn, 4e-6, 0.0, 4e-6, 3e-4)
         shift = moved(grid, PAD, [contact], centre)[0, 0]
         spun = moved(grid, PAD, [contact], edge)[0] - (shift, 0.0)
         assert np.linalg.norm(spun) == pytest.approx(2 * math.sin(0.5 * theta) * 1.9e-3, rel=1e-3)
         return shift, theta
 
-    within = left(0.6 * most, 0.6 * widest)
+    within = after_slip(0.6 * most, 0.6 * widest)
     assert within == pytest.approx((0.6 * most, 0.6 * widest), rel=1e-5)
-    shears, turns = zip(*(left(2 * most, k * widest) for k in (0.0, 0.5, 2.0, 8.0, 30.0)), strict=True)
+    shears, turns = zip(*(after_slip(2 * most, k * widest) for k in (0.0, 0.5, 2.0, 8.0, 30.0)), strict=True)
     assert shears[0] == pytest.approx(most, rel=1e-5) and turns[0] == 0
     assert (np.diff(shears) < 0).all() and (np.diff(turns) > 0).all()
     assert shears[-1] < 0.25 * most and turns[-1] == pytest.approx(widest, rel=0.05)
@@ -219,19 +224,19 @@ def test_a_contact_that_spins_gives_way_sideways(grid: PadGrid) -> None:
 
 def test_alike_in_all_directions_and_as_published(grid: PadGrid) -> None:
     """κ = 0 moves all markers along the shear; without the punch the published Gaussians come out to rounding."""
-    way, contact = np.array([3e-4, 1e-4]), disc(2e-3, way=(3e-4, 1e-4))
+    shear, contact = np.array([3e-4, 1e-4]), disc(2e-3, shear=(3e-4, 1e-4))
     even = moved(grid, replace(PAD, anisotropy=0.0), [contact])
-    assert np.abs(even[:, 0] * way[1] - even[:, 1] * way[0]).max() < 1e-12 and np.abs(even).max() > 2e-4
+    assert np.abs(even[:, 0] * shear[1] - even[:, 1] * shear[0]).max() < 1e-12 and np.abs(even).max() > 2e-4
     r2 = (PLACES**2).sum(axis=1)
-    np.testing.assert_allclose(moved(grid, None, [contact]), np.exp(-0.8e5 * r2)[:, None] * way, atol=1e-10)
+    np.testing.assert_allclose(moved(grid, None, [contact]), np.exp(-0.8e5 * r2)[:, None] * shear, atol=1e-10)
 
 
 def test_errors_of_the_published_form_are_those_without_the_punch(sensor: SensorSpec, grid: PadGrid) -> None:
     with_punch = replace(sensor, marker_motion=replace(MOTION, punch=PAD))
     frames = fots_presses(with_punch, grid)
-    errors, times = model_errors(with_punch, frames, grid, models=("fots", PUBLISHED), device="cpu")
+    errors, times = model_errors(with_punch, frames, grid, models=("fots", "fots_published"), device="cpu")
     plain, _ = model_errors(sensor, frames, grid, models=("fots",), device="cpu")
     by = {(e.model, e.load): e.mean for e in errors}
     for row in plain:
-        assert by[PUBLISHED, row.load] == row.mean
-    assert by["fots", "shear"] < 0.1 * by[PUBLISHED, "shear"] and set(times) == {"surface", "fots", PUBLISHED}
+        assert by["fots_published", row.load] == row.mean
+    assert by["fots", "shear"] < 0.1 * by["fots_published", "shear"] and set(times) == {"surface", "fots", "fots_published"}

@@ -10,16 +10,15 @@ import pytest
 
 from raytac.gel.surface import PadGrid
 from raytac.io.arrays import npy_bytes
-from raytac.markers import compliance
-from raytac.markers.compliance import cached_compliance, coat_compliance, rest_stiffness
+from raytac.markers import superposition
 from raytac.markers.pattern import marker_centres
 from raytac.markers.sampling import height_and_slope
-from raytac.markers.superposition import SuperpositionMarkers
+from raytac.markers.superposition import SuperpositionModel, cached_compliance, coat_compliance, rest_stiffness
 from raytac.markers.tracker import MarkerTracker
 from raytac.physics.soft.bodies import pad_body
 from raytac.physics.soft.mesh import PadLevel, PadMesh, pad_mesh
 from raytac.specs import SensorSpec
-from tests.ipc.test_elasticity import energy_change, make_potential
+from tests.ipc.solver.test_elasticity import energy_change, make_potential
 from tests.markers.pads import BALL, MOTION, pose, pressed
 
 DEEP = 6e-4
@@ -77,10 +76,10 @@ def test_the_cache_gives_back_what_it_was_given_and_nothing_damaged(
     (kept,) = (tmp_path / "markers").glob("*.npy")
     whole = kept.read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(compliance, "coat_compliance", lambda *_: pytest.fail("it was kept"))
+        patch.setattr(superposition, "coat_compliance", lambda *_: pytest.fail("it was kept"))
         np.testing.assert_array_equal(cached_compliance(small, sensor.gelpad), first)
     made: list[int] = []
-    monkeypatch.setattr(compliance, "coat_compliance", lambda *_: (made.append(1), first)[1])
+    monkeypatch.setattr(superposition, "coat_compliance", lambda *_: (made.append(1), first)[1])
     other = first.copy()
     other[0, 0] = np.nan
     flipped = bytearray(whole)
@@ -109,7 +108,7 @@ def test_superposition_of_a_symmetric_press_is_symmetric(sensor: SensorSpec, gri
     np.testing.assert_allclose(moved[::-1] * (1, -1), moved, atol=2e-7)
 
 
-def test_superposition_drags_what_is_held(sensor: SensorSpec, grid: PadGrid, superposed: MarkerTracker) -> None:
+def test_superposition_drags_what_sticks(sensor: SensorSpec, grid: PadGrid, superposed: MarkerTracker) -> None:
     superposed.reset()
     start, end = (pressed(grid, [(x, 0, DEEP)], poses=[pose(x)]) for x in (0.0, 3e-4))
     before = superposed.update(start).displacement[0]
@@ -132,11 +131,11 @@ def test_superposition_slides_as_coulomb_has_it(sensor: SensorSpec, grid: PadGri
         before = tracker.update(start).displacement[0, middle, 0]
         moved = tracker.update(pressed(grid, [(0, 0, DEEP)], poses=[pose(x)])).displacement[0, middle, 0] - before
         model = tracker.model
-        assert isinstance(model, SuperpositionMarkers)
+        assert isinstance(model, SuperpositionModel)
         height, _, touched = height_and_slope(start, model.coat.rest[None, :, :2])
-        wanted = np.zeros((len(model.coat.rest), 3))
-        wanted[:, 0], wanted[:, 2] = x, height[0] - model.coat.rest[:, 2]
-        coat = model._superpose(wanted, touched[0] & (wanted[:, 2] < 0))
+        prescribed = np.zeros((len(model.coat.rest), 3))
+        prescribed[:, 0], prescribed[:, 2] = x, height[0] - model.coat.rest[:, 2]
+        coat = model._superpose(prescribed, touched[0] & (prescribed[:, 2] < 0))
         return moved, np.linalg.solve(model._compliance.astype(float) + 1e-9 * np.eye(coat.size), coat.ravel()).reshape(-1, 3)
 
     stuck, slid, further = (sheared(s, x) for s, x in ((sensor, 8e-4), (gel, 8e-4), (gel, 1.6e-3)))

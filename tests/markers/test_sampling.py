@@ -1,4 +1,4 @@
-"""What a marker finds at its place, against SciPy's own interpolation."""
+"""Surface and object at the markers, against SciPy's own interpolation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.contacts import Contacts
-from raytac.markers.sampling import height_and_slope, height_at, object_way
+from raytac.markers.sampling import height_and_slope, height_at, object_displacement
 
 
 def test_height_is_bilinear_and_that_of_the_own_environment(grid: PadGrid) -> None:
@@ -16,10 +16,10 @@ def test_height_is_bilinear_and_that_of_the_own_environment(grid: PadGrid) -> No
     height = rng.normal(0, 1e-4, (3, *grid.shape)).astype(np.float32)
     surface = GelSurface(grid, height, np.zeros(height.shape, bool), np.full((3, 2), np.nan))
     xy = rng.uniform(-1, 1, (3, 40, 2)) * (0.999 * grid.x[-1], 0.999 * grid.y[-1])
-    found = height_at(surface, xy)
+    result = height_at(surface, xy)
     for b in range(3):
         expected = interpolate.RegularGridInterpolator((grid.y, grid.x), height[b].astype(float))(xy[b, :, ::-1])
-        np.testing.assert_allclose(found[b], expected, atol=1e-10)
+        np.testing.assert_allclose(result[b], expected, atol=1e-10)
 
 
 def test_height_beyond_the_pad_is_that_of_its_edge_and_of_nowhere_is_any(grid: PadGrid) -> None:
@@ -27,11 +27,11 @@ def test_height_beyond_the_pad_is_that_of_its_edge_and_of_nowhere_is_any(grid: P
     surface = GelSurface(grid, height, np.zeros(height.shape, bool), np.full((1, 2), np.nan))
     half = np.array((grid.x[-1], grid.y[-1]))
     corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    found = height_at(surface, np.concatenate([1.2 * corners, [[np.nan, 0.0]]])[None])[0]
-    # The last cell is left a thousandth of it before its end.
+    result = height_at(surface, np.concatenate([1.2 * corners, [[np.nan, 0.0]]])[None])[0]
+    # Points beyond the edge are moved to a thousandth of a cell before the last node.
     expected = [height[0, j, i] for j, i in ((-1, -1), (-1, 0), (0, 0), (0, -1))]
-    np.testing.assert_allclose(found[:4], expected, atol=1e-3 * np.abs(height).max() * 4)
-    assert np.isfinite(found).all()
+    np.testing.assert_allclose(result[:4], expected, atol=1e-3 * np.abs(height).max() * 4)
+    assert np.isfinite(result).all()
 
 
 def test_slope_and_touch_of_a_tilted_plane(grid: PadGrid) -> None:
@@ -54,8 +54,8 @@ def test_a_point_goes_with_the_nearest_contact_as_a_rigid_body(grid: PadGrid) ->
     row[0, 0, :6] = 1, 2e-3, 0.0, 3e-4, -1e-4, 0.4
     row[0, 1, :3] = 1, -6e-3, 0.0
     xy = np.array([[(3e-3, 1e-3), (2e-3, 0.0), (-5e-3, 1e-3)]] * 2)
-    way = object_way(Contacts(row), xy)
+    moved = object_displacement(Contacts(row), xy)
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     expected = np.array([turn @ (1e-3, 1e-3) - (1e-3, 1e-3), (0.0, 0.0)]) + np.array((3e-4, -1e-4))
-    np.testing.assert_allclose(way[0, :2], expected, atol=1e-15)
-    assert not way[0, 2].any() and not way[1].any()
+    np.testing.assert_allclose(moved[0, :2], expected, atol=1e-15)
+    assert not moved[0, 2].any() and not moved[1].any()

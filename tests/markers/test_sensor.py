@@ -10,7 +10,7 @@ import pytest
 
 from raytac.cli import main
 from raytac.errors import InputError
-from raytac.markers import MarkerPerturbation
+from raytac.markers import MarkerPerturbation, SurfaceMarkers
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene
 from raytac.specs.press import ObjectSpec, StageSpec
@@ -39,7 +39,7 @@ def test_a_loop_gives_what_a_press_gives() -> None:
     last = frames[-1].markers
     assert at_once is not None and last is not None
     np.testing.assert_allclose(last.displacement, at_once.displacement, atol=2e-6)
-    assert frames[0].markers is not None and not frames[0].markers.displacement.any()
+    assert not frames[0].markers.displacement.any()
     assert frames[-1].time_ms["markers"] > 0
 
 
@@ -62,7 +62,7 @@ def test_dots_in_the_image_are_where_the_markers_are() -> None:
     sensor = TactileSensor(NAME, optics="phong", markers="fots", device="cpu", resolution=(320, 240))
     frame = sensor.press(SHEARED)
     bare = sensor.optical_mode.render(replace(frame.surface, ink=None))
-    assert frame.rgb is not None and bare.rgb is not None and frame.markers is not None
+    assert bare.rgb is not None
     darker = (bare.rgb[0].astype(float) - frame.rgb[0]).sum(axis=-1)
     v, u = np.mgrid[0:240, 0:320] + 0.5
     inside = (np.abs(frame.markers.pixel[0] - (160, 120)) < (148, 108)).all(axis=1)
@@ -70,14 +70,14 @@ def test_dots_in_the_image_are_where_the_markers_are() -> None:
         near = np.hypot(u - pixel[0], v - pixel[1]) < 9
         weight = darker * near
         assert weight.sum() > 0
-        found = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
-        assert found == pytest.approx(tuple(pixel), abs=0.35)
+        centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
+        assert centre == pytest.approx(tuple(pixel), abs=0.35)
     assert sensor.rest().rgb is not None
 
 
 def test_without_markers_nothing_is_there() -> None:
     frame = TactileSensor(NAME, outputs=("height",), device="cpu").press(SHEARED)
-    assert frame.markers is None and frame.surface.ink is None
+    assert "markers" not in frame.outputs and frame.surface.ink is None
 
 
 def test_errors_come_early() -> None:
@@ -87,8 +87,9 @@ def test_errors_come_early() -> None:
         TactileSensor(NAME, markers="surface", physics="rigid")
     with pytest.raises(InputError, match="has no markers"):
         TactileSensor("gelsight_mini", markers="fots")
-    with pytest.raises(InputError, match="needs a marker model"):
-        TactileSensor(NAME, marker_perturbation=MarkerPerturbation(noise_px=1.0))
+        TactileSensor(NAME, markers=SurfaceMarkers(), physics="rigid")
+    with pytest.raises(InputError, match=r"must be a known name or a MarkersConfig.*fots"):
+        TactileSensor(NAME, markers=MarkerPerturbation(noise_px=1.0))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="was not asked for"):
         TactileSensor(NAME).reset_markers()
 
@@ -104,7 +105,7 @@ def test_press_writes_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", "markers", "--pad", "finest", "--out", str(tmp_path)]) == 2
+    assert main(["calibrate", "markers", "--level", "finest", "--out", str(tmp_path)]) == 2
     assert "did you mean 'fine'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -113,14 +114,14 @@ def test_calibrate_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.
 def test_calibrate_quickly_and_go_on_after_an_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import raytac.markers.calibration_presses as presses
+    import raytac.report.markers as report
     from raytac.io.metrics import read_metrics
     from raytac.report.markers import FILES
     from raytac.specs import load_marker_motion
 
     out, begun = tmp_path / "fit", []
-    args = ["calibrate", "markers", "--pad", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
-    simulate = presses.simulate_press
+    args = ["calibrate", "markers", "--level", "coarse", "--quick", "--device", "cpu", "--out", str(out)]
+    simulate = report.simulate_press
 
     def interrupted(sensor, press, **options):
         begun.append(press.name)
@@ -128,7 +129,7 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
             raise KeyboardInterrupt
         return simulate(sensor, press, **options)
 
-    monkeypatch.setattr(presses, "simulate_press", interrupted)
+    monkeypatch.setattr(report, "simulate_press", interrupted)
     assert main(args) == 130
     assert "finished presses are kept" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["presses"] and len(list((out / "presses").iterdir())) == 2

@@ -8,7 +8,7 @@ import pytest
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.pattern import MarkerPattern
-from raytac.markers.surface import bind
+from raytac.markers.surface import bind_to_coat
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import SensorSpec, load_sensor
 from tests.markers.pads import coat_mesh, pad_grid, pressed, with_coat
@@ -49,7 +49,7 @@ def test_pure_twist_is_pure_rotation(sensor: SensorSpec, grid: PadGrid) -> None:
 
 
 def test_a_sinking_coat_moves_dots_in_the_image_by_perspective(sensor: SensorSpec, grid: PadGrid) -> None:
-    """Straight down by d: nothing moves on the pad, and pixels spread by d over the distance that is left."""
+    """Straight down by d: nothing moves on the pad, and pixels spread by d over the remaining distance."""
     mesh, deep = coat_mesh(sensor), 1e-3
     sunk = mesh.rest - (0, 0, deep)
     frame = MarkerTracker(sensor, "surface", grid).update(with_coat(pressed(grid, []), mesh, sunk[None]))
@@ -60,15 +60,15 @@ def test_a_sinking_coat_moves_dots_in_the_image_by_perspective(sensor: SensorSpe
     assert np.abs(spread).max() > 5
 
 
-def test_bind_finds_the_triangle(sensor: SensorSpec) -> None:
+def test_points_are_bound_to_their_triangle(sensor: SensorSpec) -> None:
     mesh, rng = coat_mesh(sensor), np.random.default_rng(2)
     half = 0.5 * np.asarray(sensor.gelpad.size)
     points = np.concatenate([rng.uniform(-1, 1, (500, 2)) * half, mesh.rest[:, :2]])
-    vertices, weights = bind(mesh, points)
+    vertices, weights = bind_to_coat(mesh, points)
     assert weights.min() > -1e-6 and weights.sum(axis=1) == pytest.approx(1)
     np.testing.assert_allclose((weights[..., None] * mesh.rest[vertices]).sum(axis=1)[:, :2], points, atol=1e-12)
     with pytest.raises(InputError, match="off the coat"):
-        bind(mesh, half[None] * 1.1)
+        bind_to_coat(mesh, half[None] * 1.1)
 
 
 def test_a_rigid_pad_has_no_coat_to_track(sensor: SensorSpec, grid: PadGrid) -> None:

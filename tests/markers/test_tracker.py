@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers import MARKER_MODELS, MarkerPerturbation, MarkerTracker
+from raytac.markers import (
+    MARKERS,
+    ContactSettings,
+    ForceField,
+    Fots,
+    MarkerPerturbation,
+    MarkersConfig,
+    MarkerTracker,
+    Superposition,
+)
 from raytac.specs import SensorSpec
 from tests.markers.pads import coat_mesh, pose, pressed, with_coat
 
@@ -19,7 +31,7 @@ def still(sensor: SensorSpec, grid: PadGrid, batch: int = 1) -> GelSurface:
     return with_coat(pressed(grid, *[[]] * batch), mesh, np.repeat(mesh.rest[None], batch, axis=0))
 
 
-@pytest.mark.parametrize("model", MARKER_MODELS)
+@pytest.mark.parametrize("model", MARKERS.names)
 @pytest.mark.renderer
 def test_every_model_is_at_rest_on_a_pad_at_rest(model: str, sensor: SensorSpec, grid: PadGrid) -> None:
     frame = MarkerTracker(sensor, model, grid, num_envs=2, device="cpu").update(still(sensor, grid, 2))
@@ -71,17 +83,17 @@ def test_a_broken_environment_is_nan_and_harms_no_other(sensor: SensorSpec, grid
 
 
 def test_noise(sensor: SensorSpec, grid: PadGrid) -> None:
-    tracker = MarkerTracker(sensor, "force_field", grid, perturbation=MarkerPerturbation(noise_px=0.5), seed=3)
+    tracker = MarkerTracker(sensor, ForceField(MarkerPerturbation(noise_px=0.5)), grid, seed=3)
     frames = [tracker.update(pressed(grid, [])) for _ in range(20)]
-    found = np.concatenate([frame.displacement_px for frame in frames])
-    assert found.std() == pytest.approx(0.5, rel=0.05) and abs(found.mean()) < 0.05
+    noise = np.concatenate([frame.displacement_px for frame in frames])
+    assert noise.std() == pytest.approx(0.5, rel=0.05) and abs(noise.mean()) < 0.05
     pitch = sensor.camera.pixel_pitch
     np.testing.assert_allclose(frames[0].displacement, frames[0].displacement_px * pitch, atol=1e-12)
     np.testing.assert_array_equal(frames[0].position, frames[0].rest)
 
 
 def test_dropout(sensor: SensorSpec, grid: PadGrid) -> None:
-    tracker = MarkerTracker(sensor, "force_field", grid, perturbation=MarkerPerturbation(dropout=0.1))
+    tracker = MarkerTracker(sensor, ForceField(MarkerPerturbation(dropout=0.1)), grid)
     frames = [tracker.update(pressed(grid, [])) for _ in range(30)]
     lost = np.concatenate([~frame.visible for frame in frames])
     assert lost.mean() == pytest.approx(0.1, abs=0.02)
@@ -89,9 +101,9 @@ def test_dropout(sensor: SensorSpec, grid: PadGrid) -> None:
         np.testing.assert_array_equal(np.isnan(frame.displacement_px).all(axis=-1), ~frame.visible)
 
 
-def test_the_pattern_is_placed_anew_at_a_reset(sensor: SensorSpec, grid: PadGrid) -> None:
+def test_the_pattern_is_placed_again_at_a_reset(sensor: SensorSpec, grid: PadGrid) -> None:
     shifted = MarkerPerturbation(shift=3e-4, turn=0.02)
-    tracker = MarkerTracker(sensor, "force_field", grid, num_envs=2, perturbation=shifted)
+    tracker = MarkerTracker(sensor, ForceField(shifted), grid, num_envs=2)
     first = tracker.update(pressed(grid, [], [])).rest.copy()
     assert not np.array_equal(first[0], first[1])
     same = tracker.update(pressed(grid, [], [])).rest
@@ -107,12 +119,58 @@ def test_what_an_environment_draws_does_not_depend_on_how_many_there_are(sensor:
     everything = MarkerPerturbation(noise_px=0.3, dropout=0.05, shift=2e-4, turn=0.01)
 
     def run(batch: int, seed: int) -> np.ndarray:
-        tracker = MarkerTracker(sensor, "force_field", grid, num_envs=batch, seed=seed, perturbation=everything)
+        tracker = MarkerTracker(sensor, ForceField(everything), grid, num_envs=batch, seed=seed)
         balls = [[(0.0, 0.0, DEEP)]] * batch
         return np.stack([tracker.update(pressed(grid, *balls)).pixel for _ in range(2)], axis=1)
 
     np.testing.assert_array_equal(run(3, 7)[:1], run(1, 7))
     assert not np.array_equal(run(1, 7), run(1, 8), equal_nan=True)
+
+
+@pytest.mark.parametrize("name", MARKERS.names)
+def test_a_name_is_its_configuration_with_defaults(name: str) -> None:
+    """Configurations are plain values: equal by their fields, and they survive pickling."""
+    config = MARKERS.config(name)
+    assert isinstance(config, MarkersConfig) and config == MARKERS.config_class(name)() and MARKERS.name_of(config) == name
+    assert pickle.loads(pickle.dumps(config)) == config
+    noisy = MARKERS.config(name, perturbation=MarkerPerturbation(dropout=0.1))
+    assert noisy != config and noisy.perturbation == MarkerPerturbation(dropout=0.1)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: Fots(perturbation=0.5), "perturbation = 0.5: must be a MarkerPerturbation or None"),  # type: ignore[arg-type]
+        (lambda: Fots(contacts=None), "contacts = None: must be a ContactSettings"),  # type: ignore[arg-type]
+        (lambda: ContactSettings(cell=0.0), r"cell = 0.0: must be finite and > 0"),
+        (lambda: ContactSettings(reach=float("nan")), r"reach = nan: must be finite and > 0"),
+        (lambda: Superposition(level="finest"), "level = 'finest'.*did you mean 'fine'"),
+        (lambda: Superposition(rounds=0), "rounds = 0"),
+        (lambda: MARKERS.config("fots", rounds=3), "rounds = 3.*perturbation, contacts"),
+    ],
+)
+def test_configurations_refuse_what_cannot_be(make: Callable[[], object], match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        make()
+
+
+def test_contact_settings_reach_sampling_and_tracking(sensor: SensorSpec, grid: PadGrid) -> None:
+    """A contact 3.1 mm from where the object carries it is the same one with the default reach, and a new one with a short reach."""
+    first = pressed(grid, [(0, 0, DEEP)], poses=[pose()])
+    jumped = pressed(grid, [(3.2e-3, 0, DEEP)], poses=[pose(1e-4)])
+    moved = []
+    for settings in (ContactSettings(), ContactSettings(reach=1e-5), ContactSettings(cell=0.1e-3)):
+        tracker = MarkerTracker(sensor, ForceField(contacts=settings), grid)
+        tracker.update(first)
+        moved.append(tracker.update(jumped).displacement)
+    fresh = MarkerTracker(sensor, "force_field", grid).update(jumped).displacement
+    np.testing.assert_array_equal(moved[1], fresh)
+    assert np.abs(moved[0] - fresh).max() > 1e-5 and np.abs(moved[2] - fresh).max() > 1e-5
+    cells = [
+        MarkerTracker(sensor, Fots(contacts=ContactSettings(cell=c)), grid, device="cpu").update(first).displacement
+        for c in (4e-4, 1e-4)
+    ]
+    assert 0 < np.abs(cells[0] - cells[1]).max() < 4e-6
 
 
 @pytest.mark.parametrize("bad", [{"noise_px": -1.0}, {"dropout": 1.0}, {"shift": np.nan}])

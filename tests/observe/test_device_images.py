@@ -9,10 +9,11 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.observe import ObservationSettings, Randomization, TactileObserver, as_tensors
 from raytac.observe.device_images import DeviceImages
+from raytac.optics import RayTraced
 from raytac.sensor import TactileSensor
 
 B = 3
-DIRECT = {"optics": "raytrace", "optics_options": {"bounce": False}}
+DIRECT = {"optics": RayTraced(bounce=False)}
 """Quickest to build: light that comes straight from the LEDs."""
 
 
@@ -34,7 +35,7 @@ def both(**settings) -> tuple[TactileObserver, TactileSensor, DeviceImages]:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"crop": (0, 0, 0, 0), "optics": "phong", "optics_options": {}},
+        {"crop": (0, 0, 0, 0), "optics": "phong"},
         {"crop": (3, 1, 2, 4), "downscale": 3, "difference": True},
         {"resolution": (16, 16), "downscale": 2},
         {"difference": True},
@@ -98,7 +99,7 @@ def test_what_the_device_does_not_know_is_refused() -> None:
             DeviceImages(observer, observer.make_sensor(device="cpu"))
     observer = TactileObserver("gelsight_mini", ObservationSettings(("rgb",), resolution=(24, 16), optics="raytrace"))
     with pytest.raises(InputError, match="integrator fast"):
-        DeviceImages(observer, observer.make_sensor(device="cpu", integrator="path"))
+        DeviceImages(observer, observer.make_sensor(device="cpu", optics=RayTraced(integrator="path")))
     _, _, images = both()
     with pytest.raises(InputError, match="whole number of grids"):
         images.observe(images.upload(dented(images.grid))[0][:-1])

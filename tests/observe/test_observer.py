@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.markers import MarkerFrame, MarkerPerturbation
+from raytac.markers import Fots, MarkerFrame, MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization, TactileObserver, gymnasium_space, randomised_sensor
-from raytac.observe.cells import CellMeans
+from raytac.observe.observer import CellMeans
 from raytac.observe.randomization import CameraDrift
 from raytac.specs import load_sensor
 
@@ -202,9 +200,18 @@ def test_sensors_are_drawn_once_by_seed_within_their_ranges() -> None:
     assert TactileObserver(SENSOR, randomization=settings, seed=1).sensor == one
 
 
+def test_a_perturbation_is_given_once() -> None:
+    own = ObservationSettings(markers=Fots(MarkerPerturbation(dropout=0.1)))
+    assert TactileObserver(SENSOR, own).sensor_options()["markers"] == own.markers
+    with pytest.raises(InputError, match=r"randomization\.markers.*one of the two"):
+        TactileObserver(SENSOR, own, randomization=Randomization(markers=MarkerPerturbation(noise_px=0.5)))
+    with pytest.raises(InputError, match="did you mean 'fots'"):
+        ObservationSettings(markers="fotz")
+
+
 def test_marker_perturbation_reaches_the_sensor() -> None:
     seen = TactileObserver(SENSOR, randomization=Randomization(markers=MarkerPerturbation(noise_px=0.5)))
-    assert seen.sensor_options()["marker_perturbation"].noise_px == 0.5
+    assert seen.sensor_options()["markers"].perturbation.noise_px == 0.5
     assert TactileObserver(SENSOR, ObservationSettings(("wrench",))).sensor_options()["markers"] is None
 
 
@@ -246,6 +253,6 @@ def test_what_a_sensor_or_frame_lacks_is_told() -> None:
     with pytest.raises(InputError, match="must have 2 environments"):
         TactileObserver(SENSOR, ObservationSettings(("wrench",)), num_envs=2).observe(frame())
     with pytest.raises(InputError, match="wrench"):
-        seen.observe(replace(frame(), wrench=None))
+        seen.observe(frame().with_values(wrench=None))
     with pytest.raises(InputError, match="exposure"):
         Randomization(exposure=1.5)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from raytac.io.png import write_png
+from raytac.io.images import write_png
 
 __all__ = ["assert_images_agree", "errors", "psnr_db"]
 

@@ -7,8 +7,7 @@ import sys
 import numpy as np
 
 from raytac.gel.surface import GelSurface
-from raytac.optics.image.phong import PhongMode
-from raytac.optics.taxim.mode import TaximMode
+from raytac.optics import Phong, Taxim
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, relief
 from tests.optics.test_taxim_mode import make_table
 
@@ -22,11 +21,11 @@ def main(device: str, mode: str, out: str) -> None:
     surfaces = GelSurface(grid, heights, contacts, np.zeros((3, 2)))
     if mode == "phong":
         background = np.full((RESOLUTION[1], RESOLUTION[0], 3), 120, np.uint8)
-        images = PhongMode(spec, background=background, resolution=RESOLUTION, device=device).render(surfaces)
+        images = Phong(background=background).build(spec, resolution=RESOLUTION, device=device).render(surfaces)
     else:
         shadow = mode == "taxim-shadow"
-        images = TaximMode(spec, calibration=make_table(spec), shadows=shadow, resolution=RESOLUTION, device=device).render(
-            surfaces
+        images = (
+            Taxim(calibration=make_table(spec), shadows=shadow).build(spec, resolution=RESOLUTION, device=device).render(surfaces)
         )
     assert images.rgb is not None
     np.save(out, images.rgb)

@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 
-from raytac.optics.trace.fast_tracer import RayTracer
-from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, relief, surface
+from raytac.optics import RayTraced
+from tests.optics.scenes import RESOLUTION, ball, built, grid_of, like_a_mini, relief, surface
 
 MODES = {
     "fast": {},
@@ -24,7 +24,7 @@ def images(device: str) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for name, options in MODES.items():
         outputs = ("rgb", "layers", "normals", "depth")
-        image = RayTracer(spec, resolution=RESOLUTION, device=device, outputs=outputs, **options).render(surfaces)
+        image = built(RayTraced, spec, resolution=RESOLUTION, device=device, outputs=outputs, **options).render(surfaces)
         assert image.layers is not None
         arrays = {"rgb": image.rgb, "normals": image.normals, "depth": image.depth, **image.layers}
         found |= {f"{name}/{key}": array for key, array in arrays.items() if array is not None}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +14,19 @@ from raytac.specs.sensor import CameraSpec, LedSpec, LightsSpec, SensorSpec, Vec
 from tests.conftest import make_sensor_spec
 
 RESOLUTION = (80, 60)
+SETTINGS = ("resolution", "outputs", "device", "seed")
+"""Arguments of ``OpticsConfig.build``; the other options of these tests are fields of a configuration."""
 PITCH = 0.25e-3
 """Spacing of the pad's nodes [m]."""
 SMALL = (2e-5, 2e-5)
 """Edges of an LED that is a point for every purpose here [m]."""
+
+
+def built(config: Any, spec: SensorSpec, **options: Any) -> Any:
+    """The mode of a class of configurations, on the CPU and small unless said otherwise; ``options`` are its fields or ``SETTINGS``."""
+    assert set(options) <= {*SETTINGS, *(field.name for field in fields(config))}
+    settings = {"resolution": RESOLUTION, "device": "cpu"} | {k: v for k, v in options.items() if k in SETTINGS}
+    return config(**{k: v for k, v in options.items() if k not in SETTINGS}).build(spec, **settings)
 
 
 def led(

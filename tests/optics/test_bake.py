@@ -9,13 +9,13 @@ import pytest
 
 from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
+from raytac.optics import Taxim
 from raytac.optics.taxim.bake.bake import Baked, bake, calibrate
 from raytac.optics.taxim.bake.presses import pressed
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.views import Calibration
-from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.taxim.table import ShadowTable
-from raytac.report.table_error import SceneError, table_errors
+from raytac.report.bake import SceneError, table_errors
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 from raytac.specs.sensor import SensorSpec
@@ -49,7 +49,7 @@ def errors(baked: Baked, surfaces: dict[str, GelSurface]) -> dict[str, dict[str,
 
 @pytest.mark.parametrize("shadow", [False, True])
 def test_at_rest_it_is_the_ray_tracers_image(baked: Baked, calibration: Calibration, shadow: bool) -> None:
-    mode = TaximMode(MINI, calibration=baked.table, shadows=shadow, resolution=SIZE, device="cpu")
+    mode = Taxim(calibration=baked.table, shadows=shadow).build(MINI, resolution=SIZE, device="cpu")
     image = mode.render(at_rest(calibration.grid)).rgb
     assert image is not None and calibration.rest_image.max() > 60
     assert np.array_equal(image[0], calibration.rest_image)

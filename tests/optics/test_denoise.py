@@ -11,8 +11,9 @@ import pytest
 from raytac.device import cuda_missing
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
+from raytac.optics import RayTraced
 from raytac.optics.trace.denoise import make_denoiser
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.fast_tracer import total
 from tests.optics.conftest import Build
 from tests.optics.images import errors
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, surface
@@ -76,13 +77,13 @@ def test_denoised_layers_sum_to_the_image(tracer: Build, pressed: GelSurface) ->
 
 def test_fast_has_nothing_to_denoise() -> None:
     with pytest.raises(InputError, match="the fast integrator has no noise"):
-        RayTracer(like_a_mini(), resolution=RESOLUTION, device="cpu", denoise=True)
+        RayTraced(denoise=True).build(like_a_mini(), resolution=RESOLUTION, device="cpu")
 
 
 def test_without_the_package_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
     with pytest.raises(BackendError, match=r"pip install raytac\[denoise\]"):
-        RayTracer(like_a_mini(), resolution=RESOLUTION, device="cpu", integrator="reference", denoise=True)
+        RayTraced(integrator="reference", denoise=True).build(like_a_mini(), resolution=RESOLUTION, device="cpu")
 
 
 @pytest.mark.skipif(not cuda_missing(), reason="OptiX may work here")

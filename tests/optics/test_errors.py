@@ -10,10 +10,10 @@ import pytest
 
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
+from raytac.optics import RayTraced
 from raytac.optics.runtime import load_mitsuba
-from raytac.optics.trace.fast_tracer import RayTracer
 from tests.optics.conftest import Build
-from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, led, like_a_mini, sensor, surface
+from tests.optics.scenes import RESOLUTION, at_rest, ball, built, grid_of, led, like_a_mini, sensor, surface
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, led, like_a_
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        RayTracer(like_a_mini(), **{"resolution": RESOLUTION, "device": "cpu", **options})
+        built(RayTraced, like_a_mini(), **{"resolution": RESOLUTION, "device": "cpu", **options})
 
 
 def test_a_second_grid_is_refused(tracer: Build) -> None:
@@ -62,8 +62,8 @@ def test_a_camera_that_sees_past_the_pad_is_refused(axis: str) -> None:
     spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
     x, y, z = spec.camera.position
     position = (x + 4e-3, y, z) if axis == "x" else (x, y - 4e-3, z)
-    mode = RayTracer(
-        replace(spec, camera=replace(spec.camera, position=position)), resolution=RESOLUTION, device="cpu", bounce=False
+    mode = RayTraced(bounce=False).build(
+        replace(spec, camera=replace(spec.camera, position=position)), resolution=RESOLUTION, device="cpu"
     )
     with pytest.raises(InputError, match=rf"grid\.{axis} = .*the camera sees {axis} from -?\d+\.\d+ to -?\d+\.\d+ mm"):
         mode.render(at_rest(grid_of(spec)))
@@ -108,8 +108,8 @@ def test_device_heights_must_fill_whole_grids(tracer: Build) -> None:
     mode.render(at_rest(grid_of(spec)))
     with pytest.raises(InputError, match="whole number of grids of 8568 nodes"):
         mode.render_device(mode.mi.Float(np.zeros(8569, np.float32)))
-    with pytest.raises(InputError, match="render a GelSurface first"):
-        RayTracer(spec, resolution=RESOLUTION, device="cpu").render_device(mode.mi.Float(0.0))
+    with pytest.raises(InputError, match="call prepare"):
+        RayTraced().build(spec, resolution=RESOLUTION, device="cpu").render_device(mode.mi.Float(0.0))
 
 
 @pytest.mark.parametrize("integrator", ["fast", "reference"])
@@ -132,7 +132,9 @@ def test_an_environment_that_failed_leaves_the_others_running(tracer: Build, int
 
 
 def test_geometry_alone_traces_no_light() -> None:
-    mode = RayTracer(like_a_mini(), resolution=RESOLUTION, device="cpu", integrator="reference", spp=10**6, outputs=("depth",))
+    mode = RayTraced(integrator="reference", spp=10**6).build(
+        like_a_mini(), resolution=RESOLUTION, device="cpu", outputs=("depth",)
+    )
     grid = grid_of(like_a_mini())
     images = mode.render(at_rest(grid))
     assert images.rgb is None and images.depth is not None

@@ -17,15 +17,14 @@ from raytac import TactileSensor
 from raytac.cli import main
 from raytac.errors import SpecError
 from raytac.gel.surface import GelSurface
-from raytac.optics.exposure import mid_grey_exposure
-from raytac.optics.image.phong import PhongMode
-from raytac.optics.taxim.bake.bake import bake
-from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer, with_exposure
+from raytac.optics import Phong, RayTraced, Taxim
+from raytac.optics.response import mid_grey_exposure
+from raytac.optics.taxim.bake import bake
+from raytac.optics.trace.fast_tracer import with_exposure
 from raytac.specs import SensorSpec, load_sensor
 from raytac.specs.sensor import AUTO
 from raytac.specs.sensor_file import response_text
-from tests.optics.scenes import RESOLUTION, grid_of, like_a_mini
+from tests.optics.scenes import RESOLUTION, built, grid_of, like_a_mini
 from tests.optics.test_taxim_mode import make_table
 
 COMMON: dict[str, Any] = {"resolution": RESOLUTION, "device": "cpu"}
@@ -79,7 +78,7 @@ def test_what_no_exposure_makes_grey_is_refused(black: tuple[float, ...], lit: f
 def test_a_white_image_at_rest_is_told_of_once_with_the_exposure_that_mends_it(integrator: str) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tracer = RayTracer(WHITE, integrator=integrator, spp=1, **COMMON)
+        tracer = built(RayTraced, WHITE, integrator=integrator, spp=1, **COMMON)
         assert (at_rest(tracer) == 255).any(axis=-1).mean() > 0.5
         at_rest(tracer)
     (message,) = told(caught)
@@ -87,39 +86,39 @@ def test_a_white_image_at_rest_is_told_of_once_with_the_exposure_that_mends_it(i
     assert match and 50 < int(match[1]) <= 100
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rgb = at_rest(RayTracer(exposed(float(match[2])), integrator="fast", **COMMON))
+        rgb = at_rest(built(RayTraced, exposed(float(match[2])), integrator="fast", **COMMON))
     assert rgb.mean((0, 1)).max() == pytest.approx(127.5, abs=1.0 if integrator == "fast" else 5.0)
 
 
 def test_a_sensor_that_is_not_white_is_not_told_of() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        at_rest(RayTracer(like_a_mini(), **COMMON))
-        at_rest(RayTracer(WHITE, flat_field=np.full((60, 80, 3), 100, np.uint8), **COMMON))
-        RayTracer(exposed(AUTO), outputs=("depth",), **COMMON).render(GelSurface.at_rest(grid_of(WHITE)))
+        at_rest(built(RayTraced, like_a_mini(), **COMMON))
+        at_rest(built(RayTraced, WHITE, flat_field=np.full((60, 80, 3), 100, np.uint8), **COMMON))
+        built(RayTraced, exposed(AUTO), outputs=("depth",), **COMMON).render(GelSurface.at_rest(grid_of(WHITE)))
 
 
 def test_auto_is_one_number_of_the_sensor_whatever_is_rendered() -> None:
     sensor = with_exposure(exposed(AUTO), "cpu")
     assert isinstance(sensor.response.exposure, float) and with_exposure(sensor) is sensor
     for options in ({"spp": 4, "resolution": (40, 30)}, {"bounce": False, "integrator": "reference"}):
-        assert RayTracer(exposed(AUTO), device="cpu", **options).sensor.response == sensor.response
-    rgb = at_rest(RayTracer(exposed(AUTO), device="cpu"))
+        assert built(RayTraced, exposed(AUTO), device="cpu", **options).sensor.response == sensor.response
+    rgb = at_rest(RayTraced().build(exposed(AUTO), device="cpu"))
     assert rgb.mean((0, 1)).max() == pytest.approx(127.5, abs=0.5)
-    np.testing.assert_array_equal(rgb, at_rest(RayTracer(sensor, **COMMON)))
+    np.testing.assert_array_equal(rgb, at_rest(built(RayTraced, sensor, **COMMON)))
 
 
 def test_cheap_modes_of_a_white_sensor_tell_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     white = replace(make_table(WHITE), background=np.full((60, 80, 3), 255, np.float32))
     monkeypatch.setattr(bake, "baked_table", lambda *_, **__: white)
-    for mode in (TaximMode(WHITE, **COMMON), PhongMode(WHITE, **COMMON)):
+    for mode in (built(Taxim, WHITE, **COMMON), built(Phong, WHITE, **COMMON)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             at_rest(mode)
         assert len(told(caught)) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        at_rest(TaximMode(WHITE, calibration=white, **COMMON))  # photographs, of which the file's exposure says nothing
+        at_rest(built(Taxim, WHITE, calibration=white, **COMMON))  # photographs, of which the file's exposure says nothing
 
 
 def test_the_recorded_exposure_is_a_number_or_absent() -> None:

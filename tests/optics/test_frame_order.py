@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.markers.base import MarkerModel
+from raytac.markers.config import Fots
 from raytac.markers.contacts import ContactCells, ContactTracker
-from raytac.markers.fots import FotsMarkers
-from raytac.markers.tracker import MARKER_MODELS, MarkerTracker
+from raytac.markers.registry import MARKERS
+from raytac.markers.tracker import MarkerTracker
+from raytac.optics import Mlp, Phong, RayTraced, Taxim
 from raytac.optics.device_image import DeviceImage, ImageCut
-from raytac.optics.image.base import ImageMode
-from raytac.optics.image.mlp import MlpMode
 from raytac.optics.image.phong import PhongMode
 from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.specs import PunchSpec
 from raytac.specs.sensor import LightsSpec, SensorSpec
 from tests.markers.pads import MOTION, coat_mesh, flat_sensor, pad_grid, pose, pressed, with_coat
@@ -50,18 +50,18 @@ def table_mode(
     assert table.shadow is not None
     table = replace(table, shadow=replace(table.shadow, depth_of=depth_of))
     table = replace(table, surround=-0.5 * table.gradients) if sheets == 2 else table
-    return TaximMode(SPEC, calibration=table, shadows=shadow, resolution=RESOLUTION, device=device)
+    return Taxim(calibration=table, shadows=shadow).build(SPEC, resolution=RESOLUTION, device=device)
 
 
 def phong(device: str) -> PhongMode:
-    return PhongMode(SPEC, background=np.full((*RESOLUTION[::-1], 3), 120, np.uint8), resolution=RESOLUTION, device=device)
+    return Phong(background=np.full((*RESOLUTION[::-1], 3), 120, np.uint8)).build(SPEC, resolution=RESOLUTION, device=device)
 
 
 UPSTREAM = {"slopes_of": "height", "depth_of": "origin", "sheets": 1}
 MODES: dict[str, Callable[[str], Any]] = {
-    "fast": lambda device: RayTracer(ONE_LED, resolution=RESOLUTION, device=device),
-    "fast-direct": lambda device: RayTracer(
-        ONE_LED, resolution=RESOLUTION, device=device, bounce=False, outputs=("rgb", "layers", "normals", "depth")
+    "fast": lambda device: RayTraced().build(ONE_LED, resolution=RESOLUTION, device=device),
+    "fast-direct": lambda device: RayTraced(bounce=False).build(
+        ONE_LED, resolution=RESOLUTION, device=device, outputs=("rgb", "layers", "normals", "depth")
     ),
     "taxim": lambda device: table_mode(device, shadow=False),
     "taxim-upstream": lambda device: table_mode(device, shadow=False, **UPSTREAM),
@@ -69,7 +69,7 @@ MODES: dict[str, Callable[[str], Any]] = {
     "shadow-upstream": lambda device: table_mode(device, shadow=True, **UPSTREAM),
     "shadow-origin": lambda device: table_mode(device, shadow=True, depth_of="origin"),
     "phong": phong,
-    "mlp": lambda device: MlpMode(SPEC, calibration=network(), resolution=RESOLUTION, device=device),
+    "mlp": lambda device: Mlp(weights=network()).build(SPEC, resolution=RESOLUTION, device=device),
 }
 EACH_MODE = pytest.mark.parametrize("mode", MODES)
 
@@ -186,7 +186,7 @@ def test_device_memory_of_any_alignment(mode: str, device: str, fresh: Callable)
             if device == "cuda":
                 torch.cuda.synchronize()
             heights, touched = (array(kind, part) for kind, part in zip((one.mi.Float, one.mi.UInt8), memory, strict=True))
-            found = one.render_device(heights, touched)[0] if isinstance(one, ImageMode) else one.render_device(heights)["rgb"]
+            found = one.render_device(heights, touched).rgb
             np.testing.assert_array_equal(np.array(found), expected["rgb"].ravel(), err_msg=f"{offset} bytes")
 
 
@@ -200,7 +200,7 @@ def test_heights_that_are_one_number(mode: str, device: str) -> None:
     def image(literal: bool, height: float) -> np.ndarray:
         make = dr.full if literal else dr.opaque
         pad = make(one.mi.Float, height, GRID.rest.size), make(one.mi.UInt8, 0, GRID.rest.size)
-        found = one.render_device(*pad)[0] if isinstance(one, ImageMode) else one.render_device(pad[0])["rgb"]
+        found = one.render_device(*pad).rgb
         return np.array(found)
 
     first, second = (image(False, height) for height in (0.0, -1e-4))
@@ -273,7 +273,7 @@ def beside(one: GelSurface, other: GelSurface) -> GelSurface:
     )
 
 
-@pytest.mark.parametrize("model", [*MARKER_MODELS, "fots-punch"])
+@pytest.mark.parametrize("model", [*MARKERS.names, "fots-punch"])
 @DEVICES
 def test_markers_of_rest_press_rest_and_another_press(model: str, device: str) -> None:
     if device == "cuda" and not model.startswith("fots"):
@@ -307,9 +307,12 @@ def test_other_numbers_of_markers_are_other_recordings(device: str) -> None:
     contacts = ContactTracker(1).update(surface, samples)
     places = np.random.default_rng(0).uniform(-4e-3, 4e-3, (1, 300, 3))
 
-    def moved(model: FotsMarkers, count: int) -> np.ndarray:
+    def moved(model: MarkerModel, count: int) -> np.ndarray:
         return model.displacement(places[:, :count].copy(), surface, samples, contacts)
 
-    one = FotsMarkers(sensor, grid, device=device)
+    def make() -> MarkerModel:
+        return Fots().build(sensor, grid, num_envs=1, device=device)
+
+    one = make()
     for count in (7, 300, 1, 7):
-        np.testing.assert_array_equal(moved(one, count), moved(FotsMarkers(sensor, grid, device=device), count))
+        np.testing.assert_array_equal(moved(one, count), moved(make(), count))

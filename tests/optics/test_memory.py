@@ -98,9 +98,9 @@ def test_a_batch_that_does_not_fit_is_refused(tracer: Build, monkeypatch: pytest
     with pytest.raises(InputError, match="must be at most 2: an environment takes"):
         mode.render_device(arrays(np.zeros(3 * nodes, np.float32)))
     both = arrays(np.zeros(2 * nodes, np.float32))
-    assert len(mode.render_device(both)["rgb"]) == 2 * 3 * mode.camera.resolution[0] * mode.camera.resolution[1]
+    assert len(mode.render_device(both).rgb) == 2 * 3 * mode.camera.resolution[0] * mode.camera.resolution[1]
     with pytest.raises(InputError, match=f"ink.*{nodes}.*one value a node, {2 * nodes} here"):
-        mode.render_device(both, arrays(np.zeros(nodes, np.float32)))
+        mode.render_device(both, ink=arrays(np.zeros(nodes, np.float32)))
     with pytest.raises(InputError, match="whole number of grids"):
         mode.render_device(arrays(np.zeros(nodes + 1, np.float32)))
     with pytest.raises(InputError, match=r"integrator.*fast"):

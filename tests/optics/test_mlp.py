@@ -12,7 +12,7 @@ import pytest
 
 from raytac.errors import CalibrationError, InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.image.mlp import MlpMode
+from raytac.optics import Mlp
 from raytac.optics.image.mlp_weights import (
     FORMAT,
     INPUTS,
@@ -51,7 +51,7 @@ def _told_by_touch() -> tuple[MlpWeights, MlpWeights]:
 
 def test_at_rest_it_shows_the_background() -> None:
     weights, spec = network(), make_sensor_spec()
-    mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
+    mode = Mlp(weights=weights).build(spec, resolution=RESOLUTION, device="cpu")
     rgb = mode.render(GelSurface.at_rest(grid_of(spec))).rgb
     assert rgb is not None
     np.testing.assert_array_equal(rgb[0], weights.background.astype(np.uint8))
@@ -63,12 +63,12 @@ def test_a_pixels_colour_is_the_networks() -> None:
     grid = grid_of(spec)
     height, contact = ball(grid)
     pressed = surface(grid, height, contact=contact)
-    mode = MlpMode(spec, calibration=weights, resolution=RESOLUTION, device="cpu")
+    mode = Mlp(weights=weights).build(spec, resolution=RESOLUTION, device="cpu")
     levels = mode.render_levels(pressed)[0]
     _, moved = mode.image_heights(pressed)
     # Nodes in contact through every pixel's centre: the ball's disc, where the coat is deepest.
     only = [
-        MlpMode(spec, calibration=one, resolution=RESOLUTION, device="cpu").render_levels(pressed)[0] for one in _told_by_touch()
+        Mlp(weights=one).build(spec, resolution=RESOLUTION, device="cpu").render_levels(pressed)[0] for one in _told_by_touch()
     ]
     touched = (np.abs(only[0] - only[1]).max(axis=-1) > 1).astype(float)
     assert 0.01 < touched.mean() < 0.5 and moved[0][touched > 0].min() > 0
@@ -98,9 +98,7 @@ def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
     again = load_mlp(tmp_path)
     for old, new in zip((*weights.matrices, *weights.offsets), (*again.matrices, *again.offsets), strict=True):
         np.testing.assert_allclose(new, old, rtol=1e-6)
-    sensor = TactileSensor(
-        "gelsight_mini", optics="mlp", optics_options={"calibration": tmp_path}, outputs=("rgb",), device="cpu"
-    )
+    sensor = TactileSensor("gelsight_mini", optics=Mlp(weights=tmp_path), outputs=("rgb",), device="cpu")
     assert "mlp" in sensor.label
     with pytest.raises(CalibrationError, match="holds one"):
         load_mlp(tmp_path / "none.npz")
@@ -109,17 +107,17 @@ def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
     save_mlp(own, tmp_path / "own.npz")
     again = load_mlp(tmp_path / "own.npz")
     assert (again.provenance, again.view) == (own.provenance, pytest.approx(own.view))
-    MlpMode(spec, calibration=tmp_path / "own.npz", device="cpu")
+    Mlp(weights=tmp_path / "own.npz").build(spec, device="cpu")
     pitch = tuple(1.2 * p for p in spec.camera.pixel_pitch)
     other = dataclasses.replace(spec, camera=dataclasses.replace(spec.camera, pixel_pitch=pitch))
     with pytest.raises(InputError, match="fitted to the sensor 'mine'"):
-        MlpMode(other, calibration=tmp_path / "own.npz", device="cpu")
+        Mlp(weights=tmp_path / "own.npz").build(other, device="cpu")
     broken = dataclasses.replace(weights, matrices=(weights.matrices[0][:, :5], *weights.matrices[1:]))
     save_mlp(broken, tmp_path / "broken.npz")
     with pytest.raises(CalibrationError, match="matrix_0"):
         load_mlp(tmp_path / "broken.npz")
     with pytest.raises(InputError, match="must name a network"):
-        MlpMode(make_sensor_spec(), device="cpu")
+        Mlp().build(make_sensor_spec(), device="cpu")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.optics.image.phong import PHONG_LIGHTS, PhongLight, PhongMode
+from raytac.optics import PHONG_LIGHTS, Phong, PhongLight
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, lit_from_three_sides, relief, sensor, surface
@@ -57,7 +57,7 @@ def published(h: np.ndarray, moved: np.ndarray, rest: np.ndarray, lights: tuple[
 
 @pytest.mark.parametrize("lights", PHONG_LIGHTS)
 def test_it_is_the_published_formula(spec: SensorSpec, grid: PadGrid, lights: str) -> None:
-    mode = PhongMode(spec, lights=lights, background=background(), resolution=RESOLUTION, device="cpu")
+    mode = Phong(lights=lights, background=background()).build(spec, resolution=RESOLUTION, device="cpu")
     surfaces = surface(grid, ball(grid)[0], relief(grid))
     heights, moved = mode.image_heights(surfaces)
     rgb = mode.render(surfaces).rgb
@@ -74,7 +74,7 @@ def test_a_slope_shows_the_light_that_it_rises_towards(spec: SensorSpec, grid: P
     """Two lights from left and right: the sides of an imprint take their colours, mirrored in a mirrored press."""
     lights = (PhongLight((-1, 0, 0.25), (255, 0, 0), 0.5, 0.0), PhongLight((1, 0, 0.25), (0, 0, 255), 0.5, 0.0))
     grey = np.full((RESOLUTION[1], RESOLUTION[0], 3), 100, np.uint8)
-    mode = PhongMode(spec, lights=lights, background=grey, resolution=RESOLUTION, device="cpu")
+    mode = Phong(lights=lights, background=grey).build(spec, resolution=RESOLUTION, device="cpu")
     rgb = mode.render(surface(grid, ball(grid, centre=(0.0, 0.0))[0])).rgb
     assert rgb is not None
     row = rgb[0, RESOLUTION[1] // 2].astype(int)
@@ -87,7 +87,7 @@ def test_a_slope_shows_the_light_that_it_rises_towards(spec: SensorSpec, grid: P
 def test_the_rest_image_of_the_ray_tracer_is_the_background(tracer: Build, grid: PadGrid, spec: SensorSpec) -> None:
     lit = replace(spec, response=replace(spec.response, exposure=12.0))
     dark = (PhongLight((0, 0, 1), (0, 0, 0), 0.0, 0.0),)
-    image = PhongMode(lit, lights=dark, resolution=RESOLUTION, device="cpu").render(at_rest(grid)).rgb
+    image = Phong(lights=dark).build(lit, resolution=RESOLUTION, device="cpu").render(at_rest(grid)).rgb
     traced = tracer(lit).render(at_rest(grid)).rgb
     assert image is not None and traced is not None and traced.max() > 50
     inner = np.s_[0, 5:-5, 5:-5]
@@ -97,7 +97,7 @@ def test_the_rest_image_of_the_ray_tracer_is_the_background(tracer: Build, grid:
 def test_a_batch_is_its_single_images() -> None:
     spec = like_a_mini()
     grid = grid_of(spec)
-    mode = PhongMode(spec, background=background(), resolution=RESOLUTION, device="cpu")
+    mode = Phong(background=background()).build(spec, resolution=RESOLUTION, device="cpu")
     batch = mode.render(surface(grid, ball(grid)[0], grid.rest, relief(grid))).rgb
     assert batch is not None
     for b, height in enumerate((ball(grid)[0], grid.rest, relief(grid))):
@@ -109,12 +109,12 @@ def test_a_batch_is_its_single_images() -> None:
 
 def test_wrong_lights_and_backgrounds_are_refused(spec: SensorSpec) -> None:
     with pytest.raises(InputError, match=r"lights.*gelsight2014, gelsight2017, gazebo"):
-        PhongMode(spec, lights="gelsight", resolution=RESOLUTION, device="cpu")
+        Phong(lights="gelsight").build(spec, resolution=RESOLUTION, device="cpu")
     with pytest.raises(InputError, match="finite"):
-        PhongMode(spec, lights=(PhongLight((0, 0, np.nan), (0, 0, 0), 1, 1),), resolution=RESOLUTION, device="cpu")
+        Phong(lights=(PhongLight((0, 0, np.nan), (0, 0, 0), 1, 1),)).build(spec, resolution=RESOLUTION, device="cpu")
     with pytest.raises(InputError, match=r"background.*\(60, 80, 3\)"):
-        PhongMode(spec, background=np.zeros((3, 3, 3), np.uint8), resolution=RESOLUTION, device="cpu")
+        Phong(background=np.zeros((3, 3, 3), np.uint8)).build(spec, resolution=RESOLUTION, device="cpu")
     with pytest.raises(InputError, match="background = 'list'"):
-        PhongMode(spec, background=[[0]], resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]
+        Phong(background=[[0]]).build(spec, resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"lights = 3.*gelsight2014"):
-        PhongMode(spec, lights=3, resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]
+        Phong(lights=3).build(spec, resolution=RESOLUTION, device="cpu")  # type: ignore[arg-type]

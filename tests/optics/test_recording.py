@@ -13,11 +13,11 @@ from raytac.optics.runtime import no_collection
 CHILD = """
 import gc
 import numpy as np
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics import RayTraced
 from tests.optics.scenes import RESOLUTION, at_rest, grid_of, like_a_mini
 
 spec = like_a_mini()
-tracer = RayTracer(spec, resolution=RESOLUTION, device="cpu", bounce=False)
+tracer = RayTraced(bounce=False).build(spec, resolution=RESOLUTION, device="cpu")
 class Cycle:
     def __init__(self):
         self.me, self.array = self, tracer.mi.Float(np.ones(1000, np.float32))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import GelSurface
+from raytac.optics import RayTraced
 from raytac.optics.trace import reference
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.fast_tracer import total
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import ball, grid_of, like_a_mini, surface
@@ -80,7 +81,7 @@ def test_seeds_reproduce_and_differ(tracer: Build, spec: SensorSpec, pressed: Ge
     first = image(tracer, spec, pressed, 16)
     # Mitsuba rebuilds mesh and tree for every surface with several threads, which may move the last bit of a few pixels.
     np.testing.assert_allclose(image(tracer, spec, pressed, 16), first, rtol=1e-6)
-    built_anew = RayTracer(spec, integrator="reference", resolution=TINY, spp=16, device="cpu")
+    built_anew = RayTraced(integrator="reference", spp=16).build(spec, resolution=TINY, device="cpu")
     np.testing.assert_allclose(total(built_anew.render_layers(pressed))[0], first, rtol=1e-5)
     other, third = (image(tracer, spec, pressed, 16, seed) for seed in (1, 2))
     assert (other != first).mean() > 0.99

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from raytac.errors import SpecError
+from raytac.optics import RayTraced
 from raytac.optics.camera import Pinhole
 from raytac.optics.refraction import Slab
 from raytac.optics.runtime import load_mitsuba
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.fast_tracer import total
 from raytac.optics.trace.scene import UNIT
 from raytac.specs.sensor import RefractionSpec, SensorSpec
 from tests.optics.conftest import Build
@@ -282,13 +283,13 @@ def test_error_of_the_bounce_model_behind_the_slab(tracer: Build) -> None:
 def test_an_led_in_the_plate_is_named() -> None:
     spec = slabbed(sensor([led("fine", (12e-3, 0.0, -9e-3)), led("sunk", (12e-3, 0.0, -6e-3))]), plate=3e-3)
     with pytest.raises(SpecError, match=r"led\[1\]\.position_mm = .*LED 'sunk' reaches up to z = -5\.9.*air face, z < -7 mm"):
-        RayTracer(spec, device="cpu")
+        RayTraced().build(spec, device="cpu")
 
 
 def test_a_camera_in_the_plate_is_refused() -> None:
     spec = slabbed(sensor([led("one", (12e-3, 0.0, -29e-3))]), plate=24.5e-3)
     with pytest.raises(SpecError, match=r"camera\.position_mm = \[0\.0, 0\.0, -28\.0\]: .*behind the gel, z < -28\.5 mm"):
-        RayTracer(spec, device="cpu")
+        RayTraced().build(spec, device="cpu")
 
 
 def test_the_scene_has_the_slab_in_its_own_unit() -> None:

@@ -8,12 +8,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from raytac.optics import RayTraced
 from raytac.optics.response import Response
 from raytac.optics.runtime import load_mitsuba
 from raytac.optics.trace.fast_tracer import total
 from raytac.specs.sensor import ResponseSpec, SensorSpec
 from tests.optics.conftest import Build
-from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, surface
+from tests.optics.scenes import RESOLUTION, at_rest, ball, built, grid_of, like_a_mini, surface
 
 CURVE = ResponseSpec(
     exposure=3.0,
@@ -63,12 +64,10 @@ def background() -> np.ndarray:
 
 @pytest.mark.parametrize("options", [{}, {"integrator": "reference", "spp": 64}], ids=["fast", "reference"])
 def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
-    from raytac.optics.trace.fast_tracer import RayTracer
-
     spec = like_a_mini()
     spec = replace(spec, response=replace(CURVE, black_level=(0.0, 0.0, 0.0)))
     real = background()
-    mode = RayTracer(spec, resolution=RESOLUTION, device="cpu", flat_field=real, **options)
+    mode = built(RayTraced, spec, resolution=RESOLUTION, device="cpu", flat_field=real, **options)
     grid = grid_of(spec)
     at_rest_rgb = mode.render(at_rest(grid)).rgb
     pressed = mode.render(surface(grid, ball(grid)[0]))
@@ -79,7 +78,6 @@ def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
 
 def test_flat_field_scales_in_linear_light(tracer: Build) -> None:
     """image = background × rendered / rendered at rest, before the gamma."""
-    from raytac.optics.trace.fast_tracer import RayTracer
 
     spec = like_a_mini()
     grid = grid_of(spec)
@@ -88,7 +86,7 @@ def test_flat_field_scales_in_linear_light(tracer: Build) -> None:
     plain = tracer(spec, outputs=("rgb", "layers"))
     ratio = total(plain.render_layers(pressed))[0] / total(plain.render_layers(at_rest(grid)))[0]
     expected = 255 * np.clip((real / 255) ** spec.response.gamma * ratio, 0, 1) ** (1 / spec.response.gamma)
-    rgb = RayTracer(spec, resolution=RESOLUTION, device="cpu", flat_field=real).render(pressed).rgb
+    rgb = RayTraced(flat_field=real).build(spec, resolution=RESOLUTION, device="cpu").render(pressed).rgb
     assert rgb is not None
     assert np.abs(rgb[0] - expected).max() <= 1.0
 

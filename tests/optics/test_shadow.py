@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.optics.trace.fast_tracer import RayTracer, total
+from raytac.optics.trace.tracer import Tracer, total
 from raytac.specs.sensor import CameraSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import SMALL, at_rest, grid_of, led, plateau, sensor, surface
@@ -38,7 +38,7 @@ def tip(spec: SensorSpec, height: float, across: float = 0.0) -> float:
     return edge_node(spec) + height * (edge_node(spec) - source[0]) / (-source[2] - height)
 
 
-def share(mode: RayTracer, spec: SensorSpec, height: float) -> tuple[np.ndarray, np.ndarray]:
+def share(mode: Tracer, spec: SensorSpec, height: float) -> tuple[np.ndarray, np.ndarray]:
     """x [m] of the pixels right of the plateau and how much of the light at rest reaches each."""
     grid = grid_of(spec, PITCH)
     lit, rest = (

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
-from raytac.optics.taxim.bake.bake import bake
+from raytac.optics import RayTraced, Taxim
+from raytac.optics.taxim.bake import bake
 from raytac.optics.taxim.bake.settings import BakeSettings
-from raytac.optics.taxim.mode import TaximMode
-from raytac.optics.trace.fast_tracer import RayTracer
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec, load_task
 from raytac.specs.sensor import OpticsSpec
 from raytac.world.world import TactileWorld
-from tests.optics.scenes import RESOLUTION, grid_of, like_a_mini, surface
+from tests.optics.scenes import RESOLUTION, built, grid_of, like_a_mini, surface
 from tests.optics.test_taxim_mode import make_table
 
 LIT = like_a_mini()
@@ -28,7 +27,11 @@ DARK = replace(LIT, optics=OpticsSpec(shadows=False))
 
 def image(sensor: SensorSpec, kind: str, **options: Any) -> np.ndarray:
     common = {"resolution": RESOLUTION, "device": "cpu", **options}
-    mode = RayTracer(sensor, bounce=False, **common) if kind == "raytrace" else TaximMode(sensor, calibration=TABLE, **common)
+    mode = (
+        built(RayTraced, sensor, bounce=False, **common)
+        if kind == "raytrace"
+        else built(Taxim, sensor, calibration=TABLE, **common)
+    )
     assert mode.shadows is (options["shadows"] if options else sensor.optics.shadows)
     grid = grid_of(sensor)
     dent = (np.abs(grid.x) < 2e-3) & (np.abs(grid.y[:, None]) < 2e-3)
@@ -55,7 +58,7 @@ def test_what_is_no_truth_value_is_refused(kind: str) -> None:
 
 
 def test_a_table_without_shadows_casts_none_unless_asked() -> None:
-    mode = TaximMode(LIT, calibration=make_table(LIT, shadow=False), resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=make_table(LIT, shadow=False)).build(LIT, resolution=RESOLUTION, device="cpu")
     assert not mode.shadows and mode.label == "taxim"
 
 
@@ -70,7 +73,7 @@ def test_a_table_is_baked_with_shadows_where_sensor_or_option_wants_them(monkeyp
     monkeypatch.setattr(bake, "baked_table", fake)
     cases = ((LIT, None, True), (LIT, False, False), (DARK, None, False), (DARK, True, True))
     for sensor, asked, casts in cases:
-        assert TaximMode(sensor, shadows=asked, resolution=RESOLUTION, device="cpu").shadows is casts
+        assert Taxim(shadows=asked).build(sensor, resolution=RESOLUTION, device="cpu").shadows is casts
     assert baked == [True, True, False, True]
 
 
@@ -83,13 +86,13 @@ def test_a_sensor_without_shadows_is_baked_without_them() -> None:
 def test_path_tracing_casts_shadows_and_says_so() -> None:
     common: dict[str, Any] = {"integrator": "reference", "resolution": RESOLUTION, "device": "cpu"}
     with pytest.raises(InputError, match=r"shadows = False: .*'reference' follows light as it goes"):
-        RayTracer(LIT, shadows=False, **common)
+        built(RayTraced, LIT, shadows=False, **common)
     with pytest.warns(UserWarning, match=r"optics\.shadows = false of sensor .*'reference' casts shadows as light does"):
-        RayTracer(DARK, **common)
+        built(RayTraced, DARK, **common)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        RayTracer(LIT, **common)
-        RayTracer(DARK, shadows=True, **common)
+        built(RayTraced, LIT, **common)
+        built(RayTraced, DARK, shadows=True, **common)
 
 
 def test_sensors_and_worlds_honour_the_file(tmp_path: Path) -> None:
@@ -98,6 +101,6 @@ def test_sensors_and_worlds_honour_the_file(tmp_path: Path) -> None:
     assert not TactileSensor(path, device="cpu").optical_mode.shadows  # type: ignore[attr-defined]
     task = load_task("roll_ball")
     task = replace(task, robot=replace(task.robot, sensor=str(path)))
-    for options, casts in ({}, False), ({"optics_options": {"shadows": True}}, True):
-        world = TactileWorld(task, outputs=("rgb",), device="cpu", sensor_options=options)
+    for shadows, casts in (None, False), (True, True):
+        world = TactileWorld(task, outputs=("rgb",), device="cpu", optics=RayTraced(shadows=shadows))
         assert [sensor.optical_mode.shadows for sensor in world.sensors.values()] == [casts]  # type: ignore[attr-defined]

@@ -14,14 +14,14 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.image.phong import PhongMode
+from raytac.optics import OPTICS, Phong, Taxim
 from raytac.optics.taxim.folder import save_calibration
-from raytac.optics.taxim.mode import TaximMode, resized
+from raytac.optics.taxim.mode import resized
 from raytac.optics.taxim.table import PolyTable, ShadowTable
 from raytac.sensor import TactileSensor
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
-from tests.optics.scenes import RESOLUTION, at_rest, ball, grid_of, like_a_mini, relief, surface
+from tests.optics.scenes import RESOLUTION, at_rest, ball, built, grid_of, like_a_mini, relief, surface
 
 ROOT = Path(__file__).parents[2]
 
@@ -64,7 +64,7 @@ def test_at_rest_it_is_the_background_also_on_a_dome(spec: SensorSpec, grid: Pad
     table = make_table(spec)
     if shadow:  # the last blur reaches the background too (upstream); a flat one shows what else may change
         table = replace(table, background=np.full_like(table.background, 100))
-    mode = TaximMode(spec, calibration=table, shadows=shadow, resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=table, shadows=shadow).build(spec, resolution=RESOLUTION, device="cpu")
     assert np.abs(grid.rest).max() > 1e-4
     images = mode.render(at_rest(grid))
     assert images.rgb is not None
@@ -74,13 +74,13 @@ def test_at_rest_it_is_the_background_also_on_a_dome(spec: SensorSpec, grid: Pad
 
 def test_upstreams_tables_shade_the_dome_itself(spec: SensorSpec, grid: PadGrid) -> None:
     table = make_table(spec, slopes_of="height", shadow=False)
-    image = TaximMode(spec, calibration=table, resolution=RESOLUTION, device="cpu").render(at_rest(grid)).rgb
+    image = Taxim(calibration=table).build(spec, resolution=RESOLUTION, device="cpu").render(at_rest(grid)).rgb
     assert image is not None and np.abs(image[0].astype(float) - table.background).max() > 2
 
 
 @pytest.mark.parametrize("shadow", [False, True])
 def test_a_batch_is_its_single_images(spec: SensorSpec, grid: PadGrid, shadow: bool) -> None:
-    mode = TaximMode(spec, calibration=make_table(spec), shadows=shadow, resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=make_table(spec), shadows=shadow).build(spec, resolution=RESOLUTION, device="cpu")
     height, contact = ball(grid)
     moved, touched = ball(grid, depth=0.4e-3, centre=(-2e-3, 1e-3))
     heights = np.stack([height, grid.rest, relief(grid), moved, height]).astype(np.float32)
@@ -96,7 +96,7 @@ def test_a_batch_is_its_single_images(spec: SensorSpec, grid: PadGrid, shadow: b
 
 
 def test_pixels_see_the_height_that_the_ray_tracer_sees(tracer: Build, spec: SensorSpec, grid: PadGrid) -> None:
-    mode = TaximMode(spec, calibration=make_table(spec), resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=make_table(spec)).build(spec, resolution=RESOLUTION, device="cpu")
     seen, moved = mode.image_heights(pressed(grid))
     depth = tracer(spec, outputs=("depth",)).render(pressed(grid)).depth
     assert depth is not None
@@ -107,8 +107,10 @@ def test_pixels_see_the_height_that_the_ray_tracer_sees(tracer: Build, spec: Sen
 
 def test_normals_and_depth_are_those_of_the_ray_tracer(tracer: Build, spec: SensorSpec, grid: PadGrid) -> None:
     outputs = ("rgb", "normals", "depth")
-    images = TaximMode(spec, calibration=make_table(spec), resolution=RESOLUTION, outputs=outputs, device="cpu").render(
-        pressed(grid)
+    images = (
+        Taxim(calibration=make_table(spec))
+        .build(spec, resolution=RESOLUTION, outputs=outputs, device="cpu")
+        .render(pressed(grid))
     )
     traced = tracer(spec, outputs=("normals", "depth")).render(pressed(grid))
     for name in ("normals", "depth", "position", "contact"):
@@ -119,13 +121,13 @@ def test_normals_and_depth_are_those_of_the_ray_tracer(tracer: Build, spec: Sens
 def test_uncovered_bins_are_told(spec: SensorSpec, grid: PadGrid) -> None:
     table = make_table(spec)
     surfaces = surface(grid, ball(grid)[0], grid.rest, contact=ball(grid)[1])
-    share = TaximMode(spec, calibration=table, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered
+    share = Taxim(calibration=table).build(spec, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered
     assert share is not None and share.tolist() == [0.0, 0.0]  # no slope of this ball is 45°
     flat_only = replace(table, covered=np.arange(32)[:, None] + np.zeros((32, 32)) < 1)
-    share = TaximMode(spec, calibration=flat_only, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered
+    share = Taxim(calibration=flat_only).build(spec, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered
     assert share is not None and 0.8 < share[0] < 1 and share[1] == 0
     unknown = replace(table, covered=None)
-    assert TaximMode(spec, calibration=unknown, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered is None
+    assert Taxim(calibration=unknown).build(spec, resolution=RESOLUTION, device="cpu").render(surfaces).uncovered is None
 
 
 def test_touched_pixels_and_those_around_have_sheets_of_their_own(spec: SensorSpec, grid: PadGrid) -> None:
@@ -134,7 +136,7 @@ def test_touched_pixels_and_those_around_have_sheets_of_their_own(spec: SensorSp
     other = replace(one, gradients=-0.5 * one.gradients)
     both = replace(one, surround=other.gradients)
     first, second, found = (
-        TaximMode(spec, calibration=table, resolution=RESOLUTION, device="cpu").render_levels(pressed(grid))[0]
+        Taxim(calibration=table).build(spec, resolution=RESOLUTION, device="cpu").render_levels(pressed(grid))[0]
         for table in (one, other, both)
     )
     apart = np.abs(first - second).max(axis=-1) > 1
@@ -154,7 +156,7 @@ def test_touched_pixels_and_those_around_have_sheets_of_their_own(spec: SensorSp
 
 def test_a_failed_environment_is_black_and_alone(spec: SensorSpec, grid: PadGrid) -> None:
     surfaces = surface(grid, ball(grid)[0], np.full(grid.shape, np.nan), contact=ball(grid)[1])
-    mode = TaximMode(spec, calibration=make_table(spec), resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=make_table(spec)).build(spec, resolution=RESOLUTION, device="cpu")
     images = mode.render(surfaces)
     assert images.rgb is not None and images.uncovered is not None
     assert (images.rgb[1] == 0).all() and np.isnan(images.uncovered[1]) and np.isfinite(images.uncovered[0])
@@ -166,8 +168,8 @@ def test_a_failed_environment_is_black_and_alone(spec: SensorSpec, grid: PadGrid
 def test_twice_the_pixels_show_the_same_press(spec: SensorSpec, grid: PadGrid) -> None:
     """A table's polynomials, shadows and widths keep their size on the pad."""
     table = replace(make_table(spec), background=np.full((60, 80, 3), 100, np.float32))
-    fine = TaximMode(spec, calibration=table, resolution=(160, 120), device="cpu").render_levels(pressed(grid))[0]
-    coarse = TaximMode(spec, calibration=table, resolution=RESOLUTION, device="cpu").render_levels(pressed(grid))[0]
+    fine = Taxim(calibration=table).build(spec, resolution=(160, 120), device="cpu").render_levels(pressed(grid))[0]
+    coarse = Taxim(calibration=table).build(spec, resolution=RESOLUTION, device="cpu").render_levels(pressed(grid))[0]
     averaged = fine.reshape(60, 2, 80, 2, 3).mean(axis=(1, 3))
     assert np.abs(coarse - 100).max() > 20
     assert np.abs(averaged - coarse).mean() < 0.03 * np.abs(coarse - 100).max()
@@ -183,14 +185,14 @@ def test_what_it_cannot_do_is_refused(spec: SensorSpec, grid: PadGrid) -> None:
     table = make_table(spec, shadow=False)
     common: dict[str, Any] = {"resolution": RESOLUTION, "device": "cpu"}
     with pytest.raises(InputError, match=r"layers.*choose from: rgb, normals, depth"):
-        TaximMode(spec, calibration=table, outputs=("rgb", "layers"), **common)
+        built(Taxim, spec, calibration=table, outputs=("rgb", "layers"), **common)
     with pytest.raises(InputError, match="has no shadows"):
-        TaximMode(spec, calibration=table, shadows=True, **common)
+        built(Taxim, spec, calibration=table, shadows=True, **common)
     with pytest.raises(InputError, match="aspect ratio of the table's image, 80x60"):
-        TaximMode(spec, calibration=table, resolution=(80, 70), device="cpu")
+        Taxim(calibration=table).build(spec, resolution=(80, 70), device="cpu")
     with pytest.raises(InputError, match="PolyTable, a calibration folder or None"):
-        TaximMode(spec, calibration=3, **common)  # type: ignore[arg-type]
-    mode = TaximMode(spec, calibration=table, **common)
+        built(Taxim, spec, calibration=3, **common)  # type: ignore[arg-type]
+    mode = built(Taxim, spec, calibration=table, **common)
     with pytest.raises(InputError, match="call prepare"):
         mode.render_device(mode.mi.Float(0))
     mode.render(at_rest(grid))
@@ -211,9 +213,9 @@ def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadG
 
     size = (160, 120)
     mode = (
-        PhongMode(spec, background=np.zeros((120, 160, 3), np.uint8), resolution=size, device=device)
+        Phong(background=np.zeros((120, 160, 3), np.uint8)).build(spec, resolution=size, device=device)
         if kind == "phong"
-        else TaximMode(spec, calibration=make_table(spec), shadows=kind == "shadow", resolution=size, device=device)
+        else Taxim(calibration=make_table(spec), shadows=kind == "shadow").build(spec, resolution=size, device=device)
     )
     height, contact = ball(grid)
     for envs, inked in ((1, False), (3, False), (7, False), (7, True)):  # powers of two suit some batches better than others
@@ -225,7 +227,7 @@ def test_memory_of_an_environment_is_what_is_stated(spec: SensorSpec, grid: PadG
 
 
 def test_a_batch_that_does_not_fit_is_refused(spec: SensorSpec, grid: PadGrid, monkeypatch: pytest.MonkeyPatch) -> None:
-    mode = TaximMode(spec, calibration=make_table(spec), resolution=RESOLUTION, device="cpu")
+    mode = Taxim(calibration=make_table(spec)).build(spec, resolution=RESOLUTION, device="cpu")
     assert mode.memory_per_env(grid) > 4 * (grid.rest.size + 80 * 60 * 5)
     monkeypatch.setattr(mode, "_memory", 5 * mode.memory_per_env(grid) // 2)
     assert mode.largest_batch(grid) == 2
@@ -238,14 +240,13 @@ def test_the_sensor_takes_a_calibration_folder(tmp_path: Path) -> None:
     sensor = TactileSensor("gelsight_mini", outputs=("height",))
     table = make_table(sensor.spec)
     save_calibration(table, tmp_path / "calibration")
-    options = {"calibration": tmp_path / "calibration"}
-    sensor = TactileSensor("gelsight_mini", optics="taxim", resolution=RESOLUTION, device="cpu", optics_options=options)
+    sensor = TactileSensor("gelsight_mini", optics=Taxim(tmp_path / "calibration"), resolution=RESOLUTION, device="cpu")
     frame = sensor.press("sphere")
     assert frame.rgb is not None and frame.uncovered is not None and sensor.label == "rigid+taxim-shadow"
     assert np.abs(frame.rgb[0].astype(int) - sensor.rest().rgb[0]).max() > 10  # type: ignore[index]
     np.testing.assert_allclose(sensor.optical_mode.view_ratio, 1)  # type: ignore[attr-defined]
-    with pytest.raises(InputError, match="settings of the ray tracer"):
-        TactileSensor("gelsight_mini", optics="taxim", spp=4)
+    with pytest.raises(InputError, match=r"spp = 4: is no option of optics='taxim'.*choose from: calibration, shadows"):
+        OPTICS.config("taxim", spp=4)
     with pytest.raises(InputError, match="layers"):
         TactileSensor("gelsight_mini", optics="phong", outputs=("layers",))
 

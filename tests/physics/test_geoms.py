@@ -204,7 +204,7 @@ def test_a_scene_presses_a_body_of_a_model(tmp_path: Path) -> None:
     pad = RigidPad(make_sensor_spec(), load_press(tmp_path / "peg.toml"), pitch=0.15e-3)
     assert [p.kind for p in pad.parts] == ["cylinder", "sphere"]
     state = pad.peak(pad.run())
-    surface = pad.surface(state)
+    surface = state.surface
     assert surface.contact.any() and surface.indentation.max() == pytest.approx(0.5e-3, rel=0.02)
     assert state.normal_force[0] > 0.0
     cylinder = primitive("cylinder", (3e-3, 5e-3), pose_of((0, 0, 0), (math.sqrt(0.5), 0, math.sqrt(0.5), 0)))

@@ -14,9 +14,11 @@ import pytest
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import make_grid, rest_height
+from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
+from raytac.physics.press import CLEARANCE
 from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch, layer_stiffening, reduced_modulus
-from raytac.physics.rigid.pad import CLEARANCE, ContactState, RigidPad
+from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.rigid.rig import PressRig
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import (
@@ -72,7 +74,7 @@ def indent(depth: float) -> StageSpec:
     return StageSpec("indent", depth=depth)
 
 
-def press(scene: PressScene, steps: int = 1, **options: object) -> tuple[RigidPad, list[ContactState]]:
+def press(scene: PressScene, steps: int = 1, **options: object) -> tuple[RigidPad, list[PadReading]]:
     pad = RigidPad(sensor_with(), scene, pitch=PITCH, **options)  # type: ignore[arg-type]
     return pad, list(pad.run(steps))
 
@@ -170,12 +172,12 @@ def test_commanded_depth_is_reached_and_release_restores_rest(kind: str) -> None
     assert abs(pressed.depth[0] - 0.5e-3) < 1e-9
     travel = start.pad_from_object[0, 2, 3] - CLEARANCE - pressed.pad_from_object[0, 2, 3]
     assert abs(travel - 0.5e-3) < 1e-6
-    surface = pad.surface(pressed)
+    surface = pressed.surface
     assert surface.contact.any() and 0.4e-3 < surface.indentation.max() < 0.5e-3 + 1e-7
     rest = pad.grid.rest.astype(np.float32)
     for state in (start, released):
         assert state.normal_force[0] == 0.0 and state.depth[0] < 0.0
-        np.testing.assert_array_equal(pad.surface(state).height[0], rest)
+        np.testing.assert_array_equal(state.surface.height[0], rest)
     assert pad.peak(iter(states)) is pressed
 
 
@@ -193,7 +195,7 @@ def test_shear_and_twist_move_the_contact_as_commanded() -> None:
     shear = StageSpec("shear", shear=(1e-3, -0.5e-3))
     twist = StageSpec("twist", twist=0.3)
     scene = scene_of("torus", indent(0.5e-3), shear, twist, position=(1e-3, 0.0, 0.0), quaternion=IDENTITY)
-    pad, states = press(scene)
+    _pad, states = press(scene)
     pressed, sheared, twisted = states[1:]
     np.testing.assert_allclose(
         sheared.pad_from_object[0, :3, 3] - pressed.pad_from_object[0, :3, 3], (1e-3, -0.5e-3, 0.0), atol=1e-12
@@ -201,7 +203,7 @@ def test_shear_and_twist_move_the_contact_as_commanded() -> None:
     c, s = math.cos(0.3), math.sin(0.3)
     np.testing.assert_allclose(twisted.pad_from_object[0, :3, :3], [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], atol=1e-12)
     np.testing.assert_allclose(twisted.pad_from_object[0, :3, 3], sheared.pad_from_object[0, :3, 3], atol=1e-12)
-    moved = pad.surface(sheared).contact_centre - pad.surface(pressed).contact_centre
+    moved = sheared.surface.contact_centre - pressed.surface.contact_centre
     np.testing.assert_allclose(moved[0], (1e-3, -0.5e-3), atol=0.15e-3)  # the dome moves the deepest point a little less
     assert pressed.shear_force[0].tolist() == [0.0, 0.0] and sheared.shear_force[0, 0] > 0.0 > sheared.shear_force[0, 1]
     assert sheared.twist_torque[0] == 0.0 < twisted.twist_torque[0]
@@ -225,23 +227,23 @@ def test_force_is_kept_while_shearing() -> None:
 def test_batch_equals_single_bit_for_bit() -> None:
     offsets = np.array([[0.0, 0.0], [2e-3, -1e-3], [-3e-3, 0.5e-3]])
     scene = scene_of("torus", StageSpec("indent", force=1.0), indent(0.6e-3), StageSpec("shear", shear=(0.5e-3, 0.0)))
-    pad, states = press(scene, num_envs=3, offsets=offsets)
+    _pad, states = press(scene, num_envs=3, offsets=offsets)
     for b in range(3):
-        alone, single = press(scene, offsets=offsets[b : b + 1])
+        _alone, single = press(scene, offsets=offsets[b : b + 1])
         for together, one in zip(states, single, strict=True):
             for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque", "failed"):
                 np.testing.assert_array_equal(getattr(together, name)[b], getattr(one, name)[0])
-        np.testing.assert_array_equal(pad.surface(states[-1]).height[b], alone.surface(single[-1]).height[0])
+        np.testing.assert_array_equal(states[-1].surface.height[b], single[-1].surface.height[0])
 
 
 def test_depths_by_environment_and_a_failed_one_leaves_the_others_running() -> None:
     offsets = np.array([[0.0, 0.0], [np.nan, 0.0], [1e-3, 0.0]])
-    pad, states = press(
+    _pad, states = press(
         scene_of("sphere", indent(0.5e-3)), num_envs=3, offsets=offsets, depths=np.array([0.2e-3, 0.3e-3, 0.4e-3])
     )
     np.testing.assert_array_equal(states[-1].failed, [False, True, False])
     np.testing.assert_allclose(states[-1].depth, [0.2e-3, np.nan, 0.4e-3])
-    height = pad.surface(states[-1]).height
+    height = states[-1].surface.height
     assert np.isnan(height[1]).all() and np.isfinite(height[[0, 2]]).all()
 
 
@@ -252,17 +254,17 @@ def test_turn_shear_and_twist_by_environment_are_those_of_scenes_of_their_own() 
     own = np.array([0.9433, 0.0, 0.3144, 0.1048])
     stages = indent(0.6e-3), StageSpec("shear", shear=(1e-3, 0.0)), StageSpec("twist", twist=0.3)
     scene = scene_of("torus", *stages, quaternion=(0.9433, 0.0, 0.3144, 0.1048))
-    pad, states = press(scene, num_envs=3, rotations=turns, shears=shears, twists=twists)
+    _pad, states = press(scene, num_envs=3, rotations=turns, shears=shears, twists=twists)
     for b in range(3):
         turned = np.empty(4)
         mujoco.mju_mulQuat(turned, turns[b], own)
         alone_stages = indent(0.6e-3), StageSpec("shear", shear=tuple(shears[b])), StageSpec("twist", twist=twists[b])
         w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
-        alone, single = press(scene_of("torus", *alone_stages, quaternion=(w, x, y, z)))
+        _alone, single = press(scene_of("torus", *alone_stages, quaternion=(w, x, y, z)))
         for name in ("pad_from_object", "depth", "normal_force", "shear_force", "twist_torque"):
             np.testing.assert_allclose(getattr(states[-1], name)[b], getattr(single[-1], name)[0], rtol=1e-6, atol=1e-9)
-        apart = pad.surface(states[-1]).height[b] - alone.surface(single[-1]).height[0]
-        assert np.abs(apart).max() < 1e-8 and np.ptp(pad.surface(states[-1]).height[b]) > 0.5e-3
+        apart = states[-1].surface.height[b] - single[-1].surface.height[0]
+        assert np.abs(apart).max() < 1e-8 and np.ptp(states[-1].surface.height[b]) > 0.5e-3
 
 
 def test_a_turn_of_zeros_is_refused_and_one_that_is_not_finite_fails_alone() -> None:
@@ -290,7 +292,7 @@ def test_moving_the_case_is_the_same_press(kind: str) -> None:
         StageSpec("release"),
     )
     scene = scene_of(kind, *stages, position=(2e-3, 1e-3, 0.0), quaternion=tilted)
-    pad, moved_object = press(scene, steps=2)
+    _, moved_object = press(scene, steps=2)
     _, moved_case = press(dataclasses.replace(scene, moves="case"), steps=2)
     fixed = moved_case[0].world_from_pad[0] @ moved_case[0].pad_from_object[0]
     for a, b in zip(moved_object, moved_case, strict=True):
@@ -298,10 +300,10 @@ def test_moving_the_case_is_the_same_press(kind: str) -> None:
         np.testing.assert_allclose(b.pad_from_object, a.pad_from_object, rtol=0.0, atol=1e-9)
         for name in ("depth", "normal_force", "shear_force", "twist_torque"):
             np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(pad.surface(b).height, pad.surface(a).height, rtol=0.0, atol=1e-9)
-        np.testing.assert_array_equal(pad.surface(b).contact, pad.surface(a).contact)
+        np.testing.assert_allclose(b.surface.height, a.surface.height, rtol=0.0, atol=1e-9)
+        np.testing.assert_array_equal(b.surface.contact, a.surface.contact)
         np.testing.assert_allclose(b.world_from_pad[0] @ b.pad_from_object[0], fixed, rtol=0.0, atol=1e-12)
-    assert pad.surface(moved_case[-3]).contact.any()
+    assert moved_case[-3].surface.contact.any()
 
 
 def test_the_case_moves_against_the_object() -> None:
@@ -322,7 +324,7 @@ def test_the_case_moves_against_the_object() -> None:
 def test_untouched_pad() -> None:
     pad, states = press(scene_of("none"))
     assert len(states) == 1 and pad.peak(states) is states[0]
-    surface = pad.surface(states[0])
+    surface = states[0].surface
     assert surface.pad_from_object is None
     np.testing.assert_array_equal(surface.height[0], pad.grid.rest.astype(np.float32))
 
@@ -420,3 +422,13 @@ def test_a_stage_may_be_left_on_the_way_and_one_that_fails_leaves_the_object_whe
         list(pad.follow(StageSpec("indent", depth=0.05)))
     with pytest.raises(InputError, match="steps"):
         list(pad.follow(StageSpec("release"), 0))
+
+
+def test_a_reading_of_some_environments_is_theirs() -> None:
+    pad, states = press(scene_of("torus", indent(0.5e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [1e-3, 0.0]]))
+    whole, one = states[-1], states[-1].of([1])
+    for name in ("wrench", "pad_from_object", "depth", "failed", "force_law_area"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(whole, name)[1:])
+    np.testing.assert_array_equal(one.surface.height, whole.surface.height[1:])
+    np.testing.assert_array_equal(one.traction(), whole.traction()[1:])
+    assert one.stage == whole.stage == 0 and one.scene is pad.scene and whole.surface.batch == 2

@@ -13,8 +13,9 @@ from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.traction import cell_areas
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.pad import SoftPad
-from raytac.physics.soft.reading import UNSOLVED, UnsolvedContactWarning
+from raytac.physics.soft.reading import UnsolvedContactWarning
 from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.settings import Correction
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft
@@ -37,7 +38,7 @@ def test_the_imprint_is_as_deep_as_commanded(pressed):
     state = reached(states)
     assert not state.failed[0]
     assert state.depth[0] == pytest.approx(0.6e-3, abs=2e-6)
-    surface = pad.surface(state)
+    surface = state.surface
     assert surface.indentation.max() == pytest.approx(0.6e-3, rel=0.02)
     deepest = np.unravel_index(surface.indentation[0].argmax(), pad.grid.shape)
     assert abs(pad.grid.x[deepest[1]]) < 0.3e-3 and abs(pad.grid.y[deepest[0]]) < 0.3e-3
@@ -45,7 +46,7 @@ def test_the_imprint_is_as_deep_as_commanded(pressed):
 
 def test_inside_the_contact_the_coat_is_the_object_and_nowhere_in_it(pressed):
     pad, states = pressed
-    surface = pad.surface(reached(states))
+    surface = reached(states).surface
     under = pad.object_height(surface)[0]
     gap = under - surface.height[0]
     assert surface.contact[0].sum() > 20
@@ -57,7 +58,7 @@ def test_inside_the_contact_the_coat_is_the_object_and_nowhere_in_it(pressed):
 def test_forces_balance_and_traction_integrates_to_the_wrench(pressed):
     pad, states = pressed
     state = reached(states)
-    wrench, traction = pad.wrench(state)[0], pad.traction(state)[0].astype(float)
+    wrench, traction = state.wrench[0], state.traction()[0].astype(float)
     assert wrench[2] < -0.5
     assert wrench[:3] == pytest.approx((traction * cell_areas(pad.grid)[..., None]).sum(axis=(0, 1)), rel=1e-4, abs=1e-4)
     assert state.normal_force[0] == pytest.approx(-wrench[2])
@@ -66,7 +67,7 @@ def test_forces_balance_and_traction_integrates_to_the_wrench(pressed):
 def test_the_case_feels_what_the_object_does():
     """The wrench summed over the coat's contacts is that summed over the bonded vertices, within 1 % of the load."""
     pad = soft(press(indent(0.3e-3), StageSpec("shear", shear=(0.1e-3, 0.0))))
-    wrench = pad.wrench(pad.peak(pad.run()))[0]
+    wrench = pad.peak(pad.run()).wrench[0]
     assert pad.solver is not None
     held = pad.solver.world.wrench("pad")
     load = np.linalg.norm(wrench[:3])
@@ -75,15 +76,15 @@ def test_the_case_feels_what_the_object_does():
 
 
 def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
-    pad, states = pressed
-    wrench = pad.wrench(reached(states))[0]
+    _pad, states = pressed
+    wrench = reached(states).wrench[0]
     assert np.abs(wrench[:2]).max() < 1e-6 * abs(wrench[2])
     assert np.abs(wrench[3:]).max() < 1e-6 * abs(wrench[2]) * RADIUS
-    traction = pad.traction(reached(states))[0]
+    traction = reached(states).traction()[0]
     assert np.abs(traction[..., :2]).max() > 1e2  # it is there, and cancels
-    height = pad.surface(reached(states)).height[0]
+    height = reached(states).surface.height[0]
     assert np.abs(height - height[::-1]).max() < 1e-7 and np.abs(height - height[:, ::-1]).max() < 1e-7
-    coat = pad.surface(reached(states)).coat
+    coat = reached(states).surface.coat
     assert coat is not None
     moved = coat.displacement[0].reshape(*coat.mesh.shape, 3)  # what markers ride on
     assert np.linalg.norm(moved[..., :2], axis=-1).max() > 10e-6
@@ -94,8 +95,8 @@ def test_a_symmetric_press_has_no_net_shear_and_no_twist(pressed):
 def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
     pad, states = pressed
     for state in states:
-        surface, reading = pad.surface(state), state.reading
-        assert surface.coat is not None and reading is not None
+        surface = state.surface
+        assert surface.coat is not None
         x, y, z = surface.coat.positions[0].T
         inside = (np.abs(x) < 8e-3) & (np.abs(y) < 6e-3)
         node = [np.interp(at[inside], line, np.arange(len(line))) for at, line in ((y, pad.grid.y), (x, pad.grid.x))]
@@ -103,7 +104,7 @@ def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
         assert np.abs(z[inside] - shown).max() < (
             0.3e-6 if surface.contact.any() else 2e-6
         )  # bilinear on a dome, or a spline's own nodes
-    touching = reached(states).reading
+    touching = reached(states).solved
     assert np.abs(touching.surface.coat.positions - touching.vertices).max() > 20e-6  # the mesh alone is not there
 
 
@@ -113,8 +114,8 @@ def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
     The area of contact is that of a pad with cells of 0.25 mm, 4.39 mm² (``experiments/bench_coat.py --shapes ball``), within 3 %.
     """
     pad = SoftPad(SENSOR, press(indent(0.3e-3)), pitch=0.1e-3)
-    reading = pad.peak(pad.run()).reading
-    assert reading is not None and reading.surface.coat is not None
+    reading = pad.peak(pad.run()).solved
+    assert reading.surface.coat is not None
     assert reading.surface.contact.sum() * np.prod(pad.grid.pitch) == pytest.approx(4.39e-6, rel=0.03)
     rest = reading.surface.coat.mesh.rest
     under = np.hypot(*rest[:, :2].T) < 1.2e-3
@@ -122,32 +123,71 @@ def test_a_light_ball_does_not_push_the_skin_out_from_under_itself():
     assert under.sum() == 5 and mesh.max() > 25e-6 and skin.max() < 6e-6
 
 
-def test_a_contact_that_is_not_found_is_told_of_once(monkeypatch):
-    from raytac.physics.soft.correction import normal as fine_contact
-
+def test_a_contact_that_is_not_solved_is_warned_of_once():
     pad = soft(press(indent(0.3e-3)))
     state = pad.peak(pad.run())
-    assert state.reading is not None and state.reading.residual[0] < 1e-6
-    monkeypatch.setattr(fine_contact, "_ROUNDS", 2)
-    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as told:
+    assert state.solved.residual[0] < 1e-6
+    pad = soft(press(indent(0.3e-3)), correction=Correction(normal_iterations=2))
+    with pytest.warns(UnsolvedContactWarning, match=r"was left \d+\.\d µm from its solution, more than 5 µm") as warned:
         states = list(pad.run(2))
-    left = [state.reading.residual[0] for state in states if state.reading is not None]
-    assert len(told) == 1 and np.isnan(left[0]) and left[-1] > UNSOLVED
+    residuals = [state.solved.residual[0] for state in states]
+    assert len(warned) == 1 and np.isnan(residuals[0]) and residuals[-1] > Correction().unsolved
+
+
+def test_without_correction_the_surface_goes_through_the_solvers_vertices():
+    """The press is the same, and so are its forces; the stages can be left out one by one."""
+    scene = press(indent(0.4e-3), StageSpec("shear", shear=(0.15e-3, 0.0)))
+    readings = {}
+    for name, correction in {
+        "none": None,
+        "all": Correction(),
+        "height": Correction(tangential=False, friction=False),
+        "sideways": Correction(normal=False),
+    }.items():
+        pad = soft(scene, correction=correction)
+        readings[name] = pad.peak(pad.run()).solved
+    plain, grid = readings["none"], pad.grid
+    vertices, height = plain.vertices[0], plain.surface.height[0].astype(float)
+    assert np.array_equal(plain.surface.coat.positions[0], vertices) and np.isnan(plain.residual[0])
+    inside = (np.abs(vertices[:, 0]) < 8e-3) & (np.abs(vertices[:, 1]) < 6e-3)
+    node = [np.interp(vertices[inside, k], line, np.arange(len(line))) for k, line in ((1, grid.y), (0, grid.x))]
+    assert np.abs(map_coordinates(height, node, order=3) - vertices[inside, 2]).max() < 1e-6
+    gap = (plain.underside - plain.surface.height)[plain.surface.contact]
+    assert gap.size > 20 and gap.max() < pad.mesh.d_hat and np.abs(gap).max() > 10e-6  # cells of a millimetre
+    whole = readings["all"]
+    for reading in readings.values():
+        assert np.array_equal(reading.forces, plain.forces) and np.array_equal(reading.vertices, plain.vertices)
+    assert np.array_equal(readings["height"].surface.height, whole.surface.height)
+    assert np.array_equal(readings["height"].surface.coat.positions[..., :2], plain.vertices[..., :2])
+    assert np.array_equal(readings["sideways"].surface.height, plain.surface.height)
+    assert np.array_equal(readings["sideways"].surface.coat.positions[..., :2], whole.surface.coat.positions[..., :2])
+    assert np.abs(whole.surface.coat.positions[..., :2] - plain.vertices[..., :2]).max() > 5e-6
+
+
+def test_settings_of_the_correction_are_checked():
+    with pytest.raises(InputError, match=r"normal_iterations = 0.*whole number >= 1"):
+        Correction(normal_iterations=0)
+    with pytest.raises(InputError, match=r"gap_tolerance = nan.*\(0, inf\)"):
+        Correction(gap_tolerance=float("nan"))
+    with pytest.raises(InputError, match=r"no_blend.*greater than full_blend"):
+        Correction(no_blend=0.2)
+    with pytest.raises(InputError, match=r"correction.*None shows the plain surface"):
+        Correction(normal=False, tangential=False, friction=False)
 
 
 def test_a_release_leaves_the_pad_at_rest(pressed):
-    pad, states = pressed
+    _pad, states = pressed
     last = states[-1]
     assert last.kind == "release" and last.normal_force[0] == 0.0
-    assert np.abs(pad.surface(last).indentation).max() < 1e-6
-    assert not pad.surface(last).contact.any() and np.isnan(pad.surface(last).contact_centre).all()
+    assert np.abs(last.surface.indentation).max() < 1e-6
+    assert not last.surface.contact.any() and np.isnan(last.surface.contact_centre).all()
 
 
 def test_running_again_forgets_the_press(pressed):
     pad, states = pressed
     again = list(pad.run(2))
     for one, two in zip(states, again, strict=True):
-        assert np.abs(pad.surface(one).height - pad.surface(two).height).max() < 1e-9
+        assert np.abs(one.surface.height - two.surface.height).max() < 1e-9
         assert one.normal_force[0] == pytest.approx(two.normal_force[0], abs=1e-9)
 
 
@@ -156,7 +196,7 @@ def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
     scene = press(indent(0.6e-3))
     rigid = RigidPad(SENSOR, scene, pitch=PITCH)
     state = rigid.peak(rigid.run())
-    one, two = rigid.surface(state), pad.surface(reached(states))
+    one, two = state.surface, reached(states).surface
     both = one.contact[0] & two.contact[0]
     assert both.sum() > 20 and np.abs(one.height[0] - two.height[0])[both].max() < 10e-6
     # What the rigid pad touches, about π R δ as on a half-space, the simulated one touches too, and more, as a layer does, but not 2 π R δ.
@@ -176,7 +216,7 @@ def test_a_straight_edge_leaves_a_straight_furrow():
     spec = ObjectSpec("edge", {"side": 8e-3}, (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half)), 0.05)
     pad = SoftPad(SENSOR, PressScene("edge", spec, (indent(0.6e-3),)), pitch=0.1e-3)
     state = pad.peak(pad.run())
-    surface = pad.surface(state)
+    surface = state.surface
     under = pad.object_height(surface)
     assert under is not None
     along = np.linspace(-2.5e-3, 2.5e-3, 101)
@@ -209,8 +249,8 @@ def test_case_and_object_give_the_same_press():
     one, two = (soft(press(*stages, moves=moves)) for moves in ("object", "case"))
     a, b = one.peak(one.run()), two.peak(two.run())
     assert not np.allclose(b.world_from_pad[0], np.eye(4)) and np.allclose(a.world_from_pad[0], np.eye(4))
-    assert np.abs(one.surface(a).height - two.surface(b).height).max() < 2e-6
-    assert one.wrench(a)[0] == pytest.approx(two.wrench(b)[0], rel=5e-3, abs=2e-3 * a.normal_force[0])
+    assert np.abs(a.surface.height - b.surface.height).max() < 2e-6
+    assert a.wrench[0] == pytest.approx(b.wrench[0], rel=5e-3, abs=2e-3 * a.normal_force[0])
     world_from_object = b.world_from_pad @ b.pad_from_object
     assert np.allclose(world_from_object[0, :2, 3], 0.0, atol=1e-9) and np.allclose(
         world_from_object[0, :3, :3], np.eye(3), atol=1e-9
@@ -224,12 +264,12 @@ def test_a_soft_object_gives_way():
     hard, squash = (soft(press(indent(0.5e-3), dynamics=d, youngs_modulus=m)) for d, m in (("kinematic", 1e6), ("soft", 2e5)))
     one, two = hard.peak(hard.run()), squash.peak(squash.run())
     assert not two.failed[0] and 0.1 * one.normal_force[0] < two.normal_force[0] < 0.8 * one.normal_force[0]
-    assert squash.surface(two).indentation.max() < 0.8 * hard.surface(one).indentation.max()
-    under = squash.object_height(squash.surface(two))
-    assert under is not None and np.abs((under - squash.surface(two).height)[squash.surface(two).contact]).max() < 3e-5
+    assert two.surface.indentation.max() < 0.8 * one.surface.indentation.max()
+    under = squash.object_height(two.surface)
+    assert under is not None and np.abs((under - two.surface.height)[two.surface.contact]).max() < 3e-5
     # All of the ball is there, up to its equator and far from the contact, whether it touches or not.
     start = next(iter(squash.run()))
-    for shown in (squash.object_height(squash.surface(start)), under):
+    for shown in (squash.object_height(start.surface), under):
         assert shown is not None
         there = np.isfinite(shown[0])
         assert there.sum() * PITCH**2 == pytest.approx(math.pi * RADIUS**2, rel=0.05)
@@ -244,13 +284,13 @@ def test_the_rigid_pad_refuses_a_soft_object():
 def test_an_untouched_pad_needs_no_solver():
     pad = soft(press(kind="none"))
     state = pad.peak(pad.run())
-    assert np.array_equal(pad.surface(state).height[0], pad.grid.rest.astype(np.float32))
-    assert not pad.wrench(state).any() and not pad.traction(state).any() and pad.object_height(pad.surface(state)) is None
+    assert np.array_equal(state.surface.height[0], pad.grid.rest.astype(np.float32))
+    assert not state.wrench.any() and not state.traction().any() and pad.object_height(state.surface) is None
 
 
 def test_bad_input_is_named():
     with pytest.raises(InputError, match=r"pad.*'huge'.*coarse, medium, fine"):
-        soft(press(indent(0.4e-3)), pad="huge")
+        soft(press(indent(0.4e-3)), level="huge")
     with pytest.raises(InputError, match="num_envs"):
         soft(press(indent(0.4e-3)), num_envs=0)
     with pytest.raises(InputError, match="offsets"):
@@ -260,9 +300,6 @@ def test_bad_input_is_named():
     with pytest.raises(SpecError, match=r"object\.dynamics.*'ghost'.*kinematic, affine, soft"):
         soft(press(indent(0.4e-3), dynamics="ghost"))
     pad = soft(press(kind="none"))
-    rigid = RigidPad(SENSOR, press(indent(0.4e-3)), pitch=PITCH)
-    with pytest.raises(InputError, match=r"must be a state that this pad's run\(\) gave"):
-        pad.surface(rigid.peak(rigid.run()))
     with pytest.raises(InputError, match="steps_per_stage"):
         next(pad.run(0))
 

@@ -12,7 +12,7 @@ from raytac.physics.rigid.load_law import LoadLaw
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.pad import SoftPad
-from raytac.physics.soft.press_solver import SoftContact
+from raytac.physics.soft.press_solver import PressSolver
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft
 
@@ -26,10 +26,10 @@ def test_a_release_keeps_coulombs_law_and_never_pulls(kind):
     assert len(loaded) >= 2
     assert max(np.linalg.norm(s.shear_force[0]) / s.normal_force[0] for s in loaded) > 0.3  # the law has something to bound
     for state in released:
-        force = pad.wrench(state)[0, :3]
+        force = state.wrench[0, :3]
         assert force[2] <= 1e-4
         assert np.linalg.norm(force[:2]) <= 1.02 * SENSOR.gelpad.friction * -force[2] + 1e-4
-        assert state.reading is not None and state.reading.forces[..., 2].max() <= 1e-4
+        assert state.solved.forces[..., 2].max() <= 1e-4
     assert released[-1].normal_force[0] == 0.0
 
 
@@ -52,7 +52,7 @@ def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
     for state in states[1:]:
         assert not state.failed[0] and state.normal_force[0] == pytest.approx(1.0, rel=0.01)
     assert states[1].depth[0] > 0.3e-3
-    wrench = pad.wrench(states[2])[0]
+    wrench = states[2].wrench[0]
     assert 0.05 < wrench[0] < 1.0 and abs(wrench[1]) < 0.01 * wrench[0]  # along the drag, within Coulomb's cone
 
 
@@ -67,7 +67,7 @@ def test_a_lowered_force_keeps_coulombs_law(kind):
     for state, force in zip(lowered, (1.1, 0.7, 0.3), strict=True):
         assert not state.failed[0] and state.normal_force[0] == pytest.approx(force, rel=1e-3)
         assert state.shear_force[0, 1] > 0.0
-        assert state.reading is not None and state.reading.forces[..., 2].max() <= 1e-3 * force
+        assert state.solved.forces[..., 2].max() <= 1e-3 * force
     for state in (*sheared, *lowered):
         assert np.linalg.norm(state.shear_force[0]) <= 1.02 * 0.3 * state.normal_force[0]
     dragged = [state.shear_force[0, 1] for state in (sheared[-1], *lowered)]
@@ -90,8 +90,8 @@ def test_a_force_after_a_depth_begins_from_what_is_borne_and_forgets_no_shear(ma
 def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
     """The contact's stiffness is known from the states before: six steps of the solver a state at most, on the mean."""
     steps = []
-    drive = SoftContact.drive
-    monkeypatch.setattr(SoftContact, "drive", lambda self, *args: steps.append(1) or drive(self, *args))
+    step = PressSolver.step
+    monkeypatch.setattr(PressSolver, "step", lambda self, *args: steps.append(1) or step(self, *args))
     pad = soft(press(indent(force=1.0)))
     states = list(pad.run(8))[1:]
     assert [state.normal_force[0] for state in states] == pytest.approx(list(np.arange(1, 9) / 8), rel=1e-3)
@@ -113,7 +113,7 @@ def test_twist_turns_with_the_object():
     pad = soft(press(indent(0.4e-3), StageSpec("twist", twist=math.radians(4.0)), kind="cylinder"))
     state = pad.peak(pad.run())
     assert state.twist_torque[0] > 1e-4 and np.abs(state.shear_force[0]).max() < 1e-3 * state.normal_force[0]
-    coat = pad.surface(state).coat
+    coat = state.surface.coat
     assert coat is not None
     here = np.linalg.norm(coat.mesh.rest[:, :2], axis=1) < 2e-3
     x, y = coat.mesh.rest[here, :2].T
@@ -127,13 +127,13 @@ def test_a_depth_is_kept_through_shear_and_twist():
     pad = soft(press(*stages, kind="cylinder"))
     for state in list(pad.run(2))[2:]:
         assert state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
-        assert pad.surface(state).indentation.max() == pytest.approx(0.5e-3, abs=4e-6)
+        assert state.surface.indentation.max() == pytest.approx(0.5e-3, abs=4e-6)
 
 
 def test_a_flat_face_imprints_flat_under_twist():
     """No pits under the rim, no holes in the contact, nothing in the object: what the coat's cells of a millimetre used to leave."""
     pad = SoftPad(SENSOR, press(indent(0.5e-3), StageSpec("twist", twist=math.radians(20.0)), kind="cylinder"), pitch=0.1e-3)
-    surface = pad.surface(pad.peak(pad.run()))
+    surface = pad.peak(pad.run()).surface
     under = pad.object_height(surface)
     assert under is not None and (under - surface.height).min() > -1e-8
     rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
@@ -150,7 +150,7 @@ def test_force_against_depth_is_the_bonded_layers():
     """
     fine = PadLevel(0.8e-3, 6, 4.0, 2.0, 8e-6)
     scene = press(indent(0.15e-3), indent(0.3e-3))
-    pad = soft(scene, FRICTIONLESS, pad=pad_mesh(SENSOR.gelpad, fine))
+    pad = soft(scene, FRICTIONLESS, level=pad_mesh(SENSOR.gelpad, fine))
     force = [state.normal_force[0] for state in pad.run()][1:]
     x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
     gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)

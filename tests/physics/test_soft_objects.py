@@ -37,9 +37,9 @@ def soft():
 
 def test_a_soft_ball_leaves_a_symmetric_imprint_shallower_than_its_way(soft):
     """Ball and gel share the way by 1 − ν² over E of each, so that as stiff a ball leaves half of it to the gel at most."""
-    pad, state = soft
+    _pad, state = soft
     assert not state.failed[0] and state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
-    height, deepest = pad.surface(state).height[0], pad.surface(state).indentation.max()
+    height, deepest = state.surface.height[0], state.surface.indentation.max()
     assert 0.3 * 0.5e-3 < deepest < 0.5 * 0.5e-3
     for turned in (height[::-1], height[:, ::-1]):
         assert (
@@ -52,7 +52,7 @@ def test_a_soft_balls_imprint_has_no_facets(soft):
     """Ripple in contact, what a polynomial of degree 8 leaves: less than a third of that of the ball's own triangles."""
     pad, _ = soft
     assert pad.solver is not None
-    seen = pad.solver.seen(pad._drive.poses())
+    seen = pad.solver.coat_state(pad._drive.poses())
     facets = replace(seen.objects[0], surface=pad.solver.scene.mesh("object", "pad"))
     x, y = (a / 3e-3 for a in np.meshgrid(pad.grid.x, pad.grid.y))
     inside = np.hypot(x, y) < 0.3
@@ -71,7 +71,7 @@ def test_what_drives_a_soft_ball_is_what_the_case_feels(soft):
     driven, case = (pad.solver.world.wrench(name).force[0] for name in ("object", "pad"))
     assert state.normal_force[0] > 0.1
     assert np.abs(driven + case).max() < 0.01 * state.normal_force[0]
-    assert case == pytest.approx(pad.wrench(state)[0, :3], abs=0.01 * state.normal_force[0])
+    assert case == pytest.approx(state.wrench[0, :3], abs=0.01 * state.normal_force[0])
 
 
 def test_two_elastic_bodies_touch_by_hertzs_law(rigid, soft):
@@ -83,7 +83,7 @@ def test_two_elastic_bodies_touch_by_hertzs_law(rigid, soft):
     gel, rubber = ((1.0 - nu**2) / young for nu, young in ((gelpad.poisson_ratio, gelpad.youngs_modulus), (POISSON, YOUNG)))
     moduli = []
     for pad, state in (rigid, soft):
-        radius = math.sqrt(pad.surface(state).contact.sum() * np.prod(pad.grid.pitch) / math.pi)
+        radius = math.sqrt(state.surface.contact.sum() * np.prod(pad.grid.pitch) / math.pi)
         moduli.append(0.75 * state.normal_force[0] * RADIUS / radius**3)
     assert moduli[1] / moduli[0] == pytest.approx(gel / (gel + rubber), rel=0.1)
     assert moduli[0] * gel == pytest.approx(1.33, rel=0.1)
@@ -92,11 +92,11 @@ def test_two_elastic_bodies_touch_by_hertzs_law(rigid, soft):
 def test_a_free_ball_rests_upright_on_the_dome():
     """Symmetric, without shear or torque, and as deep as a driven one that bears the same force."""
     states = [ball(SENSOR, StageSpec("indent", force=0.3), dynamics=dynamics) for dynamics in ("affine", "kinematic")]
-    (pad, lying), (other, driven) = states
-    height = pad.surface(lying).height[0]
+    (_pad, lying), (_other, driven) = states
+    height = lying.surface.height[0]
     assert max(np.abs(height - height[::-1]).max(), np.abs(height - height[:, ::-1]).max()) < 2e-6
-    wrench = pad.wrench(lying)[0]
+    wrench = lying.wrench[0]
     assert wrench[2] == pytest.approx(-0.3, rel=0.01)
     assert np.abs(wrench[:2]).max() < 1e-3 * 0.3 and np.abs(wrench[3:]).max() < 1e-3 * 0.3 * RADIUS
-    deepest = other.surface(driven).indentation.max()
-    assert np.abs(height - other.surface(driven).height[0]).max() < 0.05 * deepest  # while it comes to rest, friction gives way
+    deepest = driven.surface.indentation.max()
+    assert np.abs(height - driven.surface.height[0]).max() < 0.05 * deepest  # while it comes to rest, friction gives way

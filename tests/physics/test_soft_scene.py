@@ -7,10 +7,11 @@ import pytest
 
 import ipc
 from raytac.errors import InputError, OverlapError
-from raytac.physics.soft.bodies import scene_body
+from raytac.physics.soft.bodies import ScenePad, scene_body
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
-from raytac.physics.soft.scene import ScenePad, SoftScene
-from raytac.physics.soft.substeps import STEP, Mover, allowed_share
+from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.settings import SceneSettings, SubstepLimits
+from raytac.physics.soft.substeps import BoxMotion, allowed_share
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 
@@ -100,14 +101,36 @@ def test_what_flies_by_itself_is_never_refused():
 
 def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
     box = np.full((1, 3), 1e-3)
-    one = Mover(np.eye(4)[None], pose(position=(10e-3, 0, 0))[None], -box, box)
+    one = BoxMotion(np.eye(4)[None], pose(position=(10e-3, 0, 0))[None], -box, box)
     far, near = (pose(position=(d, 0.0, 0.0))[None] for d in (7e-3, 2.05e-3))
-    assert allowed_share({"a": one, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.5)
-    assert allowed_share({"a": one, "b": Mover(near, near, -box, box)}, [("a", "b")], 1e-4)[0] == pytest.approx(STEP / 10e-3)
-    through = Mover(np.eye(4)[None], pose(position=(0.1, 0, 0))[None], -box, box)
-    assert allowed_share({"a": through, "b": Mover(far, far, -box, box)}, [("a", "b")], 0.0)[0] == pytest.approx(0.05)
+    limits = SubstepLimits()
+
+    def share(a, b, reach=0.0, limits=limits):
+        return allowed_share({"a": a, "b": BoxMotion(b, b, -box, box)}, [("a", "b")], reach, limits)
+
+    assert share(one, far)[0] == pytest.approx(0.5)
+    assert share(one, near, 1e-4)[0] == pytest.approx(limits.step / 10e-3)
+    assert share(one, near, 1e-4, SubstepLimits(step=2e-4))[0] == pytest.approx(2e-4 / 10e-3)
+    through = BoxMotion(np.eye(4)[None], pose(position=(0.1, 0, 0))[None], -box, box)
+    assert share(through, far)[0] == pytest.approx(0.05)
     aside = pose(position=(0.0, 50e-3, 0.0))[None]
-    assert allowed_share({"a": one, "b": Mover(aside, aside, -box, box)}, [("a", "b")], 0.0) == (np.ones(1), [None])
+    assert share(one, aside) == (np.ones(1), [None])
+
+
+def test_a_scene_takes_its_accuracy_and_its_substeps_from_its_settings():
+    cube = scene_body("cube", (primitive("box", (HALF,) * 3),), "kinematic", friction=0.0)
+    accuracy = SceneSettings(creep=1e-4, tolerance=1e-7, linear_tolerance=1e-5, substeps=SubstepLimits(step=1e-3, most=16))
+    scene = SoftScene([ScenePad("left", SENSOR, MESH)], [cube], fingers(0.3e-3)[:1], {"cube": np.eye(4)}, accuracy=accuracy)
+    solver = scene.settings
+    assert (solver.friction_velocity, solver.linear_tolerance) == (1e-4, 1e-5)
+    assert solver.velocity_tolerance * solver.dt == pytest.approx(1e-7)
+    usual = SoftScene([ScenePad("left", SENSOR, MESH)], [cube], fingers(0.3e-3)[:1], {"cube": np.eye(4)})
+    goal = fingers(-0.2e-3)[:1]
+    assert scene.is_small(goal) and not usual.is_small(goal)
+    with pytest.raises(InputError, match=r"world_from_pad.*at most 16 mm"):
+        scene.step(fingers(-30e-3)[:1])
+    with pytest.raises(InputError, match=r"most = 48.*power of two"):
+        SubstepLimits(most=48)
 
 
 def test_environments_have_their_own_poses_and_reset_alone():

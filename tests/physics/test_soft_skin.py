@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ipc
-from raytac.physics.soft.skin import SoftSkin, _cut
+from raytac.physics.soft.skin import SoftSkin, _subdivide
 from raytac.shapes.part import primitive
 from raytac.shapes.triangulate import enclosed_volume
 
@@ -29,7 +29,7 @@ def ball():
 
 def test_at_rest_it_is_the_object_and_not_its_facets(ball):
     tets, skin = ball
-    still = skin.carried(tets.vertices[None])[0]
+    still = skin.deform(tets.vertices[None])[0]
     assert np.abs(still - skin.rest).max() < 1e-12
     assert np.abs(np.linalg.norm(still, axis=1) - RADIUS).max() < 1e-9
     middles = skin.rest[skin.faces].mean(axis=1)
@@ -40,7 +40,7 @@ def test_motions_that_are_linear_in_the_place_are_exact(ball):
     tets, skin = ball
     rng = np.random.default_rng(0)
     motion, shift = np.eye(3) + 0.5 * rng.normal(size=(2, 3, 3)), rng.normal(size=(2, 1, 3))
-    found = skin.carried(np.einsum("bij,vj->bvi", motion, tets.vertices) + shift)
+    found = skin.deform(np.einsum("bij,vj->bvi", motion, tets.vertices) + shift)
     assert np.abs(found - np.einsum("bij,vj->bvi", motion, skin.rest) - shift).max() < 1e-12
 
 
@@ -53,10 +53,10 @@ def test_a_bend_is_followed_and_single_vertices_are_evened_out(ball):
         moved[:, 2] += 0.2e-3 * np.cos(at[:, 0] / 2.5e-3) * np.cos(at[:, 1] / 2.5e-3)
         return moved
 
-    found = skin.carried(bent(tets.vertices)[None])[0]
+    found = skin.deform(bent(tets.vertices)[None])[0]
     assert np.abs(found - bent(skin.rest)).max() < 0.05 * 0.2e-3
     noise = 10e-6 * np.random.default_rng(1).normal(size=tets.vertices.shape)
-    left = skin.carried((tets.vertices + noise)[None])[0] - skin.rest
+    left = skin.deform((tets.vertices + noise)[None])[0] - skin.rest
     assert 0.5e-6 < np.sqrt((left**2).mean()) < 6.7e-6
 
 
@@ -64,7 +64,7 @@ def test_a_box_keeps_its_shape():
     tets = ipc.box_mesh(lines(4), lines(4), lines(4), cut="mirrored")
     skin = SoftSkin((primitive("box", (0.5 * SIDE,) * 3),), tets)
     assert len(skin.rest) > 100 and np.abs(skin.rest).max() == pytest.approx(0.5 * SIDE)
-    assert enclosed_volume(ipc.TriMesh(skin.carried(tets.vertices[None])[0], skin.faces)) == pytest.approx(SIDE**3)
+    assert enclosed_volume(ipc.TriMesh(skin.deform(tets.vertices[None])[0], skin.faces)) == pytest.approx(SIDE**3)
 
 
 def test_long_edges_are_halved_on_both_sides_alike():
@@ -73,7 +73,7 @@ def test_long_edges_are_halved_on_both_sides_alike():
     _, first, count = np.unique(np.sort(surface, axis=1), axis=0, return_index=True, return_counts=True)
     outer = surface[first[count == 1]]
     whole = abs(enclosed_volume(ipc.TriMesh(box.vertices, outer)))
-    vertices, faces = _cut(box.vertices, outer, 0.3)
+    vertices, faces = _subdivide(box.vertices, outer, 0.3)
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     assert np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1).max() <= 0.3
     assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()  # closed

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from raytac.io.png import read_png, write_png
 
 from raytac import TactileFrame, TactileSensor, load_press, load_sensor
-from raytac.io.png import read_png, write_png
 from raytac.optics.image.mlp_weights import INPUTS, MlpWeights
 from raytac.optics.taxim.table import PolyTable, ShadowTable
 from raytac.physics.soft.contact_width import NarrowContactWarning

@@ -13,8 +13,8 @@ import pytest
 from raytac.cli import main
 from raytac.errors import BackendError, InputError, RaytacError
 from raytac.gel.surface import GelSurface
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.optics.base import OpticalMode, OpticsImages
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.page import FILES, write_comparison
@@ -49,7 +49,7 @@ class Greys:
         self, families: tuple[str, ...] = ("fast", "taxim", "phong"), fail: dict[str, BaseException] | None = None
     ) -> None:
         self.fail, self.built = fail or {}, []
-        self.modes = [Mode(family, self._builder(family, 40 * k), ()) for k, family in enumerate(families, start=1)]
+        self.modes = [Mode(family, self._builder(family, 40 * k), tuple) for k, family in enumerate(families, start=1)]
 
     def _builder(self, family: str, level: int):
         def build(setting: Setting) -> OpticalMode:
@@ -220,7 +220,7 @@ def test_other_settings_are_other_rows(greys_run: Path, tmp_path: Path) -> None:
     shutil.copytree(greys_run, tmp_path, dirs_exist_ok=True)
     for changed in (replace(SETTINGS, seed=1), replace(SETTINGS, reference_spp=4), replace(SETTINGS, frames=4)):
         assert run_comparison(changed, tmp_path, Greys(("fast",)).modes).measured == 1
-    other = [replace(mode, options={"shadow": True}) for mode in Greys(("fast",)).modes]
+    other = [replace(mode, options="shadow") for mode in Greys(("fast",)).modes]
     assert run_comparison(SETTINGS, tmp_path, other).measured == 1
 
 

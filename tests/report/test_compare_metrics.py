@@ -9,8 +9,8 @@ import pytest
 
 from raytac.report.compare.figures import error_range, signed_error
 from raytac.report.compare.metrics import equal_errors, summaries
-from raytac.report.compare.row_store import Row, Value
 from raytac.report.compare.run import REGIONS
+from raytac.report.compare.store import Row, Value
 from raytac.report.image_error import METRICS
 
 
@@ -18,6 +18,7 @@ def row(mode: str, rmse: float | None, ms: float, scene: str = "sphere", **more:
     family, _, spp = mode.partition(".spp")
     figures: dict[str, Value] = {"scene": scene, "resolution": "32x24", "mode": mode, "family": family, "label": mode}
     figures |= {"spp": int(spp) if spp else None, "device": "cpu", "ms": ms, "batch": 8, "batch_ms_per_frame": None}
+    figures |= {"words": family, "short": family, "unbiased": family in ("reference", "path")}
     figures |= {"first_image_s": None, "memory_mib": None, "memory_mib_per_env": None, "at_noise": False}
     figures |= {f"{region}_{metric}": None for region in REGIONS for metric in METRICS}
     if rmse is not None:

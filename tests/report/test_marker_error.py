@@ -1,4 +1,4 @@
-"""Marker rows of the comparison: on made-up presses whose truth is one of the models, and on the simulated pad by the command itself."""
+"""Marker rows of the comparison: on made-up presses whose truth is one of the models, and on the soft pad by the command itself."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from raytac.cli import main
 from raytac.errors import BackendError
 from raytac.io.metrics import check_metrics, read_metrics
 from raytac.markers.calibration import model_errors
+from raytac.markers.registry import models_without_coat
 from raytac.report.compare.marker_error import MarkerErrors, marker_error_metrics, marker_errors
 from raytac.report.compare.metrics import compare_metrics
 from raytac.report.compare.page import report_html
 from raytac.report.compare.run import Comparison
 from raytac.report.compare.settings import CompareSettings
-from raytac.report.markers import TESTED
 from tests.markers.pads import flat_sensor, fots_presses, pad_grid
 
 pytest.importorskip("warp")
 LOADS = ("normal", "shear", "twist")
+
+MODELS = models_without_coat()
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +34,11 @@ def found() -> MarkerErrors:
 
 
 def test_the_model_that_made_the_presses_has_the_least_error(found: MarkerErrors) -> None:
-    assert found.loads == LOADS and set(found.times_ms) == {"surface", *TESTED}
+    assert found.loads == LOADS and set(found.times_ms) == {"surface", *MODELS}
     by = {name: errors for name, errors, _ in found.by_model()}
-    assert tuple(by) == TESTED
+    assert tuple(by) == MODELS
     for k, load in enumerate(LOADS):
-        fots, published, superposition, field = (by[name][k] for name in TESTED)
+        fots, published, superposition, field = (by[name][k] for name in MODELS)
         assert fots.load == superposition.load == field.load == load
         assert published.mean == fots.mean  # the constants of these presses have no punch
         assert fots.mean < 0.2 * min(superposition.mean, field.mean) and found.truth[load] > 5e-6
@@ -45,7 +47,7 @@ def test_the_model_that_made_the_presses_has_the_least_error(found: MarkerErrors
 
 def test_the_rows_are_those_of_the_calibration(found: MarkerErrors) -> None:
     sensor, grid = flat_sensor(), pad_grid(flat_sensor())
-    errors, _ = model_errors(sensor, fots_presses(sensor, grid), grid, models=TESTED, device="cpu")
+    errors, _ = model_errors(sensor, fots_presses(sensor, grid), grid, device="cpu")
     assert tuple(errors) == found.errors
 
 
@@ -55,7 +57,7 @@ def test_metrics_and_page_hold_every_model_and_load(found: MarkerErrors, tmp_pat
     comparison = Comparison(settings, "cpu", (), {}, (), 0, {"versions.raytac": "0"}, (), found)
     metrics = compare_metrics(comparison)
     check_metrics(metrics | {"wall_s": 1.0})
-    for model in TESTED:
+    for model in MODELS:
         assert float(metrics[f"markers.coarse.{model}.ms_per_frame"]) > 0
         for load in LOADS:
             mean, truth = (float(metrics[f"markers.coarse.{model}.{load}.{name}_um"]) for name in ("mean", "truth_mean"))

@@ -1,4 +1,4 @@
-"""What the rigid pad misses against the simulated one, on a shallow press at a small size."""
+"""Error of the rigid pad against the soft one, on a shallow press at a small size."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from raytac.io.metrics import check_metrics
 from raytac.report.compare.physics_error import physics_errors, physics_metrics
-from raytac.report.surfaces import press_peaks
+from raytac.report.press import press_peaks
 from raytac.report.tracers import Tracers
 
 SCENE = """

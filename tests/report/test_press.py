@@ -9,11 +9,9 @@ import pytest
 
 from raytac.errors import RaytacError
 from raytac.frame import OUTPUTS
-from raytac.io.exr import read_exr
+from raytac.io.images import read_exr, read_png, write_sheet
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.report.press import run_press
-from raytac.report.sheet import write_sheet
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, load_press
 from tests.conftest import Shader
@@ -114,7 +112,7 @@ def test_a_failed_environment_writes_nothing(sensor_spec: SensorSpec, scene: Pre
 
 
 def test_sheet_holds_the_pictures_in_order(tmp_path: Path) -> None:
-    from raytac.io.png import write_png
+    from raytac.io.images import write_png
 
     red, blue = np.zeros((4, 6, 3), np.uint8), np.zeros((5, 3, 3), np.uint8)
     red[..., 0], blue[..., 2] = 255, 255

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from experiments import press_sheet
+from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
-from raytac.io.png import read_png
 from raytac.sensor import TactileSensor
 from tests.conftest import Shader
 

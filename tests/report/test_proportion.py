@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import binomtest
 
 from raytac.errors import InputError
-from raytac.report.proportion import wilson_interval
+from raytac.report.measure import wilson_interval
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 10), (3, 10), (97, 100), (100, 100)])

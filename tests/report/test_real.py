@@ -14,15 +14,15 @@ from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import MODES, fit_models
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.splits import by_press
+from raytac.calibrate.presses import by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.real_data import FROM_SCRATCH, INNER, OWN_LEDS, prior_of, read_data
+from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.io.png import write_png
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.io.images import write_png
+from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings, noise_floor, press_scores, summary, table_text
 from raytac.report.real_calibration import run_calibrate_optics
@@ -106,7 +106,7 @@ def test_options_of_the_other_thing_to_fit_are_refused(tmp_path: Path, capsys: p
     out, data = tmp_path / "out", tmp_path / "data"
     data.mkdir()
     data_set(data, count=6)
-    cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--pad", "coarse"], "'markers'")]
+    cases = [([str(data)], ["--quick"], "'markers'"), ([str(data)], ["--level", "coarse"], "'markers'")]
     cases += [(["markers"], ["--model", "mlp"], "a data set"), (["markers"], ["--sides", "4,2,3"], "a data set")]
     for what, option, owner in cases:
         assert main(["calibrate", *what, *option, "--device", "cpu", "--out", str(out)]) == 2, option
@@ -121,7 +121,7 @@ def of_itself(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarra
     data, grid = tmp_path_factory.mktemp("data"), make_grid(SENSOR.gelpad, 0.12e-3)
     places = [(x, y) for y in (70, 120, 170) for x in (80, 160, 240)]
     circles = np.array([(x, y, 26.0 + k % 3 * 3) for k, (x, y) in enumerate(places)])
-    tracer = RayTracer(SENSOR, device="cpu", shadows=False)
+    tracer = RayTraced(shadows=False).build(SENSOR, device="cpu")
     photographs = {"background": tracer.render(GelSurface.at_rest(grid)).rgb}
     for k in range(len(circles)):
         surface = press_surface(SENSOR, grid, circles[k : k + 1], np.array([3.155e-3]), RIGID_PAD)
@@ -160,12 +160,12 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     # Fitted without cast shadows, and so rendered, though the sensor that the fit began from casts them.
     assert SENSOR.optics.shadows and not written.optics.shadows
     images = [
-        np.array(TactileSensor(written, device="cpu", optics_options=options).press("pins").rgb, int)
-        for options in ({}, {"shadows": False}, {"shadows": True})
+        np.array(TactileSensor(written, device="cpu", optics=RayTraced(shadows=shadows)).press("pins").rgb, int)
+        for shadows in (None, False, True)
     ]
     np.testing.assert_array_equal(images[0], images[1])
     assert (np.abs(images[0] - images[2]) > 8).mean() > 0.01
-    rest = RayTracer(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
+    rest = RayTraced().build(written, device="cpu").render(GelSurface.at_rest(make_grid(SENSOR.gelpad, 0.12e-3))).rgb
     assert rest is not None
     off = np.abs(rest[0].astype(int) - background)
     assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())
@@ -209,9 +209,9 @@ def test_a_fit_begins_from_scratch_unless_told_otherwise(tmp_path: Path) -> None
 
 
 def test_the_strength_of_priors_is_a_known_one_or_inner() -> None:
-    assert prior_of(INNER) is None and prior_of("tied") == "tied"
+    assert FitOptions().chosen_prior is None and FitOptions(prior="tied").chosen_prior == "tied"
     with pytest.raises(InputError, match="inner, free, tied"):
-        prior_of("strong")
+        _ = FitOptions(prior="strong").chosen_prior
 
 
 WRONG: dict[str, Any] = {

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.report.surfaces import press_peaks
+from raytac.optics import RayTraced
+from raytac.report.press import press_peaks
 from raytac.report.tracers import Tracers
 
 SIZE = (80, 60)
@@ -19,9 +20,9 @@ def pressed():
 
 def test_a_tracer_is_built_once_for_its_options(pressed) -> None:
     tracers, _ = pressed
-    one = tracers.get(SIZE, bounce=False)
-    assert tracers.get(SIZE, bounce=False) is one and tracers.get(SIZE) is not one
-    assert tracers.get(SIZE, integrator="path").layer_names == ("all",) != one.layer_names
+    one = tracers.get(SIZE, RayTraced(bounce=False))
+    assert tracers.get(SIZE, RayTraced(bounce=False)) is one and tracers.get(SIZE) is not one
+    assert tracers.get(SIZE, RayTraced("path")).layer_names == ("all",) != one.layer_names
 
 
 @pytest.mark.parametrize(("scene", "largest_share"), [("sphere", 0.3), ("coin", 0.7)])  # a relief's valleys belong to its ring
@@ -30,7 +31,7 @@ def test_the_shadow_ring_holds_what_shadows_take(pressed, scene: str, largest_sh
     masks = tracers.regions(SIZE, surfaces[scene])
 
     def light(shadows: bool) -> np.ndarray:
-        layers = tracers.get(SIZE, bounce=False, shadows=shadows, outputs=("layers",)).render_layers(surfaces[scene])
+        layers = tracers.get(SIZE, RayTraced(bounce=False, shadows=shadows), ("layers",)).render_layers(surfaces[scene])
         return np.sum(list(layers.values()), axis=(0, 1, 4))
 
     taken = (light(False) - light(True)) * ~masks["contact"]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from raytac.robots.arm import Arm
-from raytac.robots.panda import READY, PandaRobot, one_sensor_panda, two_finger_panda
+from raytac.robots.mount import RobotModel
+from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
 
 DH = (
     (0.0, 0.333, 0.0),
@@ -73,7 +74,7 @@ def potential_energy(q: np.ndarray, gravity: float) -> float:
 class Rig:
     """A robot, compiled, at rest in the ready position."""
 
-    def __init__(self, robot: PandaRobot) -> None:
+    def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
         self.model = robot.spec.compile()
         self.data = mujoco.MjData(self.model)

@@ -11,7 +11,7 @@ from raytac.robots.arm import Arm
 from raytac.robots.ik import DifferentialIk
 from raytac.robots.impedance import CartesianImpedance, JointImpedance
 from raytac.robots.panda import MAX_VELOCITY, READY
-from raytac.robots.pose import pose_error
+from raytac.se3 import pose_error
 from tests.robots.conftest import HIGH, LOW, Rig, flange_pose
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import pytest
 
-from raytac.robots.gripper import floating_gripper
+from raytac.robots.gripper import GripperSettings, floating_gripper
 
 
 def lifted(position: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -31,3 +32,14 @@ def test_where_the_gripper_stands_does_not_change_how_it_moves():
     np.testing.assert_allclose(there, here, atol=1e-9)
     np.testing.assert_allclose(inertia_there, inertia, rtol=1e-9)
     assert here[-1, 2] > 9e-3 and np.abs(here[:, [0, 4]]).max() < 1e-9  # lifted, without pitching or going aside
+
+
+def test_mechanics_are_settings() -> None:
+    settings = GripperSettings(mass=0.7, opening=0.06, finger_mass=0.03, servo=(2e4, 100.0, 50.0))
+    model, plain = (floating_gripper(settings=one).spec.compile() for one in (settings, None))
+    assert model.body("gripper").mass[0] == 0.7 and plain.body("gripper").mass[0] == GripperSettings().mass == 0.5
+    assert model.body("left_finger").mass[0] - plain.body("left_finger").mass[0] == pytest.approx(0.01)
+    opening = model.actuator("opening")
+    assert (
+        opening.ctrlrange.tolist() == [0.0, 0.06] and opening.forcerange.tolist() == [-50.0, 50.0] and opening.gainprm[0] == 2e4
+    )

@@ -8,8 +8,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.robots.mount import case_depth, mount_sensor, standing_on
-from raytac.robots.pose import pose, pose_error
-from raytac.se3 import quaternion, rotation_vector
+from raytac.se3 import pose, pose_error, quaternion, rotation_vector
 from raytac.specs.sensor_file import load_sensor
 
 ROBOT = """

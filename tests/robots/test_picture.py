@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.io.png import read_png
+from raytac.io.images import read_png
 
 ROOT = Path(__file__).parents[2]
 

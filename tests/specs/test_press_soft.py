@@ -35,7 +35,6 @@ def test_a_scene_can_ask_for_the_simulated_pad(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"top": 'physics = "pbd"'}, r"physics = 'pbd'.*rigid, ipc"),
         ({"top": 'physics = "ipc"\npad = "huge"'}, r"pad = 'huge'.*coarse, medium, fine"),
         ({"top": 'pad = "coarse"'}, r"pad = 'coarse'.*physics must be"),
         ({"object": 'dynamics = "liquid"'}, r"object\.dynamics = 'liquid'.*kinematic, affine, soft"),

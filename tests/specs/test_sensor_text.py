@@ -10,8 +10,7 @@ import pytest
 from raytac.specs import SensorSpec, load_sensor
 from raytac.specs.files import available
 from raytac.specs.sensor import OpticsSpec
-from raytac.specs.sensor_file import lights_text
-from raytac.specs.sensor_text import sensor_files
+from raytac.specs.sensor_file import lights_text, sensor_files
 
 
 def written(sensor: SensorSpec, folder: Path) -> SensorSpec:

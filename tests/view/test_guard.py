@@ -21,9 +21,8 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from raytac.errors import BackendError, InputError
-from raytac.view import messages
 from raytac.view import server as server_module
-from raytac.view.addresses import PageAddresses
+from raytac.view.server import PageAddresses
 from raytac.view.viewer import Viewer
 from tests.view.page_client import PageClient
 from tests.view.still import StillSession
@@ -183,7 +182,7 @@ GARBAGE = {
     "deep": b"\x91" * 50_000,
     "deep in a field": b"\x82\xa4type\xb0GuiUpdateMessage\xa7updates" + b"\x91" * 50_000,
     "cut short": camera()[:-3],
-    "too long": bytes(messages.LARGEST + 1),
+    "too long": bytes(server_module.LARGEST + 1),
     "text": "text",
     "a type that is not": encoded(type="Nope"),
     "a type that commands a terminal": encoded(type="\n\x1b[2J" + 1000 * "x"),
@@ -302,10 +301,14 @@ def test_a_request_that_is_no_http_says_nothing(caplog, capfd):
 
 def test_the_messages_are_visers_own():
     """Fails if viser's browser tells more of its camera, or says it in another form."""
-    assert set(messages._Camera.__struct_fields__) == {field.name for field in dataclasses.fields(_messages.ViewerCameraMessage)}
-    assert set(messages._Update.__struct_fields__) == {field.name for field in dataclasses.fields(_messages.GuiUpdateMessage)}
+    assert set(server_module._Camera.__struct_fields__) == {
+        field.name for field in dataclasses.fields(_messages.ViewerCameraMessage)
+    }
+    assert set(server_module._Update.__struct_fields__) == {
+        field.name for field in dataclasses.fields(_messages.GuiUpdateMessage)
+    }
     for raw in (camera(), encoded(type="GuiUpdateMessage", uuid="a", updates={"value": True})):
-        again = messages.checked_message(raw, lambda uuid: None)
+        again = server_module.checked_message(raw, lambda uuid: None)
         assert _messages.Message.deserialize(again) == _messages.Message.deserialize(raw)
 
 
@@ -314,7 +317,7 @@ def test_what_viser_reads_is_what_was_checked():
     body = camera()[1:]
     twice = bytes([camera()[0] + 1]) + body + msgspec.msgpack.encode("type") + msgspec.msgpack.encode("ShareUrlRequest")
     try:
-        again = messages.checked_message(twice, lambda uuid: None)
-    except messages.BadMessage:
+        again = server_module.checked_message(twice, lambda uuid: None)
+    except server_module.BadMessage:
         return
     assert msgspec.msgpack.decode(again)["type"] == "ViewerCameraMessage"

@@ -172,7 +172,7 @@ def test_markers_follow_the_object_and_start_anew_on_reset():
 
 @pytest.mark.solver
 def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
-    press = session(physics="ipc", pad="coarse")
+    press = session(physics="ipc")
     rest = press.snapshot().reshaped["coat_mesh"]
     shot = driven(press, depth=0.3)
     view = shot.pads[SENSOR.name]
@@ -193,7 +193,7 @@ def test_the_mesh_of_a_simulated_pad_lies_on_the_coat_that_is_drawn(kind):
     """Above it everywhere, so that no line is broken, by no more than is needed for that."""
     from matplotlib.tri import LinearTriInterpolator, Triangulation
 
-    press = session(load_press(kind), physics="ipc", pad="coarse", pitch=0.1e-3)
+    press = session(load_press(kind), physics="ipc", pitch=0.1e-3)
     shot = driven(press, depth=0.5)
     x, y, z = shot.pads[SENSOR.name].vertices.T
     drawn = LinearTriInterpolator(Triangulation(1e3 * x, 1e3 * y, press.pads[0].faces), 1e3 * z)
@@ -221,7 +221,7 @@ def test_no_slider_shows_less_than_there_is():
 @pytest.mark.solver
 def test_an_object_that_lies_free_is_played_and_not_driven():
     free = replace(SCENE, object=replace(BALL, dynamics="affine"), trajectory=(StageSpec("indent", force=0.5),))
-    press = session(free, physics="ipc", pad="coarse")
+    press = session(free, physics="ipc")
     assert press.controls == () and press.snapshot().controls == {}
     with pytest.raises(InputError, match="depth"):
         press.drive({"depth": 0.1})
@@ -230,7 +230,7 @@ def test_an_object_that_lies_free_is_played_and_not_driven():
 @pytest.mark.solver
 def test_a_soft_object_is_drawn_as_it_deforms():
     soft = replace(SCENE, object=replace(BALL, dynamics="soft", youngs_modulus=2e5))
-    press = session(soft, physics="ipc", pad="coarse")
+    press = session(soft, physics="ipc")
     solid = next(s for s in press.solids if s.name == "object")
     shot = driven(press, depth=0.3)
     ball = shot.reshaped["object"]

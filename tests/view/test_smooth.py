@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from raytac.view.glb import vertex_normals
-from raytac.view.smooth import split_creases
+from raytac.view.scene_view import split_creases, vertex_normals
 
 
 def test_a_box_falls_into_six_flat_faces():

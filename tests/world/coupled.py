@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping
 import mujoco
 import numpy as np
 
-from raytac.physics.soft.bodies import SceneBody
+from raytac.physics.soft.bodies import SceneBody, ScenePad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
-from raytac.physics.soft.scene import ScenePad, SoftScene
+from raytac.physics.soft.scene import SoftScene
 from raytac.specs import load_sensor
-from raytac.world.coupling import Coupling
-from raytac.world.soft_answers import soft_answers
+from raytac.world.coupling import Coupling, coupling_inputs
 
 SENSOR = load_sensor("gelsight_mini")
 MESH = pad_mesh(SENSOR.gelpad, PadLevel(3e-3, 2, 1.5, 1.5, 5e-5))
@@ -80,10 +79,10 @@ class Coupled:
             mujoco.mj_comPos(self.model, self.data)
             report = self.scene.step(self.cases(), self._led(), dt=k * h)
             assert not report.failed[0] and report.min_gap[0] > 0.0 and report.min_det[0] > 0.0
-            wrench, contacts, partners = soft_answers(self.scene, self.links)[0]
+            wrench, contacts, bodies = coupling_inputs(self.scene, self.links)[0]
             self.wrench = wrench
             if self.two_way:
-                self.coupling.update(self.data, 0, wrench, contacts if self.law else [], partners if self.law else {})
+                self.coupling.update(self.data, 0, wrench, contacts if self.law else [], bodies if self.law else {})
             mujoco.mj_energyPos(self.model, self.data)
             mujoco.mj_energyVel(self.model, self.data)
             energies.append(float(self.data.energy.sum() + report.elastic[0] + report.barrier[0]))

@@ -9,7 +9,7 @@ import pytest
 from raytac.errors import InputError
 from raytac.physics.soft.bodies import scene_body
 from raytac.shapes.part import primitive
-from raytac.world.coupling import Coupling, FreePartner, Touching
+from raytac.world.coupling import CoupledContact, Coupling, SolverBody
 from tests.world.coupled import Coupled, pose
 
 G = 9.81
@@ -35,7 +35,7 @@ def on_a_spring(mass, k, factor, *, h=1e-3, interval=1e-2, height=-1e-5, seconds
         bound = np.zeros((6, 6))
         bound[2, 2] = factor * k
         push = np.array([0.0, 0.0, w[0, 2]])
-        contacts = [Touching(1, bound, data.xpos[1].copy(), None, push)] if x < 0.0 and factor else []
+        contacts = [CoupledContact(1, bound, data.xpos[1].copy(), None, push)] if x < 0.0 and factor else []
         coupling.update(data, 0, w, contacts)
         energy.append(0.5 * mass * data.qvel[0] ** 2 + mass * G * x + 0.5 * k * max(-x, 0.0) ** 2)
         places.append(x)
@@ -76,9 +76,9 @@ def test_a_stand_in_comes_along_as_the_true_body_would():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     coupling = Coupling(model, [1])
-    partner = FreePartner(0.3, 1e-5 * np.eye(3), np.zeros(3), np.zeros(6), np.zeros(6))
+    partner = SolverBody(0.3, 1e-5 * np.eye(3), np.zeros(3), np.zeros(6), np.zeros(6))
     coupling.update(
-        data, 0, np.zeros((1, 6)), [Touching(1, np.diag([1e5] * 3 + [10.0] * 3), np.zeros(3), "cube")], {"cube": partner}
+        data, 0, np.zeros((1, 6)), [CoupledContact(1, np.diag([1e5] * 3 + [10.0] * 3), np.zeros(3), "cube")], {"cube": partner}
     )
     for _ in range(100):
         mujoco.mj_step1(model, data)
@@ -96,7 +96,7 @@ def test_a_contact_opens_instead_of_pulling():
     before = data.qvel[0]
     coupling = Coupling(model, [1])
     w = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
-    coupling.update(data, 0, w, [Touching(1, np.diag([1e5] * 3 + [0.0] * 3), np.zeros(3), None, w[0, :3])])
+    coupling.update(data, 0, w, [CoupledContact(1, np.diag([1e5] * 3 + [0.0] * 3), np.zeros(3), None, w[0, :3])])
     for _ in range(10):
         mujoco.mj_step1(model, data)
         coupling.apply(data, 0)
@@ -116,8 +116,8 @@ def test_an_open_contact_takes_its_friction_and_torque_with_it():
     about_origin = np.append(opening[:3], opening[3:] + np.cross(at - origin, opening[:3]))
     weak = np.diag([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])  # so soft that it does not open
     contacts = [
-        Touching(1, np.diag([1e5] * 3 + [0.0] * 3), at, None, opening[:3], opening),
-        Touching(1, weak, origin.copy(), None, staying[:3], staying),
+        CoupledContact(1, np.diag([1e5] * 3 + [0.0] * 3), at, None, opening[:3], opening),
+        CoupledContact(1, weak, origin.copy(), None, staying[:3], staying),
     ]
     coupling.update(data, 0, (about_origin + staying)[None], contacts)
     mujoco.mj_step1(model, data)
@@ -215,4 +215,4 @@ def test_what_cannot_be_coupled_is_named():
     with pytest.raises(InputError, match="wrench"):
         coupling.update(data, 0, np.full((1, 6), np.nan))
     with pytest.raises(InputError, match=r"contacts = 'ball'"):
-        coupling.update(data, 0, np.zeros((1, 6)), [Touching(1, np.eye(6), np.zeros(3), "ball")])
+        coupling.update(data, 0, np.zeros((1, 6)), [CoupledContact(1, np.eye(6), np.zeros(3), "ball")])

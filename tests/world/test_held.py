@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import ipc
-from ipc.layout import rotation_matrix
-from ipc.patch_motion import RestPatches
+from ipc.bodies import rotation_matrix
+from ipc.solver.patch_motion import RestPatches
 from raytac.physics.soft.bodies import scene_body
 from raytac.shapes.part import primitive
-from raytac.world.soft_answers import STIFFENING
+from raytac.world.coupling import STIFFENING
 from tests.world.coupled import Coupled, pose
 from tests.world.test_coupling import SLIDER
 
@@ -28,7 +28,7 @@ def finger_over_a_column(height: float, drive: str = "", **options) -> Coupled:
         density=1000.0,
         youngs_modulus=5e4,
         cell=4e-3,
-        held=lambda at: at[:, 2] < -0.99 * HALF[2],
+        bonded=lambda at: at[:, 2] < -0.99 * HALF[2],
     )
     xml = SLIDER.format(h=1e-3, g=0.0, z=height, m=0.04, drive=drive)
     return Coupled(xml, ["finger"], [column], FOOT, **options)

@@ -1,4 +1,4 @@
-"""Worlds with simulated pads: who owns what, forces, reset, and what is refused."""
+"""Worlds with soft pads: owners of bodies, forces, resets and errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, OverlapError, SpecError
-from raytac.physics.soft.scene import SceneReport, SoftScene
+from raytac.physics.soft.scene import SoftScene
+from raytac.physics.soft.scene_state import SceneReport
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
@@ -45,7 +46,7 @@ def test_the_sensor_reads_the_simulated_pad(resting: TactileWorld) -> None:
     from raytac.gel.traction import cell_areas
 
     frame = resting.observe()["sensor"]
-    assert frame.traction is not None and frame.contact_cells is not None and frame.surface.coat is not None
+    assert frame.surface.coat is not None
     total = (frame.traction[0] * cell_areas(frame.surface.grid)[..., None]).sum(axis=(0, 1))
     np.testing.assert_allclose(total, resting.state().wrench["sensor"][0, :3], atol=2e-3)
     assert frame.surface.contact.any() and np.abs(frame.surface.contact_centre).max() < 1e-4
@@ -127,18 +128,16 @@ def test_an_environment_whose_last_step_did_not_converge_has_failed_and_earlier_
     state = world.step()  # the first of two steps
     frame = world.observe()["sensor"]
     assert len(calls) == 2 and not state.failed.any() and not state.report["converged"][0]
-    assert (
-        state.report["unconverged"].tolist() == [1, 0] and frame.unconverged is not None and frame.unconverged.tolist() == [1, 0]
-    )
+    assert state.report["unconverged"].tolist() == [1, 0] and frame.unconverged.tolist() == [1, 0]
     state = world.step()  # the last of two
     frame = world.observe(envs=[1, 0])["sensor"]
-    assert state.failed.tolist() == [True, False] and frame.failed is not None and frame.failed.tolist() == [False, True]
-    assert frame.unconverged is not None and frame.unconverged.tolist() == [0, 2] and np.isfinite(state.wrench["sensor"][1]).all()
+    assert state.failed.tolist() == [True, False] and frame.failed.tolist() == [False, True]
+    assert frame.unconverged.tolist() == [0, 2] and np.isfinite(state.wrench["sensor"][1]).all()
     state = world.step()
     assert state.failed.tolist() == [True, False] and state.report["newton"][0] == 0 < state.report["newton"][1]
     assert world.reset([0]).report["unconverged"].tolist() == [0, 0]
     state, frame = world.step(), world.observe()["sensor"]
-    assert not state.failed.any() and frame.unconverged is not None and frame.unconverged.tolist() == [0, 0]
+    assert not state.failed.any() and frame.unconverged.tolist() == [0, 0]
 
 
 def test_forces_that_are_not_finite_fail_their_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,7 +236,7 @@ def test_a_soft_body_is_held_where_it_touches_its_holder(monkeypatch: pytest.Mon
         held_by="plate",
     )
     with monkeypatch.context() as patched:
-        patched.setattr("ipc.patch_motion.MAX_ENTRIES", 1000)
+        patched.setattr("ipc.solver.patch_motion.MAX_ENTRIES", 1000)
         with pytest.raises(SpecError, match=r"body\[1\]\.cell_mm = 3\.0: 'beam' has .* at most 1000"):
             TactileWorld(replace(UP, coupling="two_way", bodies=(plate, beam)))
         world = TactileWorld(replace(UP, bodies=(plate, beam)))  # one-way asks for no stiffness

@@ -7,30 +7,22 @@ Dr.Jit code on device arrays, one thread a pixel of every environment, recorded 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from raytac.device import total_memory
-from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.base import OpticsImages
+from raytac.optics.base import OpticsConfig
 from raytac.optics.camera import Pinhole
-from raytac.optics.ink import checked_ink, darkened, ink_at
-from raytac.optics.refraction import Slab
-from raytac.optics.runtime import ROUNDING, check_batch, largest_batch, load_mitsuba, no_collection
-from raytac.optics.surface_check import check_same_grid, check_shapes, check_view, device_envs, safe_heights
-from raytac.optics.trace.fast_tracer import RayTracer
-from raytac.optics.trace.height_field import CoatLayout
+from raytac.optics.device_mode import DeviceMode, Float, FrameInputs, UInt8
+from raytac.optics.geometry import CoatLayout
+from raytac.optics.ink import darkened, ink_at
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["HEIGHT_MODE_OUTPUTS", "ImageHeights", "ImageMode", "see_heights"]
-
-HEIGHT_MODE_OUTPUTS = ("rgb", "normals", "depth")
-"""Optical outputs of these modes: they know colours, not the light of each LED."""
+__all__ = ["ImageHeights", "ImageMode", "see_heights"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,7 @@ class ImageHeights:
 
     height: Any
     """−z of the coat [px]: grows towards the camera."""
-    moved: Any
+    displacement: Any
     """Displacement from rest [px]: rest − z."""
     contact: Any
     """1 where the object touches, else 0 (UInt8); None if nobody asked."""
@@ -117,195 +109,94 @@ def see_heights(
     def blend(v: list[Any]) -> Any:
         return dr.lerp(dr.lerp(v[0], v[1], wx), dr.lerp(v[2], v[3], wx), wy) * (1 / pitch[0])
 
-    # Differences first, so that a coat at rest has moved by exactly nothing.
-    moved = blend([r - n for r, n in zip(before, now, strict=True)])
+    # Differences first, so that a coat at rest has displacement by exactly nothing.
+    displacement = blend([r - n for r, n in zip(before, now, strict=True)])
     touched = None
     if contact is not None:
         nearest = k + dr.select(wx > 0.5, 1, 0) + dr.select(wy > 0.5, g.nx, 0)
         touched = dr.gather(mi.UInt8, contact, first + nearest)
     dots = None if ink is None else ink_at(mi, g, ink, env, ox + (z - oz) * tx, oy + (z - oz) * ty)
-    return ImageHeights(-blend(now), moved, touched, envs, (width, height), pitch[0] / pitch[1], dots)
+    return ImageHeights(-blend(now), displacement, touched, envs, (width, height), pitch[0] / pitch[1], dots)
 
 
-class ImageMode(ABC):
-    """Base of the modes that shade height images; fulfils ``raytac.optics.base.OpticalMode``.
+class ImageMode(DeviceMode):
+    """Base of the modes that shade height images: they give ``_levels`` and ``_floats_per_pixel``."""
 
-    A mode gives ``_inputs`` (every device array that a frame reads, for the recording), ``_levels`` and ``_floats_per_pixel``.
-    """
+    _smallest_side = 3
+    _longest_row = 4
 
-    label: str
-    needs_contact = False
-    """Whether a frame reads where the object touches."""
-
-    def __init__(self, sensor: SensorSpec, *, resolution: tuple[int, int] | None, outputs: tuple[str, ...], device: str) -> None:
-        for name in outputs:
-            if name not in HEIGHT_MODE_OUTPUTS:
-                rule = f"must be an output of optics={self.label.partition('-')[0]!r}; only the ray tracer has layers"
-                raise InputError("outputs", value=name, rule=rule, choices=HEIGHT_MODE_OUTPUTS)
-        if resolution is not None and (len(resolution) != 2 or min(resolution) < 3):
-            raise InputError("resolution", value=resolution, rule="must be (width, height), each >= 3 pixels")
-        self.mi, self.device = load_mitsuba(device)
-        self.sensor, self.outputs = sensor, tuple(outputs)
-        slab = Slab.from_spec(sensor)
-        self.camera = Pinhole.from_spec(sensor.camera, resolution, slab)
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        config: OpticsConfig[Any],
+        *,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        """As ``OpticsConfig.build``; nothing is random."""
+        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
         self.pitch = sensor.camera.pitch_at(self.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
-        self._memory = total_memory(self.device)
-        self._grid: PadGrid | None = None
-        self._frozen: dict[tuple[str, int], Any] = {}
-        self._geometry: RayTracer | None = None
-
-    # ---------------------------------------------------------------- what a mode gives
 
     @abstractmethod
-    def _build(self, grid: PadGrid) -> Any:
-        """Device arrays that a frame reads besides the surface, a frozen dataclass; called once, for the first grid."""
-
-    @abstractmethod
-    def _levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
+    def _levels(self, seen: ImageHeights, arrays: Any) -> tuple[list[Float], UInt8]:
         """Three channels of B·H·W levels, neither rounded nor clipped, and flags (B·H·W, or one unused value)."""
 
     @abstractmethod
     def _floats_per_pixel(self) -> float:
         """Device memory that ``_levels`` holds at its peak, in floats a pixel."""
 
-    # ---------------------------------------------------------------- memory
+    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+        """Share of the contact pixels with an uncovered bin, from the flags of ``_levels``; a mode without coverage has none."""
+        return None
 
-    def memory_per_env(self, grid: PadGrid) -> int:
-        """Most device memory that an environment of a batch on ``grid`` takes [byte]: nodes, height images, those on the way, the last."""
+    def _bytes_per_env(self, grid: PadGrid) -> int:
         width, height = self.camera.resolution
         nodes = grid.rest.size * (9 if self.needs_contact else 8)  # height, ink and contact
         # Heights, displacement and ink, what the mode holds; contact and flags; three channels and their bytes.
-        return ROUNDING * (nodes + round(width * height * (4 * (3 + self._floats_per_pixel()) + 2 + 15)))
+        return self._lit * (nodes + round(width * height * (4 * (3 + self._floats_per_pixel()) + 2 + 15)))
 
-    def largest_batch(self, grid: PadGrid) -> int:
-        """Largest number of environments that one call may render on ``grid``."""
-        width, height = self.camera.resolution
-        return largest_batch(self._memory, self.memory_per_env(grid), 4 * max(width * height, grid.rest.size))
+    def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
+        device = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
+        rgb = np.array(device.rgb).reshape(*self._shape(len(heights)), 3)
+        return {"rgb": rgb, "uncovered": self._uncovered(np.array(device.flags), failed)}
 
-    def _check_batch(self, envs: int, grid: PadGrid) -> None:
-        each = self.memory_per_env(grid)
-        check_batch(envs, self.largest_batch(grid), per_env=each, memory=self._memory, device=self.device)
+    def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
+        mi = self.mi
+        channels, flags = self._inked_levels(self._see(heights, contact, inputs), inputs)
+        levels = dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))
+        dr.eval(levels, flags)  # in one kernel: flags that are left over would find all bins again
+        return mi.UInt8(levels), [], flags
 
-    # ---------------------------------------------------------------- images
+    def _inked_levels(self, seen: ImageHeights, inputs: FrameInputs) -> tuple[list[Float], UInt8]:
+        """``_levels`` with the dots of the markers, if there are some."""
+        channels, flags = self._levels(seen, inputs.own)
+        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.ink)), flags
 
-    def prepare(self, grid: PadGrid) -> None:
-        """Build what depends on the pad's grid; done at the first frame and kept.
+    def _see(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> ImageHeights:
+        seen = see_heights(self.mi, self.layout, self.camera, self.pitch, inputs.rest, heights, contact, inputs.ink)
+        dr.eval(seen.height, seen.displacement, seen.contact, seen.ink)
+        return seen
 
-        Raises:
-            InputError: the camera sees beyond the pad, or a second grid.
-        """
-        if self._grid is not None:
-            check_same_grid(grid, self._grid)
-            return
-        check_view(self.camera, grid)
-        self.layout = CoatLayout.from_grid(grid)
-        self._rest = self.mi.Float(grid.rest.astype(np.float32).ravel())  # a copy: see ``recording``
-        self._inputs = self._build(grid)
-        self._grid = grid
-
-    def render(self, surface: GelSurface) -> OpticsImages:
-        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
-
-        An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
-
-        Raises:
-            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
-        """
-        images = OpticsImages()
-        if {"normals", "depth"} & set(self.outputs):
-            images = self._ray_cast(surface)
-        if "rgb" not in self.outputs:
-            return images
-        heights, contact, failed = self._upload(surface)
-        width, height = self.camera.resolution
-        rgb, flags = self.render_device(heights, contact, self._upload_ink(surface))
-        image = np.array(rgb).reshape(surface.batch, height, width, 3)
-        image[failed] = 0
-        return replace(images, rgb=image, uncovered=self._uncovered(np.array(flags), failed))
+    def _seen_now(self, surface: GelSurface, *, dotted: bool) -> tuple[ImageHeights, FrameInputs, np.ndarray]:
+        """What the pixels see of a surface, without a recording; and which environments failed."""
+        heights, failed = self._checked(surface)
+        inputs = replace(self._inputs, ink=self._upload_ink(surface) if dotted else None)
+        return self._see(self._upload(heights), self._upload_contact(surface, failed), inputs), inputs, failed
 
     def render_levels(self, surface: GelSurface) -> np.ndarray:
         """The image before rounding and clipping [levels, 0-255], shape (B, H, W, 3), float32; NaN where an environment failed."""
-        heights, contact, failed = self._upload(surface)
-        channels, _ = self._inked_levels(self._see(heights, contact, self._rest, self._upload_ink(surface)), self._inputs)
-        width, height = self.camera.resolution
-        image = np.stack([np.array(c) for c in channels], axis=-1).reshape(surface.batch, height, width, 3)
+        seen, inputs, failed = self._seen_now(surface, dotted=True)
+        channels, _ = self._inked_levels(seen, inputs)
+        image = np.stack([np.array(c) for c in channels], axis=-1).reshape(*self._shape(surface.batch), 3)
         image[failed] = np.nan
         return image
 
     def image_heights(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """(−z, rest − z) of the coat through every pixel's centre [image pixels], each (B, H, W) float32."""
-        heights, contact, failed = self._upload(surface)
-        seen = self._see(heights, contact, self._rest, None)
-        width, height = self.camera.resolution
-        found = [np.array(v).reshape(surface.batch, height, width) for v in (seen.height, seen.moved)]
-        for image in found:
-            image[failed] = np.nan
-        return found[0], found[1]
-
-    def render_device(self, heights: Any, contact: Any = None, ink: Any = None) -> tuple[Any, Any]:
-        """On device arrays: heights (B·Ny·Nx) [m], contact (B·Ny·Nx, UInt8, or None) and ink (B·Ny·Nx, or None) to (image, flags).
-
-        The image is B·H·W·3, UInt8. Heights must be finite, which is not checked here.
-        Nothing leaves the device. Dr.Jit records the kernels at the first call of a batch size and
-        replays them afterwards.
-
-        Raises:
-            InputError: nothing was rendered or prepared before, heights of no whole number of grids, contact or ink of another width, or
-                a batch too large.
-        """
-        if self._grid is None:
-            raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
-        others = ({"contact": contact} if self.needs_contact else {}) | ({} if ink is None else {"ink": ink})
-        envs = device_envs(self.layout.nx * self.layout.ny, heights, **others)
-        self._check_batch(envs, self._grid)
-        key = "frame" if ink is None else "frame-ink", envs
-        if key not in self._frozen:
-            self._frozen[key] = dr.freeze(self._frame)
-        touched = contact if self.needs_contact else self.mi.UInt8(0)
-        with no_collection():
-            return self._frozen[key](heights, touched, self._rest, self._inputs, ink)
-
-    def _frame(self, heights: Any, contact: Any, rest: Any, inputs: Any, ink: Any) -> tuple[Any, Any]:
-        mi = self.mi
-        channels, flags = self._inked_levels(self._see(heights, contact, rest, ink), inputs)
-        levels = dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))
-        dr.eval(levels, flags)  # in one kernel: flags that are left over would find all bins again
-        return mi.UInt8(levels), flags
-
-    def _inked_levels(self, seen: ImageHeights, inputs: Any) -> tuple[list[Any], Any]:
-        """``_levels`` with the dots of the markers, if there are some."""
-        channels, flags = self._levels(seen, inputs)
-        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.ink)), flags
-
-    def _see(self, heights: Any, contact: Any, rest: Any, ink: Any) -> ImageHeights:
-        touched = contact if self.needs_contact else None
-        seen = see_heights(self.mi, self.layout, self.camera, self.pitch, rest, heights, touched, ink)
-        dr.eval(seen.height, seen.moved, seen.contact, seen.ink)
-        return seen
-
-    def _upload_ink(self, surface: GelSurface) -> Any:
-        ink = checked_ink(surface)
-        return None if ink is None else self.mi.Float(ink.ravel())
-
-    def _upload(self, surface: GelSurface) -> tuple[Any, Any, np.ndarray]:
-        check_shapes(surface)
-        self.prepare(surface.grid)
-        self._check_batch(surface.batch, surface.grid)
-        heights, failed = safe_heights(surface)
-        contact = None
-        if self.needs_contact:
-            touched = surface.contact & ~failed[:, None, None] if failed.any() else surface.contact
-            contact = self.mi.UInt8(np.ascontiguousarray(touched).view(np.uint8).ravel())
-        return self.mi.Float(heights.ravel()), contact, failed
-
-    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
-        """Share of the contact pixels with an uncovered bin, from the flags of ``_levels``; a mode without coverage has none."""
-        return None
-
-    def _ray_cast(self, surface: GelSurface) -> OpticsImages:
-        """Normals, positions, depth and contact are those of the ray tracer: geometry has no cheaper truth."""
-        if self._geometry is None:
-            outputs = tuple(name for name in self.outputs if name != "rgb")
-            self._geometry = RayTracer(self.sensor, resolution=self.camera.resolution, outputs=outputs, device=self.device)
-        return self._geometry.render(surface)
+        seen, _, failed = self._seen_now(surface, dotted=False)
+        heights, displacements = (np.array(v).reshape(self._shape(surface.batch)) for v in (seen.height, seen.displacement))
+        heights[failed] = displacements[failed] = np.nan
+        return heights, displacements

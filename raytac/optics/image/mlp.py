@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -11,7 +10,9 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
+from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.image.config import Mlp
 from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
 from raytac.optics.taxim.mode import resized
 from raytac.specs.sensor import SensorSpec
@@ -26,43 +27,33 @@ _VIEW_TOLERANCE = 0.01
 class MlpArrays:
     """Device arrays of a frame: the image at rest less what the network says of it, 4 floats a pixel."""
 
-    rest: Any
+    rest: Float
 
 
 class MlpMode(ImageMode):
     """The optical mode ``mlp``: one sensor, one network, one resolution; batches of surfaces in, images out."""
 
-    label = "mlp"
     needs_contact = True
 
     def __init__(
         self,
         sensor: SensorSpec,
+        config: Mlp,
         *,
-        calibration: str | Path | MlpWeights | None = None,
         resolution: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("rgb",),
         device: str = "auto",
+        seed: int = 0,
     ) -> None:
-        """Load the network; kernels are compiled at the first image.
-
-        Args:
-            sensor: camera and pad.
-            calibration: the network, its file, or the folder of ``raytac calibrate … --model mlp``. There is none by default.
-            resolution: (width, height) [px]; None is the sensor's own.
-            outputs: any of ``rgb``, ``normals``, ``depth``.
-            device: ``auto``, ``cpu`` or ``cuda``.
+        """As ``OpticsConfig.build``; the network is loaded now, kernels are compiled at the first image.
 
         Raises:
-            InputError: no network, one of a sensor that sees another piece of its pad, or a value out of its choices.
-            CalibrationError: a file that is missing or malformed.
-            BackendError: Dr.Jit cannot run on ``device``.
+            InputError: a network of a sensor that sees another piece of its pad.
         """
-        if calibration is None:
-            rule = "must name a network, as `raytac calibrate DATASET --model mlp` writes it (optics_options={'calibration': …})"
-            raise InputError("calibration", value=calibration, rule=rule)
-        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
-        self.weights = calibration if isinstance(calibration, MlpWeights) else load_mlp(calibration)
+        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
+        weights = config.weights
+        assert weights is not None
+        self.weights = weights if isinstance(weights, MlpWeights) else load_mlp(weights)
         _check_view(self.weights, sensor)
         self._view = view_slope(sensor)
 
@@ -79,13 +70,13 @@ class MlpMode(ImageMode):
         padded = np.concatenate([rest, np.zeros_like(rest[..., :1])], axis=-1).astype(np.float32)
         return MlpArrays(self.mi.Float(np.ascontiguousarray(padded).ravel()))
 
-    def _levels(self, seen: ImageHeights, inputs_: MlpArrays) -> tuple[list[Any], Any]:
+    def _levels(self, seen: ImageHeights, arrays: MlpArrays) -> tuple[list[Float], UInt8]:
         mi = self.mi
-        sx, sy, _ = seen.slopes(mi, seen.moved)
+        sx, sy, _ = seen.slopes(mi, seen.displacement)
         _, p, column, row = seen.pixel(mi)
         u, v = self._place(dr, mi.Float(column), mi.Float(row))
         change = forward(dr, self.weights, inputs(dr, sx, sy, mi.Float(seen.contact), u, v, self._view))
-        rest = dr.gather(mi.Vector4f, inputs_.rest, p)
+        rest = dr.gather(mi.Vector4f, arrays.rest, p)
         return [LEVELS * c + rest[k] for k, c in enumerate(change)], mi.UInt8(0)
 
     def _floats_per_pixel(self) -> float:
@@ -103,4 +94,4 @@ def _check_view(weights: MlpWeights, sensor: SensorSpec) -> None:
         rule = (
             f"was fitted to the sensor {name!r}, which sees {theirs}: {sensor.name!r} sees {mine} and needs a network of its own"
         )
-        raise InputError("calibration", value="mlp", rule=rule)
+        raise InputError("weights", value="mlp", rule=rule)

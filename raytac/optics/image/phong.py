@@ -20,11 +20,14 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
-from raytac.optics.trace.fast_tracer import RayTracer
-from raytac.specs.sensor import SensorSpec, Vec3
+from raytac.optics.image.config import Phong
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
+from raytac.specs.sensor import SensorSpec
 
-__all__ = ["PHONG_LIGHTS", "PhongLight", "PhongMode"]
+__all__ = ["PhongMode"]
 
 AMBIENT = 0.8
 """k_a."""
@@ -36,109 +39,51 @@ _BLUR = (0.2960964, 0.4078072)
 
 
 @dataclass(frozen=True)
-class PhongLight:
-    """One light: direction to it (x right, y down, z to the camera, not normalised), colour R, G, B [levels], k_d and k_s."""
-
-    direction: Vec3
-    colour: Vec3
-    diffuse: float
-    specular: float
-
-
-PHONG_LIGHTS: dict[str, tuple[PhongLight, ...]] = {
-    "gelsight2014": (
-        PhongLight((0.0, 1.0, 0.25), (255.0, 255.0, 255.0), 0.6, 0.5),
-        PhongLight((-1.0, 0.0, 0.25), (115.0, 130.0, 255.0), 0.5, 0.3),
-        PhongLight((0.0, -1.0, 0.25), (255.0, 82.0, 108.0), 0.6, 0.4),
-        PhongLight((1.0, 0.0, 0.25), (153.0, 255.0, 120.0), 0.1, 0.1),
-    ),
-    "gelsight2017": (
-        PhongLight((-1.0, 0.0, 0.25), (255.0, 82.0, 108.0), 0.6, 0.4),
-        PhongLight((0.5, -0.866, 0.25), (153.0, 255.0, 120.0), 0.1, 0.4),
-        PhongLight((0.5, 0.866, 0.25), (115.0, 130.0, 255.0), 0.1, 0.4),
-    ),
-    "gazebo": (
-        PhongLight((0.0, 1.0, 0.25), (240.0, 240.0, 240.0), 0.5, 0.15),
-        PhongLight((-1.0, 0.0, 0.25), (78.0, 139.0, 255.0), 0.5, 0.15),
-        PhongLight((0.0, -1.0, 0.25), (255.0, 82.0, 108.0), 0.5, 0.15),
-        PhongLight((1.0, 0.0, 0.25), (150.0, 240.0, 100.0), 0.5, 0.15),
-    ),
-}
-"""Published sets by name: two sensors of the paper, and the lights of the robot simulation in the same release."""
-
-
-@dataclass(frozen=True)
 class PhongArrays:
     """Device arrays of a frame: the dimmed image at rest, three channels of H·W."""
 
-    ambient: list[Any]
+    ambient: list[Float]
 
 
 class PhongMode(ImageMode):
     """The optical mode ``phong``: one sensor, one set of lights, one resolution; batches of surfaces in, images out."""
 
-    label = "phong"
-
     def __init__(
         self,
         sensor: SensorSpec,
+        config: Phong,
         *,
-        lights: str | tuple[PhongLight, ...] = "gelsight2017",
-        background: np.ndarray | None = None,
         resolution: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("rgb",),
         device: str = "auto",
+        seed: int = 0,
     ) -> None:
-        """Check everything; kernels are compiled at the first image.
-
-        Args:
-            sensor: camera and pad.
-            lights: a name of ``PHONG_LIGHTS``, or lights. The default is the set with three colours, as a GelSight Mini has them.
-            background: image at rest, (H, W, 3) uint8 at ``resolution``; None is what the ray tracer makes of this sensor.
-            resolution: (width, height) [px]; None is the sensor's own.
-            outputs: any of ``rgb``, ``normals``, ``depth``.
-            device: ``auto``, ``cpu`` or ``cuda``.
-
-        Raises:
-            InputError: a value out of its choices.
-            BackendError: Dr.Jit cannot run on ``device``.
-        """
-        if isinstance(lights, str) and lights not in PHONG_LIGHTS:
-            raise InputError("lights", value=lights, rule="must be a known set of lights", choices=PHONG_LIGHTS)
-        if not isinstance(lights, (str, tuple, list)):
-            raise InputError("lights", value=lights, rule="must be a name or PhongLights", choices=PHONG_LIGHTS)
-        self.lights = PHONG_LIGHTS[lights] if isinstance(lights, str) else tuple(lights)
-        for light in self.lights:
-            if not isinstance(light, PhongLight):
-                raise InputError("lights", value=light, rule="must be a name or PhongLights", choices=PHONG_LIGHTS)
-            numbers = (*light.direction, *light.colour, light.diffuse, light.specular)
-            if len(numbers) != 8 or not np.isfinite(numbers).all():
-                raise InputError("lights", value=light, rule="must be finite, with three numbers in direction and colour")
-        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
-        width, height = self.camera.resolution
-        if background is not None:
-            found = f"{background.dtype} {background.shape}" if isinstance(background, np.ndarray) else type(background).__name__
-            if found != f"uint8 {(height, width, 3)}":
-                raise InputError("background", value=found, rule=f"must be a uint8 array of shape {(height, width, 3)}")
-        self._background = background
+        """As ``OpticsConfig.build``; kernels are compiled at the first image."""
+        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
+        self.lights, self._background = config.light_list, config.background
+        if self._background is not None:
+            image, wanted = self._background, (*self._shape(1)[1:], 3)
+            kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            if kind != f"uint8 {wanted}":
+                raise InputError("background", value=kind, rule=f"must be a uint8 array of shape {wanted}")
 
     def _build(self, grid: PadGrid) -> PhongArrays:
         image = self._background
         if image is None:
-            tracer = RayTracer(self.sensor, resolution=self.camera.resolution, device=self.device)
+            tracer = ray_tracer(self.sensor, RayTraced(), resolution=self.camera.resolution, device=self.device)
             image = tracer.render(GelSurface.at_rest(grid)).rgb
             assert image is not None
         dimmed = AMBIENT * image.reshape(-1, 3).astype(np.float32)
         return PhongArrays([self.mi.Float(np.ascontiguousarray(dimmed[:, c])) for c in range(3)])
 
-    def _levels(self, seen: ImageHeights, inputs: PhongArrays) -> tuple[list[Any], Any]:
+    def _levels(self, seen: ImageHeights, arrays: PhongArrays) -> tuple[list[Float], UInt8]:
         mi = self.mi
         sx, sy, _ = seen.slopes(mi, seen.height)
         _, p, _, _ = seen.pixel(mi)
         nz = dr.rsqrt(sx * sx + sy * sy + 1)
         nx, ny = sx * nz, sy * nz
-        pressed = dr.clip(seen.moved * (self.pitch[0] / THICKNESS), 0, 1)
-        out = [self._overlay(dr.gather(mi.Float, channel, p), pressed, 0.0) for channel in inputs.ambient]
+        pressed = dr.clip(seen.displacement * (self.pitch[0] / THICKNESS), 0, 1)
+        out = [self._overlay(dr.gather(mi.Float, channel, p), pressed, 0.0) for channel in arrays.ambient]
         for light in self.lights:
             lx, ly, lz = light.direction
             dot = nx * lx + ny * ly + nz * lz

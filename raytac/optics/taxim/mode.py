@@ -14,13 +14,16 @@ import drjit as dr
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.base import chosen_shadows
-from raytac.optics.exposure import SATURATED, saturated_share
+from raytac.gel.surface import PadGrid
+from raytac.optics.base import casts_shadows
+from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
+from raytac.optics.response import SATURATED, saturated_share
+from raytac.optics.taxim.config import Taxim
 from raytac.optics.taxim.shadow import ShadowArrays, ShadowCaster
 from raytac.optics.taxim.table import PolyTable
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["TableArrays", "TableShader", "TaximMode"]
@@ -60,14 +63,14 @@ class TableShader:
             background = self._caster.blur_background(background)
         self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(_padded(background)), arrays)
 
-    def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
+    def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Float], UInt8]:
         """Three channels of B·H·W levels, and flags of every pixel (UInt8): 1 in contact, ``_UNCOVERED`` more in an uncovered bin.
 
         The flags are one unused value where coverage is not known.
         """
         mi, table = self.mi, self.table
         displaced = table.slopes_of == "displacement"
-        of = seen.moved if displaced else seen.height
+        of = seen.displacement if displaced else seen.height
         sx, sy, near = seen.slopes(mi, of)
         _, p, column, row = seen.pixel(mi)
         n = table.n_bins
@@ -112,32 +115,20 @@ class TaximMode(ImageMode):
     def __init__(
         self,
         sensor: SensorSpec,
+        config: Taxim,
         *,
-        calibration: str | Path | PolyTable | None = None,
-        shadows: bool | None = None,
         resolution: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("rgb",),
         device: str = "auto",
+        seed: int = 0,
     ) -> None:
-        """Load the table; kernels are compiled at the first image.
-
-        Args:
-            sensor: camera and pad; its lights matter only where ``calibration`` is None.
-            calibration: a table, a calibration folder (``raytac.optics.taxim.folder``), or None for the table baked from this sensor's
-                own ray tracer, which is baked now unless that was done before. The table's image is laid over the whole image.
-            shadows: cast shadows; None is as the sensor says, where the table has them.
-            resolution: (width, height) [px]; None is the sensor's own.
-            outputs: any of ``rgb``, ``normals``, ``depth``.
-            device: ``auto``, ``cpu`` or ``cuda``.
+        """As ``OpticsConfig.build``; the table is loaded or baked now, kernels are compiled at the first image.
 
         Raises:
-            InputError: a value out of its choices, or an image of another shape than the table's.
-            CalibrationError: a file of the calibration folder is missing or malformed.
-            BackendError: Dr.Jit cannot run on ``device``.
+            InputError: an image of another shape than the table's.
         """
-        self.label = "taxim"
-        casts = chosen_shadows(sensor, shadows)
-        super().__init__(sensor, resolution=resolution, outputs=outputs, device=device)
+        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
+        calibration, shadows, casts = config.calibration, config.shadows, casts_shadows(sensor, config.shadows)
         # Without being asked, a table without shadows casts none; one that is asked to is baked with them, whatever the sensor says.
         baked_of = replace(sensor, optics=replace(sensor.optics, shadows=sensor.optics.shadows or casts))
         self.table, self._is_own = _table(calibration, baked_of, self.device), calibration is None
@@ -161,11 +152,11 @@ class TaximMode(ImageMode):
 
     def _build(self, grid: PadGrid) -> TableArrays:
         if self._is_own and saturated_share(self.table.background.round().clip(0, 255)) > SATURATED:
-            RayTracer(self.sensor, device=self.device).render(GelSurface.at_rest(grid))  # which warns of it
+            ray_tracer(self.sensor, RayTraced(), device=self.device).prepare(grid)  # which warns of it
         return self._shader.inputs
 
-    def _levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Any], Any]:
-        return self._shader.levels(seen, inputs)
+    def _levels(self, seen: ImageHeights, arrays: TableArrays) -> tuple[list[Float], UInt8]:
+        return self._shader.levels(seen, arrays)
 
     def _floats_per_pixel(self) -> float:
         # With shadows: least values (3), the packed image before and after each of four blurs (20), the contact grown by rows (1/4).
@@ -201,9 +192,6 @@ def _table(calibration: object, sensor: SensorSpec, device: str) -> PolyTable:
         from raytac.optics.taxim.folder import load_calibration
 
         return load_calibration(calibration)
-    if calibration is not None:
-        rule = f"must be a PolyTable, a calibration folder or None, not {type(calibration).__name__}"
-        raise InputError("calibration", value=calibration, rule=rule)
     from raytac.optics.taxim.bake.bake import baked_table
 
     return baked_table(sensor, device=device)

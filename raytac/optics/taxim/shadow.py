@@ -106,7 +106,7 @@ class ShadowCaster:
             d = mi.Int32(dr.floor((pixels * self.pitch - t.first_depth) * (1 / t.depth_precision))) + t.depth_offset
             return dr.minimum(d, n_depth - 1) if by_drop else d
 
-        d = depth_bin(seen.moved)
+        d = depth_bin(seen.displacement)
         casts = ring & (a >= 0) & (a < n_dir) & (d >= 0) & (d < n_depth)
         a, d = mi.UInt32(dr.select(casts, a, 0)), mi.UInt32(dr.select(casts, d, 0))
         # Every pixel is a lane, though few cast: how many do changes from frame to frame, and a recording must not depend on it.
@@ -130,7 +130,7 @@ class ShadowCaster:
             shaded = inside & (of > dr.gather(mi.Float, of, at, inside))
             row_of = entry
             if by_drop:
-                drop = depth_bin(seen.moved - dr.gather(mi.Float, seen.moved, at, inside))
+                drop = depth_bin(seen.displacement - dr.gather(mi.Float, seen.displacement, at, inside))
                 shaded &= drop >= 0
                 row_of = a * n_depth + mi.UInt32(dr.maximum(drop, 0))
             value = dr.gather(mi.Vector4i, arrays.values, row_of * length + mi.UInt32(place.z), shaded)

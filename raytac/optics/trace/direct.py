@@ -11,47 +11,16 @@ environments: one thread a pixel, one code for LLVM and CUDA.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from raytac.optics.camera import Pinhole
+from raytac.optics.geometry import CoatField, PixelSample
 from raytac.optics.refraction import Slab
-from raytac.optics.trace.height_field import CoatField
 from raytac.optics.trace.led import Lamp
 from raytac.specs.sensor import CoatSpec
 
-__all__ = ["PixelSample", "direct_light", "see"]
-
-
-@dataclass(frozen=True)
-class PixelSample:
-    """What one camera ray of every pixel meets: environment index, point, normal and direction to the camera (pad frame)."""
-
-    env: Any
-    p: Any
-    n: Any
-    wo: Any
-    exit: Any = None
-    """Radiance that leaves the slab per radiance at p, T / n²; None without a slab."""
-
-
-def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[float, float] = (0.5, 0.5)) -> PixelSample:
-    """Trace one ray through every pixel of ``envs`` images, at ``jitter`` inside the pixel."""
-    width, height = camera.resolution
-    i = dr.arange(mi.UInt32, envs * width * height)
-    env = i // (width * height)
-    pixel = i - env * (width * height)
-    u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
-    origin, (tx, ty) = camera.ray(u, v)
-    p = field.camera_hit(env, origin, tx, ty)
-    n = field.normal(env, p.x, p.y)
-    exit = None
-    if camera.slab is not None:
-        ax, ay = camera.slope(u, v)
-        exit = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
-    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), exit)
+__all__ = ["direct_light"]
 
 
 def direct_light(

@@ -23,8 +23,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.optics.trace.direct import PixelSample
-from raytac.optics.trace.height_field import CoatField, CoatLayout
+from raytac.optics.geometry import CoatField, CoatLayout, PixelSample
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
 from raytac.optics.trace.scene import UNIT, SensorScene

@@ -1,4 +1,8 @@
-"""One LED on the device: where its rectangle lies, how it emits, and points on it. Every integrator of ours lights by these."""
+"""LEDs: how they emit (``lobe_gain``), their arrays on the device (``Lamp``), and the emitter that Mitsuba's scene has of them.
+
+A die behind a lens does not emit like a Lambertian patch. The usual lobe is an intensity I(θ) = I₀ cosⁿ θ about the axis; spread over
+a rectangle of area A this is the radiance L(θ) = (I₀ / A) cosⁿ⁻¹ θ, because a patch shrinks with cos θ. n = 1 is Mitsuba's ``area``.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,26 @@ import numpy as np
 
 from raytac.specs.sensor import LedSpec
 
-__all__ = ["Lamp", "LampTable"]
+__all__ = ["PLUGIN", "Lamp", "LampTable", "lobe_gain", "lobe_slopes", "register"]
+
+PLUGIN = "raytac_led"
+"""Name of the emitter in Mitsuba's scenes."""
+LEAST_COSINE = 1e-6
+"""Cosine that stands for all smaller ones, so that a power of it is defined for every angle."""
+
+
+def lobe_gain(ops: Any, cos_theta: Any, exponent: Any, least: float = LEAST_COSINE) -> Any:
+    """cosⁿ θ of an LED's lobe: n is ``lobe`` for the intensity and ``lobe`` − 1 for the radiance; the caller leaves out what lies behind.
+
+    ``ops``: ``numpy`` or ``drjit``, whichever the arrays are of.
+    """
+    return ops.power(ops.maximum(cos_theta, least), exponent)
+
+
+def lobe_slopes(cos_theta: np.ndarray, exponent: float, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes of log ``lobe_gain`` by cos θ and by n."""
+    cosine = np.maximum(cos_theta, least)
+    return np.where(cos_theta > least, exponent / cosine, 0), np.log(cosine)
 
 
 @dataclass(frozen=True)
@@ -53,7 +76,7 @@ class Lamp:
     def lobe_gain(self, direction: Any) -> Any:
         """cosⁿ θ for light leaving along the unit ``direction``; 0 behind."""
         cos_theta = dr.dot(direction, self.axis)
-        return dr.select(cos_theta > 0, dr.power(dr.maximum(cos_theta, 1e-6), self.lobe), 0)
+        return dr.select(cos_theta > 0, lobe_gain(dr, cos_theta, self.lobe), 0)
 
     def extent(self, direction: Any) -> Any:
         """Half the rectangle's length [m] along the unit ``direction``."""
@@ -97,3 +120,53 @@ class LampTable:
             power=dr.gather(mi.Color3f, t.power, index),
         )
         return lamp, dr.gather(mi.UInt32, self.group, index)
+
+
+def register(mi: Any) -> None:
+    """Register the plugin ``raytac_led`` for the variant that is active in ``mi``, once; parameters ``radiance`` (RGB) and ``lobe``."""
+    if getattr(mi, "raytac_led_variant", None) == mi.variant():
+        return
+
+    class LobeEmitter(mi.Emitter):
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.radiance = mi.Color3f(list(props["radiance"]))
+            self.exponent = mi.Float(float(props["lobe"]) - 1.0)
+            dr.make_opaque(self.radiance, self.exponent)
+            self.m_flags = mi.EmitterFlags.Surface
+
+        def traverse(self, cb: Any) -> None:
+            cb.put("radiance", self.radiance, mi.ParamFlags.Differentiable)
+            cb.put("exponent", self.exponent, mi.ParamFlags.Differentiable)
+
+        def _lobe(self, cos_theta: Any) -> Any:
+            # cos⁰ is 1 for every angle in front, so a Lambertian patch needs no branch.
+            return self.radiance * lobe_gain(dr, cos_theta, self.exponent)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            cos_theta = mi.Frame3f.cos_theta(si.wi)
+            return self._lobe(cos_theta) & (active & (cos_theta > 0))
+
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+            ds = self.get_shape().sample_direction(it, sample, active)
+            cos_theta = -dr.dot(ds.d, ds.n)
+            active = active & (cos_theta > 0) & (ds.pdf > 0)
+            ds.emitter = mi.EmitterPtr(self)
+            return ds, (self._lobe(cos_theta) / ds.pdf) & active
+
+        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            active = active & (dr.dot(ds.d, ds.n) < 0)
+            return dr.select(active, self.get_shape().pdf_direction(it, ds, active), 0)
+
+        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            cos_theta = -dr.dot(ds.d, ds.n)
+            return self._lobe(cos_theta) & (active & (cos_theta > 0))
+
+        def bbox(self) -> Any:
+            return self.get_shape().bbox()
+
+        def to_string(self) -> str:
+            return f"RaytacLed[radiance={self.radiance}, exponent={self.exponent}]"
+
+    mi.register_emitter(PLUGIN, LobeEmitter)
+    mi.raytac_led_variant = mi.variant()

@@ -21,8 +21,8 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from tqdm import tqdm
 
+from raytac.io.progress import Progress
 from raytac.optics.camera import Pinhole
 from raytac.optics.refraction import Link, Slab
 from raytac.optics.trace.led import Lamp, LampTable
@@ -90,7 +90,7 @@ def accumulate(
     template = mi.load_dict({"type": "independent"})
     total: np.ndarray | None = None
     done = 0
-    with tqdm(total=spp, unit="spp", desc="path tracing", disable=None if progress else True, leave=False) as bar:
+    with Progress(total=spp, unit="spp", desc="path tracing", show=progress, leave=False) as bar:
         while done < spp:
             count = min(per_launch, spp - done)
             n = width * height * count

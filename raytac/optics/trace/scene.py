@@ -14,8 +14,7 @@ import numpy as np
 from raytac.gel.surface import PadGrid
 from raytac.optics.ink import inked_albedo
 from raytac.optics.refraction import Slab
-from raytac.optics.trace import led_plugin as led_plugin
-from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.led import PLUGIN, Lamp, lobe_gain
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
 
 UNIT = 1e3
@@ -143,7 +142,7 @@ class SensorScene:
             "type": "rectangle",
             "to_world": T(to_world),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
-            "emitter": {"type": led_plugin.PLUGIN, "radiance": [p / area for p in led.power], "lobe": led.lobe},
+            "emitter": {"type": PLUGIN, "radiance": [p / area for p in led.power], "lobe": led.lobe},
         }
 
     def _glow(self, leds: Sequence[str] | None) -> list[float]:
@@ -211,7 +210,7 @@ class SensorScene:
         """Radiance (RGB) that LED ``index``, given as ``lamp`` in scene units, sends back along the ray that hit ``si``; 0 elsewhere."""
         area = 4 * self.dr.norm(lamp.half_u) * self.dr.norm(lamp.half_v)
         front = (si.shape == self._leds[index]) & (si.wi.z > 0)
-        lobe = self.dr.power(self.dr.maximum(si.wi.z, 1e-6), lamp.lobe - 1)
+        lobe = lobe_gain(self.dr, si.wi.z, lamp.lobe - 1)
         return lamp.power * self.dr.select(front, lobe / area, 0)
 
     def on_coat(self, si: Any) -> Any:

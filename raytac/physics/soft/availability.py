@@ -1,4 +1,4 @@
-"""The contact solver's own needs: whether it is installed, and how much Warp, which it runs on, prints."""
+"""Availability of the contact solver, and the messages of Warp, on which it runs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from raytac.device import cuda_device_count
 from raytac.errors import BackendError
 from raytac.installation import foreign_ipc
 
-__all__ = ["check_solver", "hush_solver"]
+__all__ = ["check_solver", "quiet_solver"]
 
 
 def check_solver(user: str) -> None:
-    """Say now, in one line, that the solver is missing, instead of by an ``ImportError`` from its depths.
+    """Refuse in one line if the solver is missing, before an ``ImportError`` from deep inside.
 
     Args:
-        user: what needs the solver; the message begins with it.
+        user: the feature that needs the solver; the message begins with it.
 
     Raises:
         BackendError: Warp is not installed.
@@ -27,17 +27,18 @@ def check_solver(user: str) -> None:
         raise BackendError(f'{user} needs the contact solver, and Warp is not installed: `pip install "raytac[ipc]"`')
 
 
-def hush_solver() -> None:
-    """Let Warp print warnings and errors only, in this whole process; nothing happens without Warp or without raytac's own ``ipc``.
+def quiet_solver() -> None:
+    """Let Warp print only warnings and errors in this process.
 
-    Warp otherwise lists devices and every module that it loads. Its level belongs to the process, so neither ``ipc`` nor
-    ``TactileSensor`` touches it: this is for programs, such as the ``raytac`` command. Call it before the solver is first used.
+    Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
+    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used. Nothing happens without Warp or
+    raytac's own ``ipc``.
     """
     if importlib.util.find_spec("warp") is None or foreign_ipc() is not None:
         return
     import warp as wp
 
-    from ipc.warp_start import use_writable_cache
+    from ipc import use_writable_cache
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     use_writable_cache()
@@ -47,12 +48,12 @@ def hush_solver() -> None:
 
 @contextlib.contextmanager
 def _no_standard_error() -> Iterator[None]:
-    """Drop what native code writes to standard error: that there is no CUDA driver is no news where no device was found."""
-    kept = os.dup(2)
+    """Drop native code's standard error: without a device, a missing driver is no news."""
+    original = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(original, 2)
+        os.close(original)

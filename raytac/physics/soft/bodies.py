@@ -1,4 +1,4 @@
-"""The bodies of the contact solver: bonded pads, and what touches them, driven, lying free, or soft."""
+"""Bodies of the contact solver: bonded pads, and driven, free and soft bodies."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import ipc
 from raytac.errors import InputError
 from raytac.io.cache import cache_folder
 from raytac.physics.soft.mesh import PadMesh
+from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.physics.soft.skin import SoftSkin
 from raytac.se3 import rigid_poses
 from raytac.shapes.facets import SAG
@@ -22,28 +23,28 @@ from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = ["BODY_KINDS", "OBJECT", "PAD", "Cast", "SceneBody", "ScenePad", "object_body", "pad_body", "scene_body"]
+__all__ = ["BODY_KINDS", "OBJECT", "PAD", "SceneBody", "ScenePad", "SceneRegistry", "object_body", "pad_body", "scene_body"]
 
 
 PAD, OBJECT = "pad", "object"
 """Names of the two bodies of a press."""
 BODY_KINDS = ("kinematic", "affine", "soft", "half_space")
-"""What ``scene_body`` makes."""
-_HELD = 0.2
-"""Share of a soft object's height, from its top, that the drive holds."""
+"""Kinds that ``scene_body`` makes."""
+_DRIVEN_SHARE = 0.2
+"""Share of a soft object's height, from its top, that is driven."""
 
 
 @dataclass(frozen=True)
 class SceneBody:
-    """One body of a ``SoftScene`` besides the pads."""
+    """One body of a ``SoftScene`` that is not a pad."""
 
     solid: ipc.KinematicBody | ipc.AffineBody | ipc.SoftBody | ipc.HalfSpace
     parts: tuple[Part, ...] = ()
-    """Exact shape of a rigid one, body frame: what a pad in contact is shown to touch."""
+    """Exact shape of a rigid one, body frame, which a pad in contact is shown to touch."""
     friction: float | None = None
     """μ against pads and bodies; None: each pad's own against pads."""
     skin: SoftSkin | None = None
-    """Surface of a soft one, as a pad in contact is shown to touch it; None: the faces of its tetrahedra."""
+    """Smooth surface of a soft one, which a pad in contact is shown to touch; None: the faces of its tetrahedra."""
 
     @property
     def name(self) -> str:
@@ -55,14 +56,14 @@ class SceneBody:
 
     @property
     def is_driven(self) -> bool:
-        """Its frame goes where it is told; else it moves freely."""
+        """True if its frame has prescribed poses, False if it moves freely."""
         if isinstance(self.solid, ipc.SoftBody):
             return len(self.solid.bonded) > 0
         return not isinstance(self.solid, ipc.AffineBody)
 
 
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
-    """The gel: stable neo-Hookean, held at the vertices that ``mesh`` names; its folds touch and never pass through each other."""
+    """The gel of a pad: stable neo-Hookean, fixed where bonded, with self-contact."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
     return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
 
@@ -76,7 +77,7 @@ def scene_body(
     youngs_modulus: float = 1e6,
     poisson_ratio: float = 0.45,
     cell: float = 2e-3,
-    held: Callable[[np.ndarray], np.ndarray] | None = None,
+    bonded: Callable[[np.ndarray], np.ndarray] | None = None,
     friction: float | None = None,
     sag: float = SAG,
 ) -> SceneBody:
@@ -85,17 +86,17 @@ def scene_body(
     Args:
         name: unique in its scene.
         parts: shape. ``half_space`` takes none (the solid is z <= 0 of its frame) or one ``plane``.
-        kind: ``kinematic``: rigid, goes where it is told. ``affine``: near-rigid and free. ``soft``: neo-Hookean, free, or driven where
-            ``held``. ``half_space``: a table or wall.
+        kind: ``kinematic``: rigid, with prescribed poses. ``affine``: near-rigid and free. ``soft``: neo-Hookean, free, or driven where
+            ``bonded``. ``half_space``: a table or wall.
         density: of an affine or soft body [kg/m³].
         youngs_modulus, poisson_ratio: of a soft body [Pa], [-].
-        cell: length of a soft body's tetrahedra [m]. A box is cut into a grid of mirrored cells; all else by pytetwild.
-        held: of a soft body: tells from vertices (n, 3) [m] which, (n,) bool, are fixed to the body's frame; None: none, it is free.
+        cell: edge length of a soft body's tetrahedra [m]. A box becomes a grid of mirrored cells; all else is meshed by pytetwild.
+        bonded: of a soft body: mask (n,) of the vertices (n, 3) [m] that are fixed to the body's frame; None: it is free.
         friction: see ``SceneBody``.
-        sag: how far facets may lie inside a curved part [m].
+        sag: greatest distance of facets inside a curved part [m].
 
     Raises:
-        InputError: an unknown kind, a surface that it cannot be made from or that crosses itself, or ``held`` that names no vertex.
+        InputError: an unknown kind, a surface that it cannot be made from or that crosses itself, or ``bonded`` that names no vertex.
     """
     if kind not in BODY_KINDS:
         raise InputError("kind", value=kind, rule=f"of body {name!r} must be a known kind of body", choices=BODY_KINDS)
@@ -111,7 +112,7 @@ def scene_body(
                 raise InputError("parts", value=[part.kind for part in parts], rule=rule)
             return SceneBody(ipc.HalfSpace(name), parts or (Part("plane"),), friction)
         if kind == "soft":
-            solid = _soft(name, parts, density, youngs_modulus, poisson_ratio, cell, held)
+            solid = _soft(name, parts, density, youngs_modulus, poisson_ratio, cell, bonded)
             return SceneBody(solid, (), friction, SoftSkin(parts, solid.mesh))
         surface = _checked_surface(name, parts, sag)
         if kind == "affine":
@@ -128,7 +129,7 @@ def _soft(
     youngs_modulus: float,
     poisson_ratio: float,
     cell: float,
-    held: Callable[[np.ndarray], np.ndarray] | None,
+    is_bonded: Callable[[np.ndarray], np.ndarray] | None,
 ) -> ipc.SoftBody:
     if not 0.0 < cell < np.inf:
         raise InputError("cell", value=cell, rule=f"of soft body {name!r} must be a length > 0 [m]")
@@ -140,11 +141,11 @@ def _soft(
     else:
         tets = ipc.tetrahedralize(_checked_surface(name, parts, 0.05 * cell), cell, cache_folder("tets"))
     bonded = np.zeros(0, np.int64)
-    if held is not None:
-        bonded = np.flatnonzero(held(tets.vertices))
+    if is_bonded is not None:
+        bonded = np.flatnonzero(is_bonded(tets.vertices))
         if not 0 < len(bonded) < len(tets.vertices):
             rule = f"holds {len(bonded)} of the {len(tets.vertices)} vertices of {name!r}: it must hold some and leave some"
-            raise InputError("held", value=held, rule=rule)
+            raise InputError("bonded", value=is_bonded, rule=rule)
     material = ipc.Material(young=youngs_modulus, poisson=poisson_ratio, density=density)
     return ipc.SoftBody(name, tets, material, bonded=bonded)
 
@@ -161,18 +162,18 @@ def object_body(
 ) -> SceneBody:
     """The object of a press scene as a body of the solver, in the object's frame.
 
-    ``kinematic``: a rigid surface that is driven, without the triangles that no press brings near the pad. ``affine``: free and
-    near-rigid, as heavy as ``weight`` under gravity; its surface must be closed. ``soft``: neo-Hookean, tetrahedra of about
-    ``edge_length``, driven by the fifth of its height that is farthest from the pad.
+    ``kinematic``: a driven rigid surface, without the triangles that no press brings near the pad. ``affine``: free and near-rigid,
+    with a ``weight``; its surface must be closed. ``soft``: neo-Hookean, tetrahedra of about ``edge_length``, driven by the fifth of its
+    height that is farthest from the pad.
 
     Args:
         parts: of the object.
-        spec: says which kind of body, and a soft one's material.
-        rotations: ``pad_from_object`` of every environment, (B, 3, 3): tells which side is down. One body serves all, so a rigid one
-            keeps what any of them brings near the pad, and a soft one must be turned the same in all.
+        spec: kind of body, and a soft one's material.
+        rotations: ``pad_from_object`` of every environment, (B, 3, 3). One body serves all, so a rigid one keeps the triangles that any
+            of them brings near the pad, and a soft one must be tilted the same in all.
         weight: [N], of an affine body.
         edge_length: of a soft body's tetrahedra [m].
-        sag: how far facets may lie inside a curved part [m].
+        sag: greatest distance of facets inside a curved part [m].
         lowest: height above the object's lowest point [m] beyond which a kinematic body's triangles are left out; 0 keeps all.
 
     Raises:
@@ -188,7 +189,9 @@ def object_body(
         return SceneBody(ipc.KinematicBody(OBJECT, surface), tuple(parts))
     try:
         if spec.dynamics == "affine":
-            volume = _volume(surface)
+            volume = enclosed_volume(surface)
+            if not volume > 0.0:
+                raise InputError("object.dynamics", value="affine", rule="needs a closed surface with its faces outwards")
             return SceneBody(ipc.AffineBody(OBJECT, surface, ipc.Stiff(density=weight / (9.81 * volume))), tuple(parts))
         if spec.dynamics == "soft":
             tets = ipc.tetrahedralize(surface, edge_length, cache_folder("tets"))
@@ -196,18 +199,18 @@ def object_body(
                 rule = "held at its top, so a soft object must be tilted the same in all environments"
                 raise InputError("rotations", value=rotations[:, 2].tolist(), rule=rule)
             height = tets.vertices @ rotations[0, 2]
-            held = np.flatnonzero(height >= height.max() - _HELD * np.ptp(height))
+            driven = np.flatnonzero(height >= height.max() - _DRIVEN_SHARE * np.ptp(height))
             material = ipc.Material(young=spec.youngs_modulus, poisson=spec.poisson_ratio)
-            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=held), skin=SoftSkin(parts, tets))
+            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=driven), skin=SoftSkin(parts, tets))
     except ipc.IpcError as error:
         raise InputError("object.dynamics", value=spec.dynamics, rule=f"cannot be made from this object: {error}") from error
     raise InputError("object.dynamics", value=spec.dynamics, rule="must be a known kind of body", choices=DYNAMICS)
 
 
 def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMesh:
-    """``object_surface`` of a body, without a mesh that crosses itself: no test can say whether a pad passes through such a body.
+    """``object_surface`` of a body; a mesh that crosses itself is refused, since tests of penetration fail on it.
 
-    Parts that overlap are common in models of robots, and only their outer walls touch anything, so they are a warning.
+    Overlapping parts are common in models of robots, and only their outer walls touch anything, so they only cause a warning.
     """
     for part in parts:
         if part.kind == "mesh":
@@ -225,30 +228,24 @@ def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMes
     return surface
 
 
-def _volume(surface: ipc.TriMesh) -> float:
-    """Volume [m³] that a closed surface bounds."""
-    volume = enclosed_volume(surface)
-    if not volume > 0.0:
-        raise InputError("object.dynamics", value="affine", rule="needs a closed surface with its faces outwards")
-    return volume
-
-
 @dataclass(frozen=True)
 class ScenePad:
-    """One pad of a scene; its case goes where ``world_from_pad`` says."""
+    """One pad of a ``SoftScene``, whose case has prescribed poses."""
 
     name: str
     sensor: SensorSpec
     mesh: PadMesh
     pitch: float = 0.1e-3
     """Spacing of the grid that its surface is read on [m]."""
+    correction: Correction | None = DEFAULT_CORRECTION
+    """Correction of the surface that is read; None: the spline through the solver's vertices."""
 
 
-class Cast:
-    """Pads and bodies of a scene with B environments."""
+class SceneRegistry:
+    """Pads and bodies of a scene with B environments, by name."""
 
     def __init__(self, pads: Sequence[ScenePad], bodies: Sequence[SceneBody], num_envs: int) -> None:
-        """Raises ``InputError`` where there is no pad, or a name repeats."""
+        """Register them; raises ``InputError`` where there is no pad, or a name repeats."""
         names = [thing.name for thing in (*pads, *bodies)]
         if not pads:
             raise InputError("pads", value=(), rule="must hold one pad or more")
@@ -268,7 +265,7 @@ class Cast:
         return self.bodies[name]
 
     def named(self, poses: Mapping[str, ArrayLike], free: bool = False) -> dict[str, np.ndarray]:
-        """Poses (B, 4, 4) of some bodies by name; of ``free`` ones only where they may be given."""
+        """Poses (B, 4, 4) of some bodies by name; those of free bodies are refused unless ``free``."""
         for name in poses:
             if not (self.body(name).is_driven or free):
                 driven = [n for n, body in self.bodies.items() if body.is_driven]
@@ -290,15 +287,15 @@ class Cast:
 
     def friction(self) -> dict[tuple[str, str], float]:
         """μ by pair of names: with a pad, the body's own if it has one, else the pad's gel's; between bodies, the larger of theirs."""
-        found = {}
+        mu = {}
         for pad in self.pads.values():
             for other in self.pads.values():
                 if other.name > pad.name:
-                    found[pad.name, other.name] = max(pad.sensor.gelpad.friction, other.sensor.gelpad.friction)
+                    mu[pad.name, other.name] = max(pad.sensor.gelpad.friction, other.sensor.gelpad.friction)
             for body in self.bodies.values():
-                found[pad.name, body.name] = pad.sensor.gelpad.friction if body.friction is None else body.friction
-        names = list(self.bodies.values())
-        for k, one in enumerate(names):
-            for two in names[k + 1 :]:
-                found[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
-        return found
+                mu[pad.name, body.name] = pad.sensor.gelpad.friction if body.friction is None else body.friction
+        bodies = list(self.bodies.values())
+        for k, one in enumerate(bodies):
+            for two in bodies[k + 1 :]:
+                mu[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
+        return mu

@@ -1,4 +1,4 @@
-"""How wide a contact is in cells of the simulated pad: with too few cells across it, its force is not to be trusted."""
+"""Width of a contact in cells of the soft pad's mesh, on which the force's accuracy depends."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.components import find_runs, join_runs
+from raytac.gel.interpolate import cell_lengths
 from raytac.gel.surface import GelSurface
 from raytac.specs import PressScene
 from raytac.specs.press import PADS
@@ -15,48 +16,49 @@ from raytac.specs.press import PADS
 __all__ = ["LEAST_CELLS", "NarrowContactWarning", "cells_across", "holds_force", "warn_if_narrow"]
 
 LEAST_CELLS = 6.0
-"""Cells across a contact that its force asks for: three to its radius (docs/ipc.md, the pad of a sensor)."""
+"""Least number of cells across a contact for an accurate force: three to its radius (docs/ipc.md, the pad of a sensor)."""
 _SMALL = 0.1
-"""Patches that are together less than this share of the contact's area do not count: specks at a rim."""
+"""Patches that together have less than this share of the contact's area do not count: specks at a rim."""
 
 
 class NarrowContactWarning(UserWarning):
-    """A contact is too narrow for the pad's cells: its force and traction are not to be trusted."""
+    """A contact is too narrow for the pad's cells: its force and traction are inaccurate."""
 
 
 def cells_across(surface: GelSurface, mesh: CoatMesh) -> np.ndarray:
-    """Width of the narrowest patch of contact in cells of the coat, shape (B,); NaN without contact.
+    """Width of the narrowest contact patch in cells of the coat, (B,); NaN without contact.
 
     A patch is an 8-connected piece of ``surface.contact``; its width is the diameter of its largest inscribed circle, over the longer
-    side of the coat's cell at that circle's centre. The narrowest is the first at which patches, in order of their width, make up a
-    tenth of the area. The width is right within two nodes of the surface's grid.
+    side of the coat's cell at that circle's centre. The narrowest is the first at which patches, in order of width, make up a tenth of
+    the area. The width is accurate within two nodes of the surface's grid.
     """
     return np.array([_narrowest(contact, surface, mesh) for contact in surface.contact])
 
 
 def holds_force(scene: PressScene, stage: int) -> bool:
-    """Whether the contact bears a prescribed force at a stage: its total is then right on every mesh."""
+    """True if a force is prescribed at a stage: the total is then right on every mesh."""
     indents = [s for s in scene.trajectory[: stage + 1] if s.kind == "indent"]
     return bool(indents) and indents[-1].force is not None
 
 
-def warn_if_narrow(cells: np.ndarray, pad: str, *, stacklevel: int) -> bool:
-    """Warn of the narrowest of B contacts if it has fewer than ``LEAST_CELLS`` across; returns whether it has.
+def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool:
+    """Warn of the narrowest of B contacts if it has fewer than ``LEAST_CELLS`` across; returns True if it has.
 
     Args:
         cells: from ``cells_across``, shape (B,).
-        pad: level of ``PADS`` that the pad is cut at, or another word for a mesh of one's own.
+        level: level of ``PADS`` of the mesh, or something else for a custom mesh.
         stacklevel: as for ``warnings.warn``, seen from here.
     """
     least = float(np.nanmin(cells, initial=np.inf))
     if not least < LEAST_CELLS:
         return False
-    finer = PADS[PADS.index(pad) + 1 : PADS.index(pad) + 2] if pad in PADS else ()
-    way = f"choose pad={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as pad"
+    level = level if isinstance(level, str) else "own"
+    finer = PADS[PADS.index(level) + 1 : PADS.index(level) + 2] if level in PADS else ()
+    remedy = f"choose level={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as level"
     where = f" in environment {int(np.nanargmin(cells))}" if len(cells) > 1 else ""
     warnings.warn(
-        f"pad = {pad!r}: the contact{where} is {least:.1f} cells across; for a force or traction to be trusted it must be at least "
-        f"{LEAST_CELLS:g}, three to its radius, and with fewer they are too large at a given depth: {way}, or press to a force",
+        f"level = {level!r}: the contact{where} is {least:.1f} cells across; for a force or traction to be trusted it must be at least "
+        f"{LEAST_CELLS:g}, three to its radius, and with fewer they are too large at a given depth: {remedy}, or press to a force",
         NarrowContactWarning,
         stacklevel=stacklevel + 1,
     )
@@ -77,22 +79,17 @@ def _narrowest(contact: np.ndarray, surface: GelSurface, mesh: CoatMesh) -> floa
     order = np.lexsort((-radius, of_node))
     _, first, count = np.unique(of_node[order], return_index=True, return_counts=True)
     centre = order[first]
-    cell = np.maximum(_cell(mesh.lines_x, x[columns[centre]]), _cell(mesh.lines_y, y[rows[centre]]))
-    # Up to the first node out of contact, so a strip is found up to two nodes too wide; a disc's centre lies between nodes, which takes
-    # as much off.
+    cell = np.maximum(cell_lengths(mesh.lines_x, x[columns[centre]]), cell_lengths(mesh.lines_y, y[rows[centre]]))
+    # Distances reach to the first node out of contact, so a strip comes out up to two nodes too wide; a disc's centre lies between nodes,
+    # which takes as much off.
     width = 2.0 * radius[centre] / cell
     by_width = np.argsort(width)
     area = np.cumsum(count[by_width])
     return float(width[by_width[np.searchsorted(area, _SMALL * area[-1])]])
 
 
-def _cell(lines: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Length of the cell between ``lines`` (N,) that each place lies in [m]."""
-    return np.diff(lines)[np.clip(np.searchsorted(lines, at, side="right") - 1, 0, len(lines) - 2)]
-
-
 def _inscribed(mask: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
-    """Distance of every node of a mask to the nearest that is not in it, or beyond the grid [m]; 0 outside of the mask.
+    """Distance from every node of a mask to the nearest outside it [m]; 0 outside the mask.
 
     Exact, one axis after the other (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions, 2012, without their
     envelopes: contacts are some dozens of nodes wide).
@@ -102,11 +99,11 @@ def _inscribed(mask: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
     before = np.maximum.accumulate(np.where(inside, 0, line), axis=0)
     after = np.minimum.accumulate(np.where(inside, len(line) - 1, line)[::-1], axis=0)[::-1]
     along = (pitch[1] * np.minimum(line - before, after - line)) ** 2
-    found = along.copy()
+    square = along.copy()
     for step in range(1, inside.shape[1]):
         beside = (step * pitch[0]) ** 2
-        if beside >= found.max():
+        if beside >= square.max():
             break
-        np.minimum(found[:, step:], along[:, :-step] + beside, out=found[:, step:])
-        np.minimum(found[:, :-step], along[:, step:] + beside, out=found[:, :-step])
-    return np.sqrt(found[1:-1, 1:-1])
+        np.minimum(square[:, step:], along[:, :-step] + beside, out=square[:, step:])
+        np.minimum(square[:, :-step], along[:, step:] + beside, out=square[:, :-step])
+    return np.sqrt(square[1:-1, 1:-1])

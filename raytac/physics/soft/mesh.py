@@ -1,4 +1,4 @@
-"""The gelpad as tetrahedra: graded towards the contact face and the middle, with mirrored cells that do not lock."""
+"""Tetrahedral mesh of a gelpad, graded towards the contact face and the centre."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["PAD_LEVELS", "PadLevel", "PadMesh", "pad_mesh", "pad_stiffness"]
 
 @dataclass(frozen=True)
 class PadLevel:
-    """How finely a pad is cut."""
+    """Resolution of a pad's mesh."""
 
     cell: float
-    """Mean length of a cell along x and y [m]; the count on each axis is the even number that comes closest."""
+    """Mean length of a cell along x and y [m]; each axis gets the nearest even number of cells."""
     layers: int
     spread: float
     """Length of the outermost cell over that of the innermost, along x and y."""
@@ -34,39 +34,39 @@ PAD_LEVELS = {
     "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
     "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
 }
-"""Names that ``pad=`` accepts; docs/soft-pad.md states the height error of each."""
+"""Named levels; docs/soft-pad.md has the height error of each."""
 
 
 @dataclass(frozen=True)
 class PadMesh:
-    """A pad that can be simulated, pad frame."""
+    """Mesh of a soft pad, pad frame."""
 
     tets: ipc.TetMesh
     coat: CoatMesh
     coat_vertices: np.ndarray
     """Vertex of ``tets`` under each vertex of ``coat``, shape (V,)."""
     bonded: np.ndarray
-    """Vertices of ``tets`` that are fixed to the case."""
+    """Numbers of the vertices of ``tets`` that are fixed to the case."""
     d_hat: float
     """Distance below which object and coat repel [m]."""
 
     def __post_init__(self) -> None:
         if len(self.bonded) == 0:
-            rule = "must name at least one vertex: a pad that nothing holds would be pushed away"
+            rule = "must name at least one vertex: a pad without one would be pushed away"
             raise InputError("bonded", value=[], rule=rule)
         if len(self.bonded) == len(self.tets.vertices):
             raise InputError("bonded", value=f"all {len(self.bonded)} vertices", rule="must leave vertices that can move")
 
 
 def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
-    """Cut the gelpad into tetrahedra, six a cell of a grid that follows the dome.
+    """Mesh of a gelpad: six tetrahedra to a cell of a grid that follows the dome.
 
-    Cells are mirror images of their neighbours (``ipc.box_mesh``): cut all the same way they would lock where the gel is nearly
-    incompressible (docs/soft-pad.md has the figures).
+    Cells are mirror images of their neighbours (``ipc.box_mesh``). If all were divided alike, nearly incompressible gel would lock
+    (docs/soft-pad.md has the figures).
 
     Args:
-        gelpad: size, thickness, dome, and what is bonded to the case: the back, or the back and the sides.
-        level: a name of ``PAD_LEVELS``, or a level of one's own.
+        gelpad: size, thickness, dome, and the faces bonded to the case: the back, or the back and the sides.
+        level: a name of ``PAD_LEVELS``, or a level.
 
     Raises:
         InputError: an unknown level, or one that leaves less than two cells along an axis.
@@ -99,7 +99,7 @@ def _lines(size: float, level: PadLevel) -> np.ndarray:
 
 
 def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarray:
-    """Triangles of the uppermost layer in its own vertex numbers, counter-clockwise seen from +z; shape (F, 3)."""
+    """Triangles (F, 3) of the uppermost layer, in its own numbers, counter-clockwise from +z."""
     faces = tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
     faces = faces[(faces >= first).all(axis=1)]
     a, b, c = (vertices[faces[:, k], :2] for k in range(3))
@@ -109,11 +109,11 @@ def _coat_faces(tets: np.ndarray, first: int, vertices: np.ndarray) -> np.ndarra
 
 
 _SHEAR_MARGIN = 1.2
-"""The tangential bound is the tightest, and a coarse mesh has more than the continuum."""
+"""The tangential bound is the tightest, and a coarse mesh is stiffer than the continuum."""
 
 
 def pad_stiffness(gelpad: GelpadSpec, area: float) -> np.ndarray:
-    """Bound (6, 6) of dF/dx of a contact of ``area`` [m²] that moves as one, pad axes, about its centre: [N/m], [N m/rad], diagonal.
+    """Upper bound (6, 6) of the stiffness of a rigid contact of ``area`` [m²], pad axes, about its centre: diagonal, [N/m], [N m/rad].
 
     The sum of two limits of a rigid flat punch of the same area, a = √(area/π), on a bonded layer of thickness t: one much wider than the
     layer (all strain confined: modulus M = E (1 − ν) / ((1 + ν)(1 − 2ν)), shear modulus G over the height t) and one much narrower

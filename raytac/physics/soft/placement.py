@@ -1,4 +1,4 @@
-"""Where a press has the object and the case: poses of a batch from first touch, depth, shear and twist."""
+"""Placement of a press: poses of object and case from first touch, shear and twist."""
 
 from __future__ import annotations
 
@@ -8,35 +8,36 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.physics.press import PressTargets, about_z
+from raytac.physics.press import PressTargets
 from raytac.physics.rigid.load_law import LoadLaw, first_touch_z, gap_at_touch
+from raytac.se3 import about_z
 from raytac.shapes.part import Part
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["SoftPlaces"]
+__all__ = ["PressPlacement"]
 
 
-class SoftPlaces:
-    """Places of one scene's object over one pad, for B environments with their own offsets."""
+class PressPlacement:
+    """Poses of one scene's object over one pad, for B environments with their own offsets."""
 
     def __init__(
         self, scene: PressScene, parts: Sequence[Part], gelpad: GelpadSpec, grid: PadGrid, targets: PressTargets
     ) -> None:
-        """Environments that are lost are put at the pad's middle.
+        """Find the first touch of every environment; lost ones are put at the pad's centre.
 
         Raises:
             SpecError: an object that does not start over the pad, or is sheared or twisted off it; names the scene's file and key.
-            InputError: the same of an environment that is there by its own offset, rotation, shear or twist; names both.
+            InputError: the same by an environment's own offset, rotation, shear or twist; names both.
         """
         self._targets, self._parts, self._gelpad, self._grid = targets, parts, gelpad, grid
         self._rotations = targets.rotations
         self._touches: dict[bytes, float] = {}
         start = np.asarray(scene.object.position[:2])
-        places = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
-        self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(places.tolist())])
+        centres = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
+        self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(centres.tolist())])
         """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
-        self._check_ways(scene)
+        self._check_stages(scene)
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
         """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
@@ -49,25 +50,21 @@ class SoftPlaces:
         return poses
 
     def case(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
-        """``world_from_pad`` (B, 4, 4) of a case that moves: the object stays where it is at first touch, as in ``PressRig``."""
+        """``world_from_pad`` (B, 4, 4) of a case that moves while the object stays at first touch, as in ``PressRig``."""
         poses = np.tile(np.eye(4), (len(height), 1, 1))
         for b, angle in enumerate(twist):
-            turn = about_z(-angle)
-            poses[b, :3, :3] = turn
-            poses[b, :3, 3] = self.origin[b] - turn @ (np.array([*shear[b], height[b]]) + self.origin[b])
+            rotation = about_z(-angle)
+            poses[b, :3, :3] = rotation
+            poses[b, :3, 3] = self.origin[b] - rotation @ (np.array([*shear[b], height[b]]) + self.origin[b])
         return poses
 
-    def lift(self, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
-        """How much lower than at the start the pad is first touched after a shear and twist [m], shape (B,)."""
-        return np.array(
-            [
-                at[2] - self._touch(b, at[0] + way[0], at[1] + way[1], angle)
-                for b, (at, way, angle) in enumerate(zip(self.origin, shear, twist, strict=True))
-            ]
-        )
+    def touch_drop(self, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
+        """Height of the first touch at the start less that after a shear and twist [m], shape (B,)."""
+        places = zip(self.origin, self.origin[:, :2] + shear, twist, strict=True)
+        return np.array([origin[2] - self._touch(b, x, y, angle) for b, (origin, (x, y), angle) in enumerate(places)])
 
     def stiffness(self, b: int, twist: float, force: float) -> float:
-        """Force over depth [N/m] that the bonded layer's law expects at ``force`` [N]: a start for a search."""
+        """Force over depth [N/m] by the bonded layer's law at ``force`` [N]: a first guess."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
         law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
@@ -79,7 +76,7 @@ class SoftPlaces:
         except InputError as error:
             raise self._targets.start_error(b, error) from error
 
-    def _check_ways(self, scene: PressScene) -> None:
+    def _check_stages(self, scene: PressScene) -> None:
         """Refuse shears and twists that end off the pad."""
         targets, shear, twist = self._targets, np.zeros((len(self.origin), 2)), np.zeros(len(self.origin))
         for index, stage in enumerate(scene.trajectory):
@@ -97,7 +94,7 @@ class SoftPlaces:
                     raise targets.stage_error(index, targets.stage(stage, b), b, error) from error
 
     def _touch(self, b: int, x: float, y: float, twist: float) -> float:
-        """Height of the object's origin at which it first touches the pad at rest [m]; kept, since environments share places."""
+        """Height of the object's origin at first touch [m]; cached, since environments share poses."""
         pose = np.eye(4)
         pose[:3, :3] = about_z(twist) @ self._rotations[b]
         pose[:2, 3] = x, y

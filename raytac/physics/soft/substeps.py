@@ -1,309 +1,248 @@
-"""Where pads and bodies of a soft scene go in a step: their poses, and into how many parts the step must be cut."""
+"""Substeps of a soft scene: division of a step where bodies are near each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 import ipc
 from raytac.errors import InputError
-from raytac.physics.soft.bodies import SceneBody
-from raytac.se3 import between, rotations
+from raytac.physics.soft.bodies import SceneBody, ScenePad
+from raytac.physics.soft.scene_state import Poses
+from raytac.physics.soft.settings import SubstepLimits
+from raytac.se3 import inverse, rotations, turn_angle
 
-if TYPE_CHECKING:
-    from raytac.physics.soft.scene import SoftScene
-from collections.abc import Sequence
+__all__ = ["BoxMotion", "Pair", "SceneQuery", "Substeps", "allowed_share"]
 
-from raytac.se3 import inverse, turn_angle
-
-__all__ = ["MOST_SUBSTEPS", "STEP", "TURN", "Mover", "Pair", "Poses", "SceneReport", "Travel", "allowed_share"]
-
-
-MOST_SUBSTEPS = 64
-"""Parts that one step may be cut into: 6.4 mm or 128° near something."""
-_REACH = 4.0
-"""Bodies closer than so many d̂ are near."""
+Pair = tuple[str, str]
+_NOTHING = 1e-15
+_CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)
 
 
-@dataclass(frozen=True)
-class Poses:
-    """Of all that is driven, ``world_from_…``."""
+class SceneQuery(Protocol):
+    """Present state of a scene, as ``Substeps`` asks for it."""
 
-    pads: np.ndarray
-    """(B, S, 4, 4)."""
-    bodies: dict[str, np.ndarray]
-    """(B, 4, 4) by name."""
+    world: ipc.World
+    settings: ipc.Settings
 
-    def copy(self) -> Poses:
-        return Poses(self.pads.copy(), {name: pose.copy() for name, pose in self.bodies.items()})
+    @property
+    def failed(self) -> np.ndarray: ...
 
-    def towards(self, goal: Poses, share: float) -> Poses:
-        """A share of the way to ``goal``."""
-        pads = [between(self.pads[:, k], goal.pads[:, k], share) for k in range(self.pads.shape[1])]
-        return Poses(np.stack(pads, axis=1), {name: between(self.bodies[name], p, share) for name, p in goal.bodies.items()})
-
-    def longest(self, goal: Poses, b: int) -> float:
-        """Longest way of any origin of environment ``b`` to ``goal`` [m]."""
-        ways = [np.linalg.norm((goal.pads - self.pads)[b, :, :3, 3], axis=-1).max()]
-        ways += [np.linalg.norm((goal.bodies[n] - p)[b, :3, 3]) for n, p in self.bodies.items()]
-        return float(max(ways))
+    def pose(self, name: str) -> np.ndarray: ...
 
 
-class Travel:
-    """Cuts the steps of a scene: half, a quarter and so on of it, never more than bodies that are near may move against each other."""
+class Substeps:
+    """Divides steps into halves, quarters and so on, so that near bodies move little in each."""
 
-    def __init__(self, scene: SoftScene) -> None:
-        self.scene = scene
-        pads, bodies = list(scene.pads), list(scene.bodies.values())
-        self.pairs: list[Pair] = [(a, b) for k, a in enumerate(pads) for b in pads[k + 1 :]]
-        self.pairs += [(a, b.name) for a in pads for b in bodies]
-        for k, a in enumerate(bodies):  # the solver alone sees to those that are both free; a half-space comes second
-            others = [b for b in bodies[k + 1 :] if a.is_driven != b.is_driven]
+    def __init__(
+        self, pads: Mapping[str, ScenePad], bodies: Mapping[str, SceneBody], query: SceneQuery, limits: SubstepLimits
+    ) -> None:
+        self.limits = limits
+        self._pads, self._bodies, self._query = pads, bodies, query
+        names, others = list(pads), list(bodies.values())
+        self.pairs: list[Pair] = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :]]
+        self.pairs += [(a, b.name) for a in names for b in others]
+        for k, a in enumerate(others):  # two free bodies are left to the solver; a half-space comes second
+            partners = [b for b in others[k + 1 :] if a.is_driven != b.is_driven]
             flip = isinstance(a.solid, ipc.HalfSpace)
-            self.pairs += [(b.name, a.name) if flip else (a.name, b.name) for b in others]
+            self.pairs += [(b.name, a.name) if flip else (a.name, b.name) for b in partners]
 
-    def part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
-        """How much of a step of ``dt`` [s] may be made next, and environments where even the least part is too much, with the pair.
+    def next_part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
+        """Part of a step of ``dt`` [s] that may be made next, and the environments that must be refused, with the pair that moves too far.
 
-        In ``MOST_SUBSTEPS``-ths, a power of two that ``done`` is a multiple of; what is too much counts for nothing in it. What no one
-        drives may be too fast (a beam that snaps back): that is the solver's to resolve, in the smallest parts.
+        Parts are counted in ``limits.most``-ths of the step; the result is a power of two that divides ``done``. Refused environments do
+        not limit it. Free bodies are never refused (a beam may snap back): the solver resolves them, in the smallest parts.
         """
-        room, pairs = self._room(done, self._movers(now, goal, dt * (1.0 - done / MOST_SUBSTEPS)))
+        most = self.limits.most
+        room, pairs = self._room(done, self._motions(now, goal, dt * (1.0 - done / most)))
         if (room < 1.0).any():
-            driven = self._room(done, self._movers(now, goal, 0.0))[0]
+            driven = self._room(done, self._motions(now, goal, 0.0))[0]
             room = np.where((room < 1.0) & (driven >= 1.0), 1.0, room)
-        least = room[room >= 1.0].min(initial=MOST_SUBSTEPS)
-        part = MOST_SUBSTEPS
+        least = room[room >= 1.0].min(initial=most)
+        part = most
         while part > least or done % part:
             part //= 2
         return part, {b: pairs[b] for b in np.flatnonzero(room < 1.0).tolist()}
 
-    def _room(self, done: int, movers: Mapping[str, Mover]) -> tuple[np.ndarray, list[Pair | None]]:
-        """Sixty-fourths of the step that these motions leave in every environment (B,), and the pairs that set it."""
-        pairs = [(a, b) for a, b in self.pairs if not (_is_still(movers[a]) and _is_still(movers[b]))]
-        share, limiting = allowed_share(movers, pairs, _REACH * self.scene.world.d_hat)
-        return (MOST_SUBSTEPS - done) * share * (1.0 + 1e-9), limiting
-
     def refusal(self, b: int, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
         """The error of a motion of environment ``b`` that cannot be resolved."""
-        where = f"in environment {b} " if self.scene.num_envs > 1 else ""
+        limits = self.limits
+        where = f"in environment {b} " if len(self._query.failed) > 1 else ""
         rule = (
             f"{where}takes {' and '.join(pair or ())} too far against each other where they are near: "
-            f"at most {MOST_SUBSTEPS * STEP * 1e3:.3g} mm "
-            f"or {np.degrees(MOST_SUBSTEPS * TURN):.3g} degrees in one step of {self.scene.settings.dt} s; move slower or in more steps"
+            f"at most {limits.most * limits.step * 1e3:.3g} mm "
+            f"or {np.degrees(limits.most * limits.turn):.3g} degrees in one step of {self._query.settings.dt} s; "
+            "move slower or in more steps"
         )
-        return InputError("world_from_pad", value=f"ways of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
+        return InputError("world_from_pad", value=f"displacements of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
-    def _movers(self, now: Poses, goal: Poses, left: float) -> dict[str, Mover]:
-        found = {}
-        for k, (name, pad) in enumerate(self.scene.pads.items()):
-            rest, at = pad.mesh.tets.vertices, self.scene.world.positions(name, frame="body")
-            low, high = np.minimum(rest.min(axis=0), at.min(axis=1)), np.maximum(rest.max(axis=0), at.max(axis=1))
-            found[name] = Mover(now.pads[:, k], goal.pads[:, k], low, high)
-        for name, body in self.scene.bodies.items():
-            found[name] = self._mover(body, now.bodies, goal.bodies, left)
-        failed = self.scene.failed[:, None, None]
-        if failed.any():  # nothing moves there, whatever speed it had
-            found = {name: replace(mover, end=np.where(failed, mover.start, mover.end)) for name, mover in found.items()}
-        return found
+    def _room(self, done: int, motions: Mapping[str, BoxMotion]) -> tuple[np.ndarray, list[Pair | None]]:
+        """Parts of the step that these motions allow, (B,), and the pairs that limit it."""
+        pairs = [(a, b) for a, b in self.pairs if not (motions[a].is_still() and motions[b].is_still())]
+        share, limiting = allowed_share(motions, pairs, self.limits.reach * self._query.world.d_hat, self.limits)
+        return (self.limits.most - done) * share * (1.0 + 1e-9), limiting
 
-    def _mover(self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], left: float) -> Mover:
-        name, solid, one = body.name, body.solid, np.ones((self.scene.num_envs, 1))
+    def _motions(self, now: Poses, goal: Poses, remaining: float) -> dict[str, BoxMotion]:
+        """Motions of pads and bodies to ``goal``; free ones keep their velocity, ``remaining`` [s]."""
+        motions = {}
+        for k, (name, pad) in enumerate(self._pads.items()):
+            rest, vertices = pad.mesh.tets.vertices, self._query.world.positions(name, frame="body")
+            low, high = np.minimum(rest.min(axis=0), vertices.min(axis=1)), np.maximum(rest.max(axis=0), vertices.max(axis=1))
+            motions[name] = BoxMotion(now.pads[:, k], goal.pads[:, k], low, high)
+        for name, body in self._bodies.items():
+            motions[name] = self._body_motion(body, now.bodies, goal.bodies, remaining)
+        failed = self._query.failed[:, None, None]
+        if failed.any():  # nothing moves there, whatever its velocity was
+            motions = {name: replace(motion, end=np.where(failed, motion.start, motion.end)) for name, motion in motions.items()}
+        return motions
+
+    def _body_motion(
+        self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], remaining: float
+    ) -> BoxMotion:
+        name, solid, ones = body.name, body.solid, np.ones((len(self._query.failed), 1))
         if isinstance(solid, ipc.HalfSpace):
-            return Mover(now[name], goal[name], 0.0 * one, 0.0 * one, is_plane=True)
-        start = now[name] if body.is_driven else self.scene.pose(name)
+            return BoxMotion(now[name], goal[name], 0.0 * ones, 0.0 * ones, is_plane=True)
+        start = now[name] if body.is_driven else self._query.pose(name)
         if isinstance(solid, ipc.SoftBody):
-            at = np.einsum("bji,bnj->bni", start[:, :3, :3], self.scene.world.positions(name) - start[:, None, :3, 3])
-            end = self._pulled(solid, start, goal[name], left) if body.is_driven else self._carried(name, start, left)
-            return Mover(start, end, at.min(axis=1), at.max(axis=1))
+            vertices = np.einsum("bji,bnj->bni", start[:, :3, :3], self._query.world.positions(name) - start[:, None, :3, 3])
+            end = (
+                self._contact_end(solid, start, goal[name], remaining)
+                if body.is_driven
+                else self._free_end(name, start, remaining)
+            )
+            return BoxMotion(start, end, vertices.min(axis=1), vertices.max(axis=1))
         vertices = solid.surface.vertices
-        end = goal[name] if body.is_driven else self._carried(name, start, left)
-        return Mover(start, end, one * vertices.min(axis=0), one * vertices.max(axis=0))
+        end = goal[name] if body.is_driven else self._free_end(name, start, remaining)
+        return BoxMotion(start, end, ones * vertices.min(axis=0), ones * vertices.max(axis=0))
 
-    def _carried(self, name: str, start: np.ndarray, left: float) -> np.ndarray:
-        """Where a free body's momentum takes its pose in the time ``left`` [s]."""
-        motion = self.scene.world.rigid_motion(name)
-        return _moved(start, motion.centre, left * motion.velocity, left * motion.spin)
+    def _free_end(self, name: str, start: np.ndarray, remaining: float) -> np.ndarray:
+        """Pose of a free body after the ``remaining`` time [s] at its present momentum."""
+        motion = self._query.world.rigid_motion(name)
+        return _move(start, motion.centre, remaining * motion.velocity, remaining * motion.spin)
 
-    def _pulled(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, left: float) -> np.ndarray:
-        """The same of a soft body that is held somewhere: its places in contact, as they move now; without any, it is where it is held."""
-        world = self.scene.world
+    def _contact_end(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, remaining: float) -> np.ndarray:
+        """Pose of a driven soft body whose contact keeps its velocity; ``goal`` without contact."""
+        world = self._query.world
         load = np.linalg.norm(world.contact_forces(solid.name), axis=2)
         touched = load.sum(axis=1) > 0.0
         if not touched.any():
             return goal
         nodes = world.surface(solid.name)[0]
         x, v = world.positions(solid.name)[:, nodes], world.velocities(solid.name)[:, nodes]
-        share = load / np.where(touched, load.sum(axis=1), 1.0)[:, None]
-        centre, velocity = np.einsum("bn,bni->bi", share, x), np.einsum("bn,bni->bi", share, v)
+        weight = load / np.where(touched, load.sum(axis=1), 1.0)[:, None]
+        centre, velocity = np.einsum("bn,bni->bi", weight, x), np.einsum("bn,bni->bi", weight, v)
         arm = x - centre[:, None]
-        second = np.einsum("bn,bni,bnj->bij", share, arm, arm) + 1e-12 * np.eye(3)
+        second = np.einsum("bn,bni,bnj->bij", weight, arm, arm) + 1e-12 * np.eye(3)
         inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-        momentum = np.einsum("bn,bni->bi", share, np.cross(arm, v - velocity[:, None]))
+        momentum = np.einsum("bn,bni->bi", weight, np.cross(arm, v - velocity[:, None]))
         spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
-        return np.where(touched[:, None, None], _moved(start, centre, left * velocity, left * spin), goal)
-
-
-def _moved(poses: np.ndarray, centre: np.ndarray, way: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Poses (B, 4, 4) after a turn about a centre [m] and a way, (B, 3) each."""
-    rotation, found = rotations(turn), poses.copy()
-    found[:, :3, :3] = rotation @ poses[:, :3, :3]
-    found[:, :3, 3] = centre + way + np.einsum("bij,bj->bi", rotation, poses[:, :3, 3] - centre)
-    return found
-
-
-def _is_still(mover: Mover) -> bool:
-    return np.array_equal(mover.start, mover.end)
+        return np.where(touched[:, None, None], _move(start, centre, remaining * velocity, remaining * spin), goal)
 
 
 @dataclass(frozen=True)
-class SceneReport:
-    """One step of B environments, all of its parts together; every array has shape (B,).
-
-    failed: a number was not finite; the environment stays as it was until it is reset. converged: every part met its tolerance.
-    unconverged: how many parts of an environment that has not failed did not. last_converged: whether the last part did.
-    min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a part's motion that was refused because it would crush what is in the way. newton: iterations. elastic, barrier: energies at the
-    end [J]. substeps: parts of the step.
-    """
-
-    failed: np.ndarray
-    converged: np.ndarray
-    unconverged: np.ndarray
-    last_converged: np.ndarray
-    min_gap: np.ndarray
-    min_det: np.ndarray
-    blocked: np.ndarray
-    newton: np.ndarray
-    elastic: np.ndarray
-    barrier: np.ndarray
-    substeps: int
-
-    def then(self, later: SceneReport) -> SceneReport:
-        """Both parts of a step as one."""
-        return SceneReport(
-            self.failed | later.failed,
-            self.converged & later.converged,
-            self.unconverged + later.unconverged,
-            later.last_converged,
-            np.minimum(self.min_gap, later.min_gap),
-            np.minimum(self.min_det, later.min_det),
-            np.maximum(self.blocked, later.blocked),
-            self.newton + later.newton,
-            later.elastic,
-            later.barrier,
-            self.substeps + later.substeps,
-        )
-
-
-STEP = 1e-4
-"""Longest relative way of two bodies that may touch, in one step of the solver [m]."""
-TURN = 0.035
-"""Largest relative turn in one step [rad]: 0.1 mm at 3 mm from the axis."""
-_NOTHING = 1e-15
-_CLEAR = 1e-3
-"""Two boxes that one face's normal keeps so far apart, before and after, do not meet on the way [m]."""
-_CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)
-
-
-@dataclass(frozen=True)
-class Mover:
-    """A box that goes from one pose to another, in B environments; or a half-space, z <= 0 of its frame."""
+class BoxMotion:
+    """Motion of a box, or of a half-space z <= 0 of its frame, in B environments."""
 
     start: np.ndarray
     """``world_from_box`` (B, 4, 4)."""
     end: np.ndarray
-    """Where it is told to be, or where its velocity takes it."""
+    """The same where it is driven to, or where its velocity takes it."""
     low: np.ndarray
     high: np.ndarray
-    """Corners of the box in its frame [m], (B, 3) each; of a half-space not used."""
+    """Corners of the box in its frame [m], (B, 3) each; not used of a half-space."""
     is_plane: bool = False
 
     def corners(self) -> np.ndarray:
         """(B, 8, 3) [m], in its frame."""
         return self.low[:, None] + _CORNERS * (self.high - self.low)[:, None]
 
+    def is_still(self) -> bool:
+        return np.array_equal(self.start, self.end)
 
-Pair = tuple[str, str]
 
+def allowed_share(
+    motions: Mapping[str, BoxMotion], pairs: Sequence[Pair], reach: float, limits: SubstepLimits
+) -> tuple[np.ndarray, list[Pair | None]]:
+    """Largest share of all motions, in (0, 1], that takes no pair too far, and that pair, (B,).
 
-def allowed_share(movers: Mapping[str, Mover], pairs: Sequence[Pair], reach: float) -> tuple[np.ndarray, list[Pair | None]]:
-    """Largest share of all ways, in (0, 1], that brings no pair of bodies too far in one step, and the pair that sets it, by environment.
-
-    Two bodies whose boxes are ``reach`` [m] apart or more may come that much nearer in one step; closer ones move by at most ``STEP``
-    and ``TURN`` against each other. The distance of two boxes is bounded from below by their separation along the normals of their
-    faces; boxes that one of these keeps a millimetre apart at both ends of the way are free to go. The first of a pair must not be a
-    half-space.
+    Two bodies whose boxes are farther apart than ``reach`` [m] may use up the excess. Closer ones move by at most ``limits.step`` and
+    ``limits.turn`` against each other. The distance of two boxes is bounded from below by their separation along the normals of their
+    faces (conservative advancement). Boxes that one of these keeps ``limits.clear`` apart at both ends of the motion may move freely. The
+    first of a pair must not be a half-space.
     """
-    batch = len(next(iter(movers.values())).start)
+    batch = len(next(iter(motions.values())).start)
     least = np.ones(batch)
     limiting: list[Pair | None] = [None] * batch
     for pair in pairs:
-        a, b = (movers[name] for name in pair)
-        if b.is_plane:
-            gap, way, turn, free_way = _against_plane(a, b)
-        else:
-            gap, way, turn, free_way = _against_box(a, b)
-        near = np.minimum(STEP / np.maximum(way, _NOTHING), TURN / np.maximum(turn, _NOTHING))
-        far = np.maximum(gap - reach, 0.0) / np.maximum(free_way, _NOTHING)
+        a, b = (motions[name] for name in pair)
+        gaps, slide, travel, turn = _plane_gaps(a, b) if b.is_plane else _box_gaps(a, b)
+        # One normal that separates the two at the start and at the end does so all along.
+        closing = np.where(gaps.min(axis=0).max(axis=1) > limits.clear, 0.0, travel)
+        near = np.minimum(limits.step / np.maximum(slide, _NOTHING), limits.turn / np.maximum(turn, _NOTHING))
+        far = np.maximum(gaps[0].max(axis=1) - reach, 0.0) / np.maximum(closing, _NOTHING)
         share = np.maximum(near, far)
-        for b in np.flatnonzero(share < least).tolist():
-            least[b], limiting[b] = share[b], pair
+        for env in np.flatnonzero(share < least).tolist():
+            least[env], limiting[env] = share[env], pair
     return least, limiting
 
 
-def _place(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (B, n, 3) through poses (B, 4, 4)."""
-    return np.einsum("bij,bnj->bni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-
-
-def _against_plane(a: Mover, plane: Mover) -> tuple[np.ndarray, ...]:
+def _plane_gaps(a: BoxMotion, plane: BoxMotion) -> tuple[np.ndarray, ...]:
+    """As ``_box_gaps``, of a box and a half-space: its one normal, and the box's lowest corner."""
     before, after = (inverse(p) @ t for p, t in ((plane.start, a.start), (plane.end, a.end)))
-    there, then = (_place(pose, a.corners()) for pose in (before, after))
-    moved = np.linalg.norm(then - there, axis=2)
-    lowest = there[:, :, 2].argmin(axis=1)
-    one = np.arange(len(there))
-    turn = _turn(before, after)
-    gaps = np.stack([there[:, :, 2].min(axis=1), then[:, :, 2].min(axis=1) - _bulge(there, then, turn)])
-    return gaps[0], moved[one, lowest], turn, _free_way(moved.max(axis=1), gaps[:, :, None])
+    start, end = (_transform(pose, a.corners()) for pose in (before, after))
+    length, turn = np.linalg.norm(end - start, axis=2), _relative_turn(before, after)
+    lowest = start[:, :, 2].argmin(axis=1)
+    gaps = np.stack([start[:, :, 2].min(axis=1), end[:, :, 2].min(axis=1) - _chord_error(start, end, turn)])
+    return gaps[:, :, None], length[np.arange(len(start)), lowest], length.max(axis=1), turn
 
 
-def _against_box(a: Mover, b: Mover) -> tuple[np.ndarray, ...]:
+def _box_gaps(a: BoxMotion, b: BoxMotion) -> tuple[np.ndarray, ...]:
+    """Relative motion of two boxes.
+
+    Returns their separation along every face normal at the start and at the end [m], (2, B, 12); the displacement where they may meet
+    [m], (B,); the longest of any corner [m], (B,); and the rotation [rad], (B,).
+    """
     before, after = (inverse(p) @ t for p, t in ((b.start, a.start), (b.end, a.end)))
-    there, then = (_place(pose, a.corners()) for pose in (before, after))
-    moved = np.linalg.norm(then - there, axis=2).max(axis=1)
-    back, later = (_place(inverse(pose), b.corners()) for pose in (before, after))
-    turn = _turn(before, after)
-    bulge = np.maximum(_bulge(there, then, turn), _bulge(back, later, turn))
-    gaps = np.stack([_apart(there, b), _apart(then, b) - bulge[:, None]])
-    gaps = np.concatenate([gaps, np.stack([_apart(back, a), _apart(later, a) - bulge[:, None]])], axis=2)
-    # Where they may meet: the middle of what the second box and the first's own have in common, as seen from the first.
-    middle = 0.5 * (np.clip(back.min(axis=1), a.low, a.high) + np.clip(back.max(axis=1), a.low, a.high))[:, None]
-    way = np.linalg.norm((_place(after, middle) - _place(before, middle))[:, 0], axis=1)
-    return gaps[0].max(axis=1), way, turn, _free_way(moved, gaps)
+    start, end = (_transform(pose, a.corners()) for pose in (before, after))
+    b_start, b_end = (
+        _transform(inverse(pose), b.corners()) for pose in (before, after)
+    )  # of the second box, as the first sees it
+    longest, turn = np.linalg.norm(end - start, axis=2).max(axis=1), _relative_turn(before, after)
+    error = np.maximum(_chord_error(start, end, turn), _chord_error(b_start, b_end, turn))[:, None]
+    of_a = np.stack([_separation(start, b), _separation(end, b) - error])
+    of_b = np.stack([_separation(b_start, a), _separation(b_end, a) - error])
+    # They may meet at the centre of the overlap of both boxes, in the first one's frame.
+    centre = 0.5 * (np.clip(b_start.min(axis=1), a.low, a.high) + np.clip(b_start.max(axis=1), a.low, a.high))[:, None]
+    slide = np.linalg.norm((_transform(after, centre) - _transform(before, centre))[:, 0], axis=1)
+    return np.concatenate([of_a, of_b], axis=2), slide, longest, turn
 
 
-def _apart(points: np.ndarray, box: Mover) -> np.ndarray:
+def _separation(points: np.ndarray, box: BoxMotion) -> np.ndarray:
     """Separation of points (B, n, 3) from a box along each of its six normals [m], (B, 6)."""
     return np.concatenate([box.low - points.max(axis=1), points.min(axis=1) - box.high], axis=1)
 
 
-def _free_way(moved: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-    """The way ``moved`` (B,) that may use up a gap; 0 where one normal separates the two at the start and at the end, so all along.
-
-    ``gaps``: start and end, (2, B, normals) [m].
-    """
-    return np.where(gaps.min(axis=0).max(axis=1) > _CLEAR, 0.0, moved)
+def _chord_error(start: np.ndarray, end: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Greatest distance of a rotating corner from the straight line between its ends [m], (B,)."""
+    radius = np.maximum(np.linalg.norm(start, axis=2).max(axis=1), np.linalg.norm(end, axis=2).max(axis=1))
+    return radius * (1.0 - np.cos(0.5 * turn))
 
 
-def _bulge(there: np.ndarray, then: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """How far the way of a turning box can leave its chord [m], (B,)."""
-    reach = np.maximum(np.linalg.norm(there, axis=2).max(axis=1), np.linalg.norm(then, axis=2).max(axis=1))
-    return reach * (1.0 - np.cos(0.5 * turn))
-
-
-def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def _relative_turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return turn_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+
+
+def _transform(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (B, n, 3) through poses (B, 4, 4)."""
+    return np.einsum("bij,bnj->bni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+
+
+def _move(poses: np.ndarray, centre: np.ndarray, displacement: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Poses (B, 4, 4) after a rotation vector about a centre and a displacement, (B, 3) each."""
+    rotation, result = rotations(turn), poses.copy()
+    result[:, :3, :3] = rotation @ poses[:, :3, :3]
+    result[:, :3, 3] = centre + displacement + np.einsum("bij,bj->bi", rotation, poses[:, :3, 3] - centre)
+    return result

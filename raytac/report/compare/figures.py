@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from raytac.report.compare.metrics import known, resolutions, select, summaries
-from raytac.report.compare.modes import FAMILIES
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import Comparison
+from raytac.report.compare.store import Row
 
 __all__ = ["error_range", "signed_error", "write_pareto", "write_sheet_of_scene"]
 
@@ -34,57 +34,70 @@ STYLE: dict[Any, Any] = {
     "ytick.labelsize": 7,
     "savefig.dpi": 300,
 }
-# Colours of Okabe and Ito, told apart by marker and line too.
-LOOK: dict[str, tuple[str, str, Any]] = {
-    "fast": ("#0072B2", "o", "none"),
-    "fast_4_rays": ("#0072B2", "D", "none"),
-    "reference": ("#009E73", "^", "-"),
-    "reference_denoised": ("#56B4E9", "v", "--"),
-    "path": ("#D55E00", "s", "-"),
-    "taxim": ("#CC79A7", "P", "none"),
-    "taxim_shadow": ("#CC79A7", "X", "none"),
-    "phong": ("#E69F00", "*", "none"),
-    "peer": ("#000000", "|", ":"),
-    "peer_shadow": ("#000000", "|", "--"),
-}
-NAMED_BELOW = ("fast_4_rays", "taxim_shadow", "peer_shadow")
-"""Modes that lie close to the one that they vary: their names go below the point."""
-SHORT = {"fast": "fast", "fast_4_rays": "4 rays", "taxim": "table", "taxim_shadow": "+ shadow", "phong": "Phong"}
-"""Labels of points that are not part of a sweep."""
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
+"""Colours of Okabe and Ito, which families take in turn; markers tell them apart too."""
+MARKERS = ("o", "D", "^", "v", "s", "P", "X", "*", "h", "<", ">")
 PANELS = (("frame_mae", "whole frame"), ("contact_mae", "contact"), ("ring_mae", "shadow ring"))
 
 
+@dataclass(frozen=True)
+class Look:
+    """How a family of modes is drawn."""
+
+    colour: str
+    marker: str
+    line: Any
+    named_below: bool
+    """Its name goes below the point: every second one, so that names of neighbours do not meet."""
+    words: str
+    timed_only: bool
+    """It has no error against our reference."""
+
+
 def write_pareto(comparison: Comparison, path: Path) -> None:
-    """Error against time of a frame, log axes: a row of panels a resolution; whole frame, contact and shadow ring beside each other.
+    """Error against time of a frame, with log axes: a row of panels a resolution.
+
+    Whole frame, contact and shadow ring are beside each other.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
-    the mean noise of the reference, below which no error can be told.
+    the mean noise of the reference, below which no error can be resolved.
     """
     rows, names = comparison.rows, resolutions(comparison.rows)
-    shown = list(dict.fromkeys(summary.family for summary in summaries(rows)))
+    looks = _looks(rows)
     columns = 4
     with matplotlib.rc_context(STYLE):
-        height = 0.35 + 0.17 * math.ceil(len(shown) / columns) + 2.3 * len(names)
+        height = 0.35 + 0.17 * math.ceil(len(looks) / columns) + 2.3 * len(names)
         figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
         grid = figure.subplots(len(names), len(PANELS), squeeze=False, sharex="row", sharey="row")
         for line, resolution in zip(grid, names, strict=True):
             here = select(rows, resolution=resolution)
             _scales(line[0], here)
             for axes, (column, title) in zip(line, PANELS, strict=True):
-                _panel(axes, here, column)
+                _panel(axes, here, column, looks)
                 axes.set_title(f"{title}, {resolution.replace('x', ' × ')}")
                 axes.set_xlabel("time of a frame, batch 1 [ms]")
             line[0].set_ylabel("MAE [levels of 255]")
-        handles = [_handle(family) for family in shown]
+        handles = [_handle(look) for look in looks.values()]
         figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
         figure.savefig(path)
 
 
-def _handle(family: str) -> Line2D:
-    colour, marker, line = LOOK[family]
-    if family.startswith("peer"):
-        return Line2D([], [], color=colour, linestyle=line, linewidth=0.8, label=f"{FAMILIES[family]}: time only")
-    return Line2D([], [], color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=4.5, label=FAMILIES[family])
+def _looks(rows: Sequence[Row]) -> dict[str, Look]:
+    """How every family is drawn, in the order of the rows."""
+    looks: dict[str, Look] = {}
+    for s in summaries(rows):
+        if s.family not in looks:
+            k, timed = len(looks), not s.errors
+            line = (":" if timed else "none") if s.spp is None else ("-" if s.unbiased else "--")
+            looks[s.family] = Look(COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)], line, k % 2 == 1, s.words, timed)
+    return looks
+
+
+def _handle(look: Look) -> Line2D:
+    if look.timed_only:
+        return Line2D([], [], color=look.colour, linestyle=look.line, linewidth=0.8, label=f"{look.words}: time only")
+    style: dict[str, Any] = {"marker": look.marker, "linestyle": look.line, "linewidth": 1.0, "markersize": 4.5}
+    return Line2D([], [], color=look.colour, label=look.words, **style)
 
 
 def _scales(axes: Axes, rows: Sequence[Row]) -> None:
@@ -101,24 +114,27 @@ def _scales(axes: Axes, rows: Sequence[Row]) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _panel(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    found = summaries(rows)
-    for family in dict.fromkeys(summary.family for summary in found):
-        colour, marker, line = LOOK[family]
-        if family.startswith("peer"):
-            for s in (s for s in found if s.family == family):
+def _panel(axes: Axes, rows: Sequence[Row], column: str, looks: dict[str, Look]) -> None:
+    all_summaries = summaries(rows)
+    for family in dict.fromkeys(summary.family for summary in all_summaries):
+        look = looks[family]
+        colour, marker, line = look.colour, look.marker, look.line
+        if look.timed_only:
+            for s in (s for s in all_summaries if s.family == family):
                 axes.axvline(s.ms, color=colour, linestyle=line, linewidth=0.8, zorder=1)
             continue
-        points = sorted((s for s in found if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0)
+        points = sorted(
+            (s for s in all_summaries if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0
+        )
         for s in points:
             values = known(select(rows, mode=s.mode), column)
             axes.plot([s.ms, s.ms], [min(values), max(values)], color=colour, linewidth=0.6, alpha=0.5, zorder=2)
-            label = SHORT[s.family] if s.spp is None else f"{s.spp}"
+            label = s.short if s.spp is None else f"{s.spp}"
             place: dict[str, Any] = {"xytext": (3.5, 2.5), "textcoords": "offset points"}
             # To the left where the right half of the panel would cut it off.
             if s.spp is None and s.ms > math.sqrt(axes.get_xlim()[0] * axes.get_xlim()[1]):
                 place |= {"xytext": (-3.5, 2.5), "ha": "right"}
-            if s.family in NAMED_BELOW:
+            if look.named_below:
                 place["xytext"] = (place["xytext"][0], -8.0)
             axes.annotate(label, (s.ms, s.errors[column]), fontsize=6, color=colour, zorder=4, **place)
         x, y = [s.ms for s in points], [s.errors[column] for s in points]
@@ -163,8 +179,8 @@ def write_sheet_of_scene(comparison: Comparison, scene: str, resolution: str, pa
         figure = Figure(figsize=(WIDTH_IN, total))
 
         def cell(k: int, lower: bool) -> Axes:
-            left, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
-            axes = figure.add_axes((left / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
+            x, top = (k % columns) * (wide + gap), (k // columns) * line_in + caption + lower * (high + gap)
+            axes = figure.add_axes((x / WIDTH_IN, 1 - (top + high) / total, wide / WIDTH_IN, high / total))
             axes.set_axis_off()
             return axes
 

@@ -1,4 +1,7 @@
-"""How far the cheap marker models are from surface tracking: presses of the simulated pad that no fit has seen, error beside time."""
+"""Error and time of the cheap marker models against surface tracking.
+
+They are measured on presses of the soft pad that no fit has seen.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from raytac.io.metrics import Metric
-from raytac.report.markers import TESTED, error_metrics, press_all
+from raytac.report.markers import error_metrics, press_all
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -17,19 +20,19 @@ if TYPE_CHECKING:
 __all__ = ["PAD", "MarkerErrors", "held_out_frames", "marker_error_metrics", "marker_errors"]
 
 PAD = "medium"
-"""Level of the simulated pad where none is asked for: the one that shipped marker motion was fitted to."""
+"""Level of the soft pad where none is asked for: the one that shipped marker motion was fitted to."""
 
 
 @dataclass(frozen=True)
 class MarkerErrors:
-    """Every model of ``raytac.report.markers.TESTED`` against surface tracking."""
+    """Every model that needs no coat against surface tracking."""
 
     pad: str
-    """How finely the simulated pad was cut whose surface is the truth."""
+    """Mesh level of the soft pad whose surface is the reference."""
     probes: int
     """Markers that errors are averaged over, on a 1 mm grid over the view."""
     presses: tuple[str, ...]
-    """What was pressed, in words."""
+    """The presses in words."""
     errors: tuple[ModelError, ...]
     """By model and kind of load; the model ``surface`` has no row, since it is the truth."""
     times_ms: dict[str, float]
@@ -52,7 +55,7 @@ class MarkerErrors:
 
 
 def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = False) -> list[PressFrame]:
-    """States of the presses that no fit sees, on the simulated pad of level ``pad``; ``quick``: few of them.
+    """States of the presses that no fit sees, on the soft pad of level ``pad``; ``quick``: few of them.
 
     Raises:
         RaytacError: a press did not settle, or fits nowhere on this sensor.
@@ -60,7 +63,7 @@ def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = 
     """
     from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
 
-    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=False)
+    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=True)
 
 
 def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, device: str) -> MarkerErrors:
@@ -69,7 +72,7 @@ def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, dev
     Args:
         sensor: with a marker motion; its own pattern does not matter.
         frames: whole presses, in order.
-        pad: level of the simulated pad that they come from.
+        pad: level of the soft pad that they come from.
         device: ``auto``, ``cpu`` or ``cuda``.
 
     Raises:
@@ -78,18 +81,18 @@ def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, dev
     """
     from raytac.markers.calibration import model_errors, probe_sensor
 
-    errors, times = model_errors(sensor, frames, frames[0].surface.grid, models=TESTED, device=device)
+    errors, times = model_errors(sensor, frames, frames[0].surface.grid, device=device)
     probes = probe_sensor(sensor).markers
     presses = tuple(dict.fromkeys(str(frame.press) for frame in frames))
     return MarkerErrors(pad, probes.rows * probes.columns, presses, tuple(errors), times)
 
 
-def marker_error_metrics(found: MarkerErrors | None) -> dict[str, Metric]:
+def marker_error_metrics(errors: MarkerErrors | None) -> dict[str, Metric]:
     """``markers.<pad>.<model>.<load>.<figure>`` and ``markers.<pad>.<model>.ms_per_frame``; nothing of None."""
-    if found is None:
+    if errors is None:
         return {}
-    key = f"markers.{found.pad}"
-    metrics: dict[str, Metric] = {f"{key}.probes": found.probes, f"{key}.presses": len(found.presses)}
-    for row in found.errors:
+    key = f"markers.{errors.pad}"
+    metrics: dict[str, Metric] = {f"{key}.probes": errors.probes, f"{key}.presses": len(errors.presses)}
+    for row in errors.errors:
         metrics |= error_metrics(f"{key}.{row.model}.{row.load}", row)
-    return metrics | {f"{key}.{model}.ms_per_frame": ms for model, ms in found.times_ms.items() if math.isfinite(ms)}
+    return metrics | {f"{key}.{model}.ms_per_frame": ms for model, ms in errors.times_ms.items() if math.isfinite(ms)}

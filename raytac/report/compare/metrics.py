@@ -11,8 +11,8 @@ import numpy as np
 from raytac.io.metrics import Metric
 from raytac.report.compare.marker_error import marker_error_metrics
 from raytac.report.compare.physics_error import physics_metrics
-from raytac.report.compare.row_store import Row
 from raytac.report.compare.run import REGIONS, Comparison
+from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
 
 __all__ = [
@@ -28,8 +28,6 @@ __all__ = [
 ]
 
 
-UNBIASED = ("reference", "path")
-"""Families whose error falls as 1/√spp, so that it may be extrapolated."""
 KEYS = {"mae": "mae_levels", "rmse": "rmse_levels", "psnr": "psnr_db", "ssim": "ssim", "flip": "flip"}
 
 
@@ -57,6 +55,11 @@ class Summary:
     mode: str
     family: str
     label: str
+    words: str
+    """The family for a reader."""
+    short: str
+    """Label of its point in a figure."""
+    unbiased: bool
     spp: int | None
     device: str
     scenes: int
@@ -71,7 +74,7 @@ class Summary:
     """``frame_mae`` …: means over scenes; RMSE and the PSNR that follows from it: over the mean square; worst scene's PSNR:
     ``frame_psnr_worst``."""
     at_noise: bool
-    """Whether the noise of the reference makes up half of the mean square error in some scene."""
+    """True if the noise of the reference makes up half of the mean square error in some scene."""
 
 
 def summaries(rows: Sequence[Row]) -> list[Summary]:
@@ -105,6 +108,9 @@ def _summary(rows: list[Row]) -> Summary:
         mode=str(first["mode"]),
         family=str(first["family"]),
         label=str(first["label"]),
+        words=str(first["words"]),
+        short=str(first["short"]),
+        unbiased=first["unbiased"] is True,
         spp=None if first["spp"] is None else int(first["spp"]),
         device=str(first["device"]),
         scenes=len(rows),
@@ -121,7 +127,7 @@ def _summary(rows: list[Row]) -> Summary:
 
 @dataclass(frozen=True)
 class EqualError:
-    """What a sampled family costs at the error of ``fast`` in one scene."""
+    """Cost of a sampled family at the error of ``fast`` in one scene."""
 
     resolution: str
     scene: str
@@ -141,23 +147,24 @@ def equal_errors(rows: Sequence[Row]) -> list[EqualError]:
 
     A denoised image is biased, so that its error need not fall on: beyond the last measured point nothing is said of it.
     """
-    found = []
+    costs = []
+    families = dict.fromkeys(str(row.figures["family"]) for row in rows if row.figures["spp"] is not None)
     for resolution in resolutions(rows):
         for fast in select(rows, resolution=resolution, mode="fast"):
             scene, target, ms = fast.figures["scene"], float(fast.figures["frame_rmse"] or 0), float(fast.figures["ms"] or 0)
-            for family in ("reference", "reference_denoised", "path"):
+            for family in families:
                 sampled = select(rows, resolution=resolution, scene=scene, family=family)
                 sampled.sort(key=lambda row: int(row.figures["spp"] or 0))
                 if sampled and target > 0:
-                    found.append(_equal_error(resolution, str(scene), family, target, ms, sampled))
-    return found
+                    costs.append(_equal_error(resolution, str(scene), family, target, ms, sampled))
+    return costs
 
 
 def _equal_error(resolution: str, scene: str, family: str, target: float, ms: float, sampled: list[Row]) -> EqualError:
     spp = [int(row.figures["spp"] or 0) for row in sampled]
     errors, times = known(sampled, "frame_rmse"), known(sampled, "ms")
     reached = target >= errors[-1]
-    if not reached and family not in UNBIASED:
+    if not reached and not sampled[0].figures["unbiased"]:
         return EqualError(resolution, scene, family, target, None, None, "not reached")
     wanted = spp_for_error(spp, errors, target)
     how = "interpolated" if reached else "extrapolated as 1/√spp"
@@ -219,32 +226,32 @@ def _key(family: str, device: object, resolution: object, spp: object) -> str:
 
 
 def _row_metrics(row: Row) -> dict[str, Metric]:
-    figures, found = row.figures, {}
+    figures, metrics = row.figures, {}
     scene = figures["scene"]
     key = _key(str(figures["family"]), figures["device"], figures["resolution"], figures["spp"])
-    found[f"{key}.ms.{scene}"] = figures["ms"]
+    metrics[f"{key}.ms.{scene}"] = figures["ms"]
     for region in REGIONS:
         prefix = "" if region == "frame" else f"{region}_"
         for metric in METRICS:
-            found[f"{key}.{prefix}{KEYS[metric]}.{scene}"] = figures[f"{region}_{metric}"]
+            metrics[f"{key}.{prefix}{KEYS[metric]}.{scene}"] = figures[f"{region}_{metric}"]
     if figures["family"] == "fast":
         base = f"reference.{figures['resolution']}"
-        found[f"{base}.noise_levels.{scene}"] = figures["noise_frame_rmse"]
-        found[f"{base}.noise_psnr_db.{scene}"] = figures["noise_frame_psnr"]
-    return {name: value for name, value in found.items() if isinstance(value, (int, float, str))}
+        metrics[f"{base}.noise_levels.{scene}"] = figures["noise_frame_rmse"]
+        metrics[f"{base}.noise_psnr_db.{scene}"] = figures["noise_frame_psnr"]
+    return {name: value for name, value in metrics.items() if isinstance(value, (int, float, str))}
 
 
 def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
     """Time of the package over ours at the largest resolution that both ran at, medians over scenes, batch 1."""
-    found: dict[str, Metric] = {}
+    metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
         ours, peers = (
             known(select(rows, resolution=resolution, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer")
         )
         if ours and peers:
-            found[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
-            found[f"taxim{shadow}.vs_peer_resolution"] = resolution
-    return found
+            metrics[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
+            metrics[f"taxim{shadow}.vs_peer_resolution"] = resolution
+    return metrics
 
 
 def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) -> float:

@@ -1,35 +1,22 @@
-"""Which optical modes a comparison measures, with which settings."""
+"""Which optical modes a comparison measures, with which settings: all that are registered, and the package ``taxim``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from raytac.errors import BackendError
 from raytac.gel.surface import GelSurface
+from raytac.optics.base import Variant
+from raytac.optics.registry import OPTICS
 from raytac.report.tracers import Tracers
-from raytac.sensor import TactileSensor
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsImages
-    from raytac.optics.trace.fast_tracer import RayTracer
 
-__all__ = ["FAMILIES", "Mode", "SampledMode", "Setting", "comparison_modes"]
-
-FAMILIES = {
-    "fast": "raytac fast",
-    "fast_4_rays": "raytac fast, 4 rays a pixel",
-    "reference": "raytac reference",
-    "reference_denoised": "raytac reference, denoised",
-    "path": "Mitsuba path",
-    "taxim": "Taxim table",
-    "taxim_shadow": "Taxim table with shadow",
-    "phong": "Phong",
-    "peer": "taxim package",
-    "peer_shadow": "taxim package with shadow",
-}
-"""Name in keys and files, and in words, of every kind of mode; a sampled family has one mode for each number of samples a pixel."""
+__all__ = ["Mode", "Setting", "comparison_modes"]
 
 
 @dataclass(frozen=True)
@@ -46,14 +33,20 @@ class Mode:
     """One way to make images: a label, and what builds it."""
 
     family: str
-    """One of ``FAMILIES``."""
+    """Name in keys and files; a sampled family has one mode for each number of samples a pixel."""
     build: Callable[[Setting], OpticalMode]
     """Raises RaytacError where the mode cannot run."""
-    code: tuple[str, ...]
+    code: Callable[[], tuple[str, ...]]
     """Modules whose source, with all that they import, shapes the image and its time."""
+    words: str = ""
+    """The family for a reader; its name if empty."""
+    short: str = ""
+    """Label of its point in a figure; its name if empty."""
     spp: int | None = None
     """Samples a pixel, None for a mode without noise."""
-    options: dict[str, Any] = field(default_factory=dict)
+    unbiased: bool = False
+    """Whether the error of a sampled family falls as 1/√spp, so that it may be extrapolated."""
+    options: str = ""
     """Settings as they go into the key of a row."""
     prepare: Callable[[Setting], object] | None = None
     """Work before the first image whose result stays on disk for later processes, such as baking a table; it is not timed."""
@@ -70,93 +63,60 @@ class Mode:
     @property
     def label(self) -> str:
         """In words, e.g. ``Mitsuba path, 16 spp``."""
-        return FAMILIES[self.family] + ("" if self.spp is None else f", {self.spp} spp")
+        return (self.words or self.family) + ("" if self.spp is None else f", {self.spp} spp")
 
 
-class SampledMode:
-    """A sampled integrator at one number of samples; several share one ray tracer, which is costly to build."""
+class _Sampled:
+    """A mode with noise at one number of samples; several share one tracer, which is costly to build."""
 
-    def __init__(self, tracer: RayTracer, spp: int, seed: int) -> None:
-        self.tracer, self.spp, self.seed = tracer, spp, seed
-        self.label, self.device = f"{tracer.label}-{spp}spp", tracer.device
+    def __init__(self, mode: Any, spp: int, seed: int) -> None:
+        self._render = partial(mode.render, spp=spp, seed=seed)
+        self.label, self.device = f"{mode.label}-{spp}spp", mode.device
 
     def render(self, surface: GelSurface) -> OpticsImages:
-        self.tracer.spp, self.tracer.seed = self.spp, self.seed
-        return self.tracer.render(surface)
+        return self._render(surface)
 
 
 def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False) -> tuple[Mode, ...]:
-    """Every mode of the comparison; the sampled ones once for each of ``spp`` samples a pixel. ``quick`` leaves out costly variants."""
-    modes = [_traced("fast")]
-    if not quick:
-        modes.append(_traced("fast_4_rays", spp=4))
-    for family in ("reference", "reference_denoised", "path"):
-        chosen = spp if not (quick and family == "reference_denoised") else spp[-1:]
-        modes += [_sampled(family, n) for n in chosen]
-    others = [
-        _named("taxim", "taxim", {"shadows": False}),
-        _named("taxim_shadow", "taxim", {"shadows": True}),
-        _named("phong", "phong", {}),
-        _peer("peer", shadow=False),
-        _peer("peer_shadow", shadow=True),
-    ]
-    slow = ("taxim", "taxim_shadow", "peer", "peer_shadow") if quick else ()
-    return (*modes, *(replace(mode, build=_too_slow, prepare=None) if mode.family in slow else mode for mode in others))
+    """Every mode of the comparison; the sampled ones once for each of ``spp`` samples a pixel. ``quick`` builds no costly variants."""
+    modes = []
+    for name in OPTICS.names:
+        for variant in OPTICS.config_class(name).variants():
+            for n in spp if variant.config.sampled else (None,):
+                modes.append(_mode(variant, n, left_out=quick and variant.slow))
+    return (*modes, _peer("peer", shadow=False, left_out=quick), _peer("peer_shadow", shadow=True, left_out=quick))
 
 
 def _too_slow(setting: Setting) -> OpticalMode:
     raise BackendError("left out of a quick run: baking its table, or compiling it, takes longer than all the rest")
 
 
-def _traced(family: str, **options: Any) -> Mode:
-    def build(setting: Setting) -> OpticalMode:
-        return setting.tracers.get(setting.size, **options)
-
-    return Mode(family, build, ("raytac.optics.trace.fast_tracer",), options=options)
-
-
-def _sampled(family: str, spp: int) -> Mode:
-    integrator, denoise = family.removesuffix("_denoised"), family.endswith("_denoised")
+def _mode(variant: Variant, spp: int | None, *, left_out: bool) -> Mode:
+    config = variant.config
 
     def build(setting: Setting) -> OpticalMode:
-        options = {"denoise": True} if denoise else {}
-        tracer = setting.tracers.get(setting.size, integrator=integrator, **options)
+        mode = setting.tracers.mode(setting.size, config)
         # Seeds apart from those of the reference images: shared samples would share their error.
-        return SampledMode(tracer, spp, (100_000 + 1_000 * setting.tracers.seed) % 2**32)
+        return mode if spp is None else _Sampled(mode, spp, (100_000 + 1_000 * setting.tracers.seed) % 2**32)
 
-    code = ("raytac.optics.trace.fast_tracer",)
-    return Mode(family, build, code, spp, {"integrator": integrator, "denoise": denoise, "spp": spp})
+    def bake(setting: Setting) -> None:
+        config.bake(setting.tracers.spec, setting.tracers.device)
 
-
-_MODULES = {"phong": "raytac.optics.image.phong", "mlp": "raytac.optics.image.mlp", "taxim": "raytac.optics.taxim.mode"}
-
-
-def _named(family: str, optics: str, options: dict[str, Any]) -> Mode:
-    def build(setting: Setting) -> OpticalMode:
-        tracers = setting.tracers
-        sensor = TactileSensor(
-            tracers.spec,
-            optics=optics,
-            resolution=setting.size,
-            device=tracers.device,
-            seed=tracers.seed,
-            optics_options=options,
-        )
-        return sensor.optical_mode
-
-    table = optics == "taxim"
-    code = (_MODULES[optics],)
-    note = "" if table else "lights and constants as published for another sensor, not fitted to this one"
-    return Mode(family, build, code, options={"optics": optics, **options}, prepare=_bake if table else None, note=note)
+    return Mode(
+        variant.name,
+        _too_slow if left_out else build,
+        lambda: (config.maker().__module__,),
+        words=variant.words,
+        short=variant.short,
+        spp=spp,
+        unbiased=config.unbiased,
+        options=repr(config),
+        prepare=None if left_out else bake,
+        note=variant.note,
+    )
 
 
-def _bake(setting: Setting) -> None:
-    from raytac.optics.taxim.bake.bake import baked_table
-
-    baked_table(setting.tracers.spec, device=setting.tracers.device)
-
-
-def _peer(family: str, *, shadow: bool) -> Mode:
+def _peer(family: str, *, shadow: bool, left_out: bool) -> Mode:
     def build(setting: Setting) -> OpticalMode:
         from raytac.report.compare.peer_taxim import PeerTaxim
 
@@ -166,4 +126,11 @@ def _peer(family: str, *, shadow: bool) -> Mode:
         "its own sensor (GelSight with a dome), background and colours: no error against our reference is defined. "
         "Its time includes its own deformation of the gel, which the other modes are given."
     )
-    return Mode(family, build, ("raytac.report.compare.peer_taxim",), options={"shadow": shadow}, has_reference=False, note=note)
+    return Mode(
+        family,
+        _too_slow if left_out else build,
+        lambda: ("raytac.report.compare.peer_taxim",),
+        words="taxim package" + (" with shadow" if shadow else ""),
+        has_reference=False,
+        note=note,
+    )

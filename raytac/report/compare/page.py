@@ -9,7 +9,6 @@ from typing import Any
 from raytac.io.folder import result_folder
 from raytac.io.metrics import write_metrics
 from raytac.report.compare.metrics import compare_metrics, equal_errors, resolutions, select, summaries
-from raytac.report.compare.modes import FAMILIES
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
 
@@ -69,7 +68,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
     import jinja2
 
     rows, settings = comparison.rows, comparison.settings
-    found = summaries(rows)
+    summary = summaries(rows)
     templates = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=templates, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     flip = any(row.figures["frame_flip"] is not None for row in rows)
@@ -89,18 +88,18 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
             {
                 "resolution": resolution.replace("x", " × "),
                 "scenes": f"over {scenes}",
-                "summaries": [s for s in found if s.resolution == resolution],
+                "summaries": [s for s in summary if s.resolution == resolution],
             }
             for resolution in resolutions(rows)
         ],
-        batch=next((s.batch for s in found), 0),
+        batch=next((s.batch for s in summary), 0),
         flip=flip,
         errors_wide=4 if flip else 3,
-        any_at_noise=any(s.at_noise for s in found),
+        any_at_noise=any(s.at_noise for s in summary),
         noise=noise,
         reference_spp=f"{settings.reference_spp:,}",
         equal=equal_errors(rows),
-        families=FAMILIES,
+        families={row.figures["family"]: row.figures["words"] for row in comparison.rows},
         left_out=comparison.left_out,
         physics=comparison.physics,
         markers=comparison.markers,

@@ -20,7 +20,7 @@ AWAY_MM = 5.0
 
 
 def contact_height_map(surface: GelSurface, size: tuple[int, int], width_mm: float) -> np.ndarray:
-    """What presses into the gel as the package wants it: (B, H, W) float32 [mm], 0 at the gel's highest point, negative inside.
+    """Object's underside as the package wants it: (B, H, W) float32 [mm], 0 at the gel's highest point, negative inside.
 
     Where there is contact the gel's surface is the object's underside; elsewhere the object counts as ``AWAY_MM`` off, since the package
     deforms the gel by itself. Pixels are squares of ``width_mm`` / W, centred on the pad.

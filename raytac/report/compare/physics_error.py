@@ -1,4 +1,4 @@
-"""What the cheap physics costs: height and image of the rigid pad with its Gaussians against the simulated pad, on the same presses."""
+"""Error of the rigid pad, with its Gaussians, against the soft pad on the same presses: height and image."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from raytac.errors import RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
+from raytac.physics import Ipc, Rigid
 from raytac.report.image_error import mae, regions
 from raytac.report.tracers import Tracers
 from raytac.sensor import TactileSensor
@@ -22,12 +23,15 @@ __all__ = ["PhysicsError", "physics_errors", "physics_metrics"]
 
 @dataclass(frozen=True)
 class PhysicsError:
-    """One press on both pads. Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255]."""
+    """Differences of one press on both pads.
+
+    Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255].
+    """
 
     scene: str
     resolution: str
     pad: str
-    """How finely the simulated pad was cut; the rigid one is measured against it."""
+    """Mesh level of the soft pad, against which the rigid one is measured."""
     contact_um: float
     """Height where either touches."""
     ring_um: float
@@ -35,7 +39,7 @@ class PhysicsError:
     pad_um: float
     """Height of all that neither touches."""
     bulge_um: float
-    """How far the simulated gel comes up beside the press; the Gaussians' never does."""
+    """Greatest rise of the soft gel beside the press; that of the Gaussians never rises."""
     contact_levels: float
     ring_levels: float
     frame_levels: float
@@ -47,29 +51,29 @@ class PhysicsError:
 def physics_errors(
     tracers: Tracers, scenes: Sequence[str | Path], size: tuple[int, int], pad: str, surfaces: dict[str, GelSurface]
 ) -> tuple[PhysicsError, ...]:
-    """Press every scene into the simulated pad and compare.
+    """Press every scene into the soft pad and compare.
 
     Args:
         tracers: the sensor's ray tracers.
         scenes: press scenes.
         size: (width, height) of the images [px].
-        pad: level of the simulated pad.
+        pad: level of the soft pad.
         surfaces: the rigid pad's, by name of scene.
 
     Raises:
-        RaytacError: a press did not settle on the simulated pad.
+        RaytacError: a press did not settle on the soft pad.
         BackendError: the solver cannot run here.
     """
-    tracer, found = tracers.get(size), []
+    tracer, errors = tracers.get(size), []
     settings = {"outputs": ("height",), "resolution": size, "device": "cpu", "seed": tracers.seed}
     for scene in scenes:
         press, seconds = load_press(scene), []
-        for physics in ("rigid", "ipc"):
+        for physics in (Rigid(), Ipc(level=pad)):
             start = time.perf_counter()
-            sensor = TactileSensor(tracers.spec, physics=physics, pad=pad if physics == "ipc" else None, **settings)
-            frame = sensor.press(press)
+            sensor = TactileSensor(tracers.spec, physics=physics, **settings)
+            frame = sensor.press(press, progress=True)
             seconds.append(time.perf_counter() - start)
-        if frame.failed is not None and frame.failed[0]:
+        if frame.failed[0]:
             raise RaytacError(f"the press {press.name!r} did not settle on the {pad} pad")
         rigid, soft = surfaces[press.name], frame.surface
         touched = rigid.contact[0] | soft.contact[0]
@@ -80,7 +84,7 @@ def physics_errors(
         masks = [tracers.regions(size, surface) for surface in (rigid, soft)]
         contact, around = (masks[0][name] | masks[1][name] for name in ("contact", "ring"))
         around = around & ~contact
-        found.append(
+        errors.append(
             PhysicsError(
                 press.name,
                 f"{size[0]}x{size[1]}",
@@ -95,7 +99,7 @@ def physics_errors(
                 *seconds,
             )
         )
-    return tuple(found)
+    return tuple(errors)
 
 
 def physics_metrics(errors: Sequence[PhysicsError]) -> dict[str, Metric]:

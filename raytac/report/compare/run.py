@@ -17,24 +17,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from raytac.errors import InputError, RaytacError
 from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
+from raytac.io.progress import Progress
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, held_out_frames, marker_errors
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
-from raytac.report.compare.references import References
-from raytac.report.compare.row_store import Row, RowStore, Value, row_key
 from raytac.report.compare.settings import CompareSettings
+from raytac.report.compare.store import References, Row, RowStore, Value, row_key
 from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
-from raytac.report.machine import machine
-from raytac.report.surfaces import press_peaks
-from raytac.report.timing import moving, timed_within
+from raytac.report.measure import machine, moving, timed_within
+from raytac.report.press import press_peaks
 from raytac.report.tracers import Tracers
 from raytac.specs import load_sensor
 
@@ -49,7 +47,7 @@ BATCH = {"cpu": 8, "cuda": 64}
 """Environments of the batched timing where none are asked for."""
 TURNS = 6
 """Surfaces that take turns in a timing."""
-CODE = ("raytac.report.image_error", "raytac.report.timing")
+CODE = ("raytac.report.image_error", "raytac.report.measure")
 """Modules on which every row depends, besides those of its mode."""
 DISTRIBUTIONS = ("numpy", "mitsuba", "drjit", "mitsuba-oidn", "scikit-image", "flip-evaluator", "taxim", "jax")
 """Packages whose version is part of a row's key."""
@@ -81,7 +79,7 @@ class Comparison:
     facts: dict[str, Metric]
     """Machine and versions."""
     physics: tuple[PhysicsError, ...] = ()
-    """Rigid pad against the simulated one, if that was asked for."""
+    """Rigid pad against the soft one, if that was asked for."""
     markers: MarkerErrors | None = None
     """Marker models against surface tracking, if that was asked for."""
 
@@ -105,14 +103,14 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
     device = load_mitsuba(settings.device)[1]
     modes = comparison_modes(settings.spp, quick=settings.quick) if modes is None else modes
     facts = machine()
-    run = _Run(settings, device, RowStore(out / "rows", tqdm.write), out / "references", facts)
+    run = _Run(settings, device, RowStore(out / "rows", Progress.write), out / "references", facts)
     total = len(settings.resolutions) * len(settings.scenes) * len(modes)
-    with tqdm(total=total, desc="compare", unit="row", disable=None) as bar:
+    with Progress(total=total, desc="compare", unit="row") as bar:
         for size in settings.resolutions:
             run.measure_all(size, modes, bar)
         markers = None
         if settings.markers:
-            bar.set_postfix_str("markers on the simulated pad")
+            bar.set_postfix_str("markers on the soft pad")
             markers = _marker_errors(settings, device)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
@@ -151,18 +149,18 @@ class _Run:
         self.measured = 0
         self._digests: dict[tuple[str, ...], str] = {}
 
-    def measure_all(self, size: tuple[int, int], modes: Sequence[Mode], bar: tqdm) -> None:
+    def measure_all(self, size: tuple[int, int], modes: Sequence[Mode], bar: Progress) -> None:
         settings, name = self.settings, f"{size[0]}x{size[1]}"
         spec, surfaces = press_peaks(settings.sensor, settings.scenes, size, settings.seed)
         tracers = Tracers(spec, self.device, settings.seed)
-        references = References(self.folder, tracers, size, settings.reference_spp, tqdm.write)
+        references = References(self.folder, tracers, size, settings.reference_spp, Progress.write)
         scenes = []
         for scene, surface in surfaces.items():
             bar.set_postfix_str(f"{name} {scene}: reference")
             scenes.append(_Scene(scene, surface, references, tracers, size))
             self.images[scene, name] = scenes[-1].truth
         if settings.pad is not None:
-            bar.set_postfix_str(f"{name}: simulated pad")
+            bar.set_postfix_str(f"{name}: soft pad")
             self.physics += physics_errors(tracers, settings.scenes, size, settings.pad, surfaces)
         seen: set[str] = set()
         for mode in modes:
@@ -174,7 +172,7 @@ class _Run:
                 bar.update(len(scenes) - (len(self.rows) - done))
             seen.add(mode.family)
 
-    def _measure_mode(self, mode: Mode, setting: Setting, scenes: list[_Scene], first: bool, bar: tqdm) -> None:
+    def _measure_mode(self, mode: Mode, setting: Setting, scenes: list[_Scene], first: bool, bar: Progress) -> None:
         """Rows of one mode; ``first`` says that no mode before has built and compiled the same."""
         name = f"{setting.size[0]}x{setting.size[1]}"
         built: OpticalMode | None = None
@@ -214,9 +212,10 @@ class _Run:
 
     def _digest(self, mode: Mode) -> str:
         """Digest of the code behind a mode's row; reading sources takes a while, so each is read once."""
-        if mode.code not in self._digests:
-            self._digests[mode.code] = code_digest(*mode.code, *CODE)
-        return self._digests[mode.code]
+        code = mode.code()
+        if code not in self._digests:
+            self._digests[code] = code_digest(*code, *CODE)
+        return self._digests[code]
 
     def _measure(self, mode: Mode, built: OpticalMode, scene: _Scene, size: str, sensor: str, first_image_s: float | None) -> Row:
         image = _rgb(built, scene.surface)[0]
@@ -226,6 +225,9 @@ class _Run:
             "mode": mode.name,
             "family": mode.family,
             "label": mode.label,
+            "words": mode.words or mode.family,
+            "short": mode.short or mode.family,
+            "unbiased": mode.unbiased,
             "spp": mode.spp,
             "sensor": sensor,
             "device": built.device,
@@ -273,7 +275,7 @@ class _Run:
         return figures | {"batch_ms_per_frame": float(np.median(calls)) / self.batch, "batch_calls": len(calls)}
 
     def _memory(self, built: OpticalMode, surface: GelSurface, batched: bool) -> dict[str, Value]:
-        """Peak of the device arrays of one call [MiB], and by how much it grows with each further environment; None if not Dr.Jit."""
+        """Peak of the device arrays of one call, and its growth per environment [MiB]; None if not Dr.Jit."""
         from raytac.optics.runtime import peak_bytes
 
         one, many = (moving([surface], n, 1)[0] for n in (1, self.batch))
@@ -302,14 +304,17 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region: the halves are independent, so half their difference has the variance of their mean."""
+        """Noise of the reference by region.
+
+        The halves are independent, so half their difference has the variance of their mean.
+        """
         one, two = self._halves
-        found = {}
+        figures = {}
         for region, mask in self.masks.items():
             off = rmse(one[mask], two[mask]) / 2 if mask.any() else math.nan
             absolute = mean_absolute(one[mask], two[mask]) / 2 if mask.any() else math.nan
-            found[region] = {"mae": absolute, "rmse": off, "psnr": psnr(off)}
-        return found
+            figures[region] = {"mae": absolute, "rmse": off, "psnr": psnr(off)}
+        return figures
 
 
 def _rgb(mode: OpticalMode, surface: GelSurface) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What ``raytac compare`` compares, and what it refuses before anything is computed."""
+"""Settings of ``raytac compare``, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from raytac.checks import check_seed
 from raytac.errors import BackendError, InputError
-from raytac.markers.fots import marker_motion_of
+from raytac.markers.base import marker_motion_of
 from raytac.physics.soft.availability import check_solver
 from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
@@ -21,7 +22,7 @@ SPP = (1, 4, 16, 64)
 
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings:
-    """What to compare."""
+    """Settings of a comparison."""
 
     sensor: str = "gelsight_mini"
     scenes: tuple[str, ...] = ("sphere", "coin", "pins")
@@ -42,9 +43,9 @@ class CompareSettings:
     quick: bool = False
     """Fewer modes."""
     pad: str | None = None
-    """Level of the simulated pad that the rigid one is measured against; None leaves those rows out."""
+    """Level of the soft pad that the rigid one is measured against; None leaves those rows out."""
     markers: bool = False
-    """Measure the marker models against surface tracking too, on the simulated pad of level ``pad``, else ``marker_error.PAD``."""
+    """Measure the marker models against surface tracking too, on the soft pad of level ``pad``, else ``marker_error.PAD``."""
 
     def quickened(self) -> CompareSettings:
         """The first scene at 80 x 60 pixels with few samples, frames and modes."""
@@ -72,8 +73,7 @@ class CompareSettings:
             raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
         if not self.budget_s > 0:
             raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
-        if not 0 <= self.seed < 2**32:
-            raise InputError("seed", value=self.seed, rule="must be a whole number in [0, 2^32)")
+        check_seed("seed", self.seed)
         for size in self.resolutions:
             if min(size) <= 2 * SSIM_BORDER or max(size) > LARGEST_SIDE:
                 rule = f"must have sides from {2 * SSIM_BORDER + 1} (the window of SSIM) to {LARGEST_SIDE} pixels"
@@ -96,5 +96,5 @@ class CompareSettings:
 
     @property
     def uses_solver(self) -> bool:
-        """Whether anything is pressed into the simulated pad."""
+        """True if anything is pressed into the soft pad."""
         return self.markers or self.pad is not None

@@ -83,12 +83,12 @@ def test_cells_are_those_under_the_patch() -> None:
 def test_the_warning_names_level_width_rule_and_the_next_level() -> None:
     assert tuple(PAD_LEVELS) == PADS
     for level, way in (
-        ("coarse", "pad='medium'"),
-        ("medium", "pad='fine'"),
+        ("coarse", "level='medium'"),
+        ("medium", "level='fine'"),
         ("fine", "mesh of your own"),
         ("own", "mesh of your own"),
     ):
-        with pytest.warns(NarrowContactWarning, match=rf"pad = '{level}': the contact is 2\.5 cells across.*at least 6.*{way}"):
+        with pytest.warns(NarrowContactWarning, match=rf"level = '{level}': the contact is 2\.5 cells across.*at least 6.*{way}"):
             assert warn_if_narrow(np.array([2.5]), level, stacklevel=1)
     with pytest.warns(NarrowContactWarning, match="in environment 1 is 2.0"):
         assert warn_if_narrow(np.array([np.nan, 2.0, 4.0]), "coarse", stacklevel=1)

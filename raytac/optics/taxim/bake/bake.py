@@ -16,6 +16,7 @@ from itertools import chain
 import numpy as np
 
 from raytac.gel.surface import GelSurface
+from raytac.io.progress import Progress
 from raytac.optics.taxim.bake.fit import BinFit, BinSums
 from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
 from raytac.optics.taxim.bake.settings import BakeSettings
@@ -123,13 +124,11 @@ def bake(
 
 def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: int = 0, progress: bool = False) -> Baked:
     """``bake`` with a ray tracer that is set up already."""
-    from tqdm import tqdm
-
     settings = BakeSettings() if settings is None else settings
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
     pins = settings.pins if sensor.optics.shadows else 0
     images = settings.images + 6 * pins
-    with tqdm(total=images, desc=f"bake {sensor.name}", unit="image", disable=None if progress else True) as bar:
+    with Progress(total=images, desc=f"bake {sensor.name}", unit="image", show=progress) as bar:
         touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
             add_samples(touched, views, at.rest_image, views.contact)

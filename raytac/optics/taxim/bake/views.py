@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
 from raytac.optics.image.base import see_heights
-from raytac.optics.trace.fast_tracer import RayTracer
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["Calibration", "Views"]
@@ -47,13 +47,19 @@ class Calibration:
         seed: int = 0,
         flat_field: np.ndarray | None = None,
     ) -> None:
-        """``flat_field`` and errors as of ``RayTracer``."""
+        """``flat_field`` as of ``RayTraced``, the rest and errors as of its ``build``."""
         self.sensor = sensor
-        options: dict[str, Any] = {"resolution": resolution, "outputs": ("rgb",), "device": device, "flat_field": flat_field}
-        self.tracer = RayTracer(sensor, seed=seed, **options)
+        self.tracer = ray_tracer(sensor, RayTraced(flat_field=flat_field), resolution=resolution, device=device, seed=seed)
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
-        options["bounce"] = False
-        self._direct = [RayTracer(self.tracer.sensor, shadows=shadows, **options) for shadows in (True, False)]
+        self._direct = [
+            ray_tracer(
+                self.tracer.sensor,
+                RayTraced(flat_field=flat_field, bounce=False, shadows=shadows),
+                resolution=resolution,
+                device=device,
+            )
+            for shadows in (True, False)
+        ]
         self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
         self.grid: PadGrid = make_grid(sensor.gelpad, grid_pitch(self.pitch))
@@ -92,8 +98,8 @@ class Calibration:
         heights = mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
         contact = mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
         seen = see_heights(mi, tracer.layout, tracer.camera, self.pitch, self._rest, heights, contact)
-        dr.eval(seen.height, seen.moved, seen.contact)
-        slope_x, slope_y, _ = seen.slopes(mi, seen.moved)
+        dr.eval(seen.height, seen.displacement, seen.contact)
+        slope_x, slope_y, _ = seen.slopes(mi, seen.displacement)
         dr.eval(slope_x, slope_y)
-        x, y, moved, touched = (np.array(v).reshape(rgb.shape[:3]) for v in (slope_x, slope_y, seen.moved, seen.contact))
+        x, y, moved, touched = (np.array(v).reshape(rgb.shape[:3]) for v in (slope_x, slope_y, seen.displacement, seen.contact))
         return Views(rgb, x, y, moved * np.float32(self.pitch[0]), touched.astype(bool))

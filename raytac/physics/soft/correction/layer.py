@@ -1,4 +1,4 @@
-"""How the face of a gel layer gives way to pressure, wave by wave."""
+"""Compliance of a gel layer bonded at its back, wave by wave, in closed form."""
 
 from __future__ import annotations
 
@@ -9,49 +9,49 @@ from raytac.specs.sensor import GelpadSpec
 __all__ = ["CosineSeries", "layer_compliance", "layer_shear", "layer_spread"]
 
 _DEEP = 20.0
-"""Wave number times thickness beyond which a layer is a half-space to rounding."""
+"""Wave number times thickness above which a layer is a half-space to rounding."""
 _LONG = 1e-3
-"""And below which it is squeezed evenly."""
+"""The same below which it is compressed uniformly."""
 
 
 def layer_compliance(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Depth over pressure [m/Pa] of a wave of that ``wave_number`` [rad/m] on a layer whose back is bonded, same shape.
+    """Normal displacement over pressure [m/Pa] at each ``wave_number`` [rad/m], same shape.
 
     With α = k h and K = 3 − 4ν it is 2 (1 − ν²)/(E k) · (K sinh 2α − 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), small strain and
-    no friction (K. L. Johnson, Contact Mechanics, 1985, section 5.8 has the layer; checked here against finite elements). For short
-    waves that is the half-space's 2 (1 − ν²)/(E k); for k → 0 it is h (1 + ν)(1 − 2ν)/(E (1 − ν)), a layer that cannot give way sideways.
+    no friction (K. L. Johnson, Contact Mechanics, 1985, section 5.8 has the layer; tests compare it with finite elements). For short
+    waves that is the half-space's 2 (1 − ν²)/(E k). For k → 0 it is h (1 + ν)(1 − 2ν)/(E (1 − ν)), uniaxial compression.
     """
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
-    reach, α, κ, determinant = _layer(wave_number, gelpad)
-    return 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) - 2.0 * α) / determinant * reach
+    inverse_k, α, κ, determinant = _layer(wave_number, gelpad)
+    return 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) - 2.0 * α) / determinant * inverse_k
 
 
 def layer_spread(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Sideways displacement over pressure [m/Pa] of the face of that layer: under p cos kx it is this times p sin kx, same shape.
+    """Sideways displacement over pressure [m/Pa]: under p cos kx it is this times p sin kx.
 
     2 (1 + ν)/(E k) · (α² − (1 − 2ν)(3 − 4ν) sinh² α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same solution of the layer's plane
-    strain as ``layer_compliance`` (checked against finite elements with it). Long waves squeeze gel out from under the load (> 0), short
-    ones draw the face towards it: −(1 + ν)(1 − 2ν)/(E k), the half-space's.
+    strain as ``layer_compliance``. Long waves squeeze gel out from under the load (> 0). Short ones draw the face towards it:
+    −(1 + ν)(1 − 2ν)/(E k), the half-space's.
     """
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
-    reach, α, κ, determinant = _layer(wave_number, gelpad)
-    return 2.0 * (1.0 + nu) / young * (α**2 - (1.0 - 2.0 * nu) * κ * np.sinh(α) ** 2) / determinant * reach
+    inverse_k, α, κ, determinant = _layer(wave_number, gelpad)
+    return 2.0 * (1.0 + nu) / young * (α**2 - (1.0 - 2.0 * nu) * κ * np.sinh(α) ** 2) / determinant * inverse_k
 
 
 def layer_shear(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Sideways displacement over traction [m/Pa] of the face of that layer under a wave of traction, same shape twice.
+    """Sideways displacement over traction [m/Pa] along the wave vector, and across it.
 
-    First along the wave vector, 2 (1 − ν²)/(E k) · (K sinh 2α + 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same plane strain as
-    ``layer_compliance``; then across it, where gel is only sheared: 2 (1 + ν)/(E k) · tanh α. Both tend to h/G for long waves.
+    Along: 2 (1 − ν²)/(E k) · (K sinh 2α + 2α) / (K cosh 2α + 2α² + 5 − 12ν + 8ν²), from the same plane strain as
+    ``layer_compliance``. Across, where gel is only sheared: 2 (1 + ν)/(E k) · tanh α. Both tend to h/G for long waves.
     """
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
-    reach, α, κ, determinant = _layer(wave_number, gelpad)
-    along = 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) + 2.0 * α) / determinant * reach
-    return along, 2.0 * (1.0 + nu) / young * np.tanh(α) * reach
+    inverse_k, α, κ, determinant = _layer(wave_number, gelpad)
+    along = 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) + 2.0 * α) / determinant * inverse_k
+    return along, 2.0 * (1.0 + nu) / young * np.tanh(α) * inverse_k
 
 
 def _layer(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """1/k, α = k h within bounds, K, and what both numerators are divided by."""
+    """1/k, α = k h within bounds, K, and the denominator of all three laws."""
     nu, thickness = gelpad.poisson_ratio, gelpad.thickness
     wave_number = np.maximum(np.asarray(wave_number, float), _LONG / thickness)
     α, κ = np.minimum(wave_number * thickness, _DEEP), 3.0 - 4.0 * nu
@@ -59,7 +59,7 @@ def _layer(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.
 
 
 class CosineSeries:
-    """Values at even nodes from edge to edge of the pad as a series of cosines, whose slope across the edges is 0."""
+    """Cosine series through values at evenly spaced nodes, with zero slope at both edges."""
 
     def __init__(self, nodes: np.ndarray) -> None:
         """``nodes`` [m], shape (n,), evenly spaced from one edge to the other."""
@@ -71,16 +71,16 @@ class CosineSeries:
         half[[0, -1]] = 0.5
         order = np.arange(n)
         self.analysis = 2.0 * half[:, None] * half * np.cos(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
-        """What takes values at the nodes to the amplitudes, shape (n, n)."""
+        """Matrix from values at the nodes to amplitudes, shape (n, n)."""
         self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """The same for sines, which are 0 at the ends, shape (n, n)."""
         self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
-        """Amplitudes of hat functions on the nodes over those of the cosines that pass through the same values, shape (n,)."""
+        """Amplitudes of hat functions on the nodes over those of the cosines through the same values, shape (n,)."""
 
     def synthesis(self, t: np.ndarray) -> np.ndarray:
-        """What takes amplitudes to the values at ``t`` [m]: shape (P, n)."""
+        """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""
         return np.cos(np.outer(np.asarray(t) - self._start, self.wave_numbers))
 
     def sines(self, t: np.ndarray) -> np.ndarray:
-        """The sines of the same wave numbers at ``t`` [m]: shape (P, n)."""
+        """Sines of the same wave numbers at ``t`` [m], shape (P, n)."""
         return np.sin(np.outer(np.asarray(t) - self._start, self.wave_numbers))

@@ -1,4 +1,4 @@
-"""How the coat of a pad's mesh gives way to small forces: linear elasticity on the very tetrahedra of the solver."""
+"""Linear compliance of the coat of a pad's mesh, on the solver's own tetrahedra."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ __all__ = ["coat_compliance"]
 _SAME_PLACE = 1e-9
 """Vertices nearer than this are mirror images [m]."""
 _SAME = 1e-9
-"""Relative difference of two stiffnesses that rounding explains."""
+"""Relative difference of two stiffnesses that is rounding."""
 
 
 def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False, along: tuple[int, ...] = (2,)) -> np.ndarray:
-    """Displacement along x, y, z of each coat vertex [m] that 1 N on each gives, shape (A, 3, V, V); small strain, float64.
+    """Displacement of each coat vertex under 1 N on each [m], shape (A, 3, V, V), float64.
 
     Entry (a, c, i, j): component c of vertex i, force on vertex j along the axis ``along[a]`` (0, 1, 2: x, y, z).
 
-    Linear tetrahedra with the gelpad's E and ν, as the solver's neo-Hookean gel has them at small strain, held where the mesh is
-    bonded. ``rollers``: the sides of the pad do not move outwards either (and may slide), as if the pad went on as its own mirror
-    image. The unknowns are eliminated layer by layer from the back (block Gaussian elimination of a block tridiagonal matrix;
-    a layer is what lies equally many edges from the coat). A mesh that is its own mirror image is split into its symmetric
-    and antisymmetric halves first, which is exact and makes the layers half as large for each mirror.
+    Linear tetrahedra with the gelpad's E and ν, as the solver's neo-Hookean gel has them at small strain, fixed where the mesh is
+    bonded. ``rollers``: the sides of the pad do not move outwards either (and may slide), as if the pad were continued by its mirror
+    image. The unknowns are eliminated layer by layer from the back (block Gaussian elimination of a block tridiagonal matrix); a layer
+    is the set of vertices equally many edges from the coat. A mesh that is its own mirror image is first split into its symmetric
+    and antisymmetric parts, which is exact and halves the layers for each mirror.
     """
     stiffness = _stiffness(mesh.tets.vertices, mesh.tets.tets, gelpad)
-    held = np.zeros((len(mesh.tets.vertices), 3), bool)
-    held[mesh.bonded] = True
+    fixed = np.zeros((len(mesh.tets.vertices), 3), bool)
+    fixed[mesh.bonded] = True
     if rollers:
         for axis in (0, 1):
             at = mesh.tets.vertices[:, axis]
-            held[(at <= at.min() + _SAME_PLACE) | (at >= at.max() - _SAME_PLACE), axis] = True
+            fixed[(at <= at.min() + _SAME_PLACE) | (at >= at.max() - _SAME_PLACE), axis] = True
     layer = _layers(mesh)
-    found = np.zeros((len(along), 3, *(len(mesh.coat_vertices),) * 2))
+    compliance = np.zeros((len(along), 3, *(len(mesh.coat_vertices),) * 2))
     on_coat = np.full(len(mesh.tets.vertices), -1)
     on_coat[mesh.coat_vertices] = np.arange(len(mesh.coat_vertices))
-    for basis in _halves(mesh, stiffness, held):
-        found += _condensed(stiffness, basis, layer, on_coat, along)
-    for one, axis in zip(found, along, strict=True):
+    for basis in _halves(mesh, stiffness, fixed):
+        compliance += _condensed(stiffness, basis, layer, on_coat, along)
+    for one, axis in zip(compliance, along, strict=True):
         one[axis] = 0.5 * (one[axis] + one[axis].T)
-    return found
+    return compliance
 
 
 @dataclass(frozen=True)
 class _Sparse:
-    """Entries of a sparse matrix; the same place may occur several times and then adds up."""
+    """Entries of a sparse matrix; entries at the same place add up."""
 
     row: np.ndarray
     column: np.ndarray
@@ -81,7 +81,7 @@ def _stiffness(vertices: np.ndarray, tets: np.ndarray, gelpad: GelpadSpec) -> _S
 
 
 def _layers(mesh: PadMesh) -> np.ndarray:
-    """How many edges each vertex is away from the coat, shape (n,)."""
+    """Number of edges between each vertex and the coat, shape (n,)."""
     tets = mesh.tets.tets
     layer = np.full(len(mesh.tets.vertices), -1)
     layer[mesh.coat_vertices] = 0
@@ -96,8 +96,8 @@ def _layers(mesh: PadMesh) -> np.ndarray:
     return layer
 
 
-def _halves(mesh: PadMesh, stiffness: _Sparse, held: np.ndarray) -> list[_Sparse]:
-    """Orthonormal bases, one for each kind of symmetry, of the unknowns that are free; columns are sparse, rows are unknowns."""
+def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Sparse]:
+    """Orthonormal bases of the free unknowns, one for each kind of symmetry."""
     vertices = mesh.tets.vertices
     n = len(vertices)
     mirrors = []
@@ -110,9 +110,9 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, held: np.ndarray) -> list[_Sparse
         signs = np.tile(sign, n)
         probe = np.cos(np.arange(3 * n) ** 2 % 1009)
         one, two = stiffness.times(signs * probe[where]), signs * stiffness.times(probe)[where]
-        if np.abs(one - two).max() <= _SAME * np.abs(one).max() and np.array_equal(held.ravel()[where], held.ravel()):
+        if np.abs(one - two).max() <= _SAME * np.abs(one).max() and np.array_equal(fixed.ravel()[where], fixed.ravel()):
             mirrors.append((where, signs))
-    free = np.flatnonzero(~held.ravel())
+    free = np.flatnonzero(~fixed.ravel())
     bases = []
     for parities in product((1.0, -1.0), repeat=len(mirrors)):
         row, value = free[:, None], np.ones((len(free), 1))
@@ -140,7 +140,7 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, held: np.ndarray) -> list[_Sparse
 
 
 def _mirror_image(vertices: np.ndarray, axis: int) -> np.ndarray | None:
-    """Vertex that each vertex is the mirror image of, shape (n,); None if some have none."""
+    """Mirror image of each vertex, shape (n,); None if some have none."""
     mirrored = vertices * np.where(np.arange(3) == axis, -1.0, 1.0)
     here, there = (np.lexsort(np.round(v / _SAME_PLACE).astype(np.int64).T) for v in (vertices, mirrored))
     if np.abs(vertices[here] - mirrored[there]).max() > _SAME_PLACE:
@@ -151,16 +151,16 @@ def _mirror_image(vertices: np.ndarray, axis: int) -> np.ndarray | None:
 
 
 def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: np.ndarray, along: tuple[int, ...]) -> np.ndarray:
-    """Share of one half in the coat's compliance, (A, 3, V, V)."""
+    """Contribution of one basis to the coat's compliance, (A, 3, V, V)."""
     by_row = np.argsort(basis.row, kind="stable")
     row, column, value = basis.row[by_row], basis.column[by_row], basis.value[by_row]
     n = stiffness.shape[0]
     # Within one half every unknown occurs in at most one column.
     column_of, weight = np.full(n, -1), np.zeros(n)
     column_of[row], weight[row] = column, value
-    left, right = column_of[stiffness.row], column_of[stiffness.column]
-    used = (left >= 0) & (right >= 0)
-    left, right = left[used], right[used]
+    first, second = column_of[stiffness.row], column_of[stiffness.column]
+    used = (first >= 0) & (second >= 0)
+    first, second = first[used], second[used]
     entry = stiffness.value[used] * weight[stiffness.row[used]] * weight[stiffness.column[used]]
     depth_of = np.empty(basis.shape[1], int)
     depth_of[column] = layer[row // 3]
@@ -170,8 +170,8 @@ def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: n
         place[depth_of == depth] = np.arange(size)
 
     def block(upper: int, lower: int) -> np.ndarray:
-        here = (depth_of[left] == upper) & (depth_of[right] == lower)
-        at = place[left[here]] * sizes[lower] + place[right[here]]
+        here = (depth_of[first] == upper) & (depth_of[second] == lower)
+        at = place[first[here]] * sizes[lower] + place[second[here]]
         return np.bincount(at, entry[here], sizes[upper] * sizes[lower]).reshape(sizes[upper], sizes[lower])
 
     inverse = np.zeros((0, 0))
@@ -185,5 +185,5 @@ def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: n
     for axis in range(3):
         top = np.flatnonzero((column_of >= 0) & (np.arange(n) % 3 == axis) & (on_coat[np.arange(n) // 3] >= 0))
         spread[axis, on_coat[top // 3], place[column_of[top]]] = weight[top]
-    answers = [inverse @ spread[axis].T for axis in along]
-    return np.stack([[side @ answer for side in spread] for answer in answers])
+    responses = [inverse @ spread[axis].T for axis in along]
+    return np.stack([[side @ response for side in spread] for response in responses])

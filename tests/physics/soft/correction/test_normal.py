@@ -10,12 +10,13 @@ import pytest
 
 from raytac.gel.interpolate import sampled
 from raytac.gel.surface import make_grid
+from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance, layer_spread
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.normal import FineContact, FineGrid, _evening
-from raytac.physics.soft.correction.splines import CoatSurface
-from raytac.physics.soft.correction.tangential import SkinMotion
+from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection, _smoothing
+from raytac.physics.soft.correction.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
+from raytac.physics.soft.settings import Correction
 from raytac.specs import load_sensor
 
 GELPAD = load_sensor("gelsight_mini").gelpad
@@ -41,16 +42,16 @@ def test_bonded_vertices_of_the_coat_bear_no_force():
     mesh = pad_mesh(gelpad, PadLevel(2.5e-3, 3, 1.5, 1.5, 5e-5))
     grid = make_grid(gelpad, 0.4e-3)
     compliance, continued = coat_compliance(mesh, gelpad)[0, 2], coat_compliance(mesh, gelpad, rollers=True)[0, 2]
-    fine = FineContact(CoatSurface(mesh.coat, gelpad), gelpad, grid.x, grid.y, compliance, continued)
+    fine = NormalCorrection(CoatSurface(mesh.coat, gelpad), gelpad, grid.x, grid.y, compliance, continued)
     rest = mesh.coat.rest
     load = np.where(rest[:, 0] > 0.5 * gelpad.size[0] - 4e-3, 1.0, 0.0)
     bonded = np.diagonal(compliance) == 0.0
     assert (bonded & (load > 0.0)).any()
     down = np.where(bonded, 0.0, -1e-4 * load)
     shape = fine.solve(fine.surface.places(np.zeros((len(rest), 3))), down, load, np.full(grid.shape, np.nan))
-    assert np.isfinite(shape.held).all() and (shape.held[bonded] == 0.0).all()
+    assert np.isfinite(shape.mesh_forces).all() and (shape.mesh_forces[bonded] == 0.0).all()
     pressed = ~bonded & (load > 0.0)
-    assert (compliance @ shape.held)[pressed] == pytest.approx(-1e-4, rel=1e-6)
+    assert (compliance @ shape.mesh_forces)[pressed] == pytest.approx(-1e-4, rel=1e-6)
 
 
 def test_a_field_read_at_no_place_is_no_number():
@@ -122,8 +123,8 @@ def fine():
     grid = make_grid(GELPAD, 0.2e-3)
     surface = CoatSurface(MESH.coat, GELPAD)
     compliances = [coat_compliance(MESH, GELPAD, rollers=rollers)[0, 2] for rollers in (False, True)]
-    contact = FineContact(surface, GELPAD, grid.x, grid.y, *compliances)
-    return contact, grid, FineGrid(contact, grid.x, grid.y)
+    contact = NormalCorrection(surface, GELPAD, grid.x, grid.y, *compliances)
+    return contact, grid, ContactSampler(contact, grid.x, grid.y)
 
 
 def ball(grid, depth, radius=4e-3):
@@ -179,26 +180,24 @@ def test_laying_closes_gaps_under_pressure_only(fine):
     assert (under - laid).min() > -1e-9
 
 
-def test_the_best_of_the_search_is_kept_and_its_residual_told(fine, monkeypatch):
-    """With few rounds the contact is not found, and says by how much; with all it is found."""
-    from raytac.physics.soft.correction import normal as fine_contact
-
+def test_the_best_of_the_search_is_kept_and_its_residual_given(fine, monkeypatch):
+    """With few iterations the contact is not solved, and the residual says by how much; with all it is."""
     under = ball(fine[1], 0.6e-3)
-    left = []
-    for rounds in (1, 4, 40):
-        monkeypatch.setattr(fine_contact, "_ROUNDS", rounds)
+    residuals = []
+    for iterations in (1, 4, 40):
+        monkeypatch.setattr(fine[0], "settings", Correction(normal_iterations=iterations))
         shape, height = pressed(fine, under)
         gap = under - height
         worst = max(-gap.min(), np.abs(gap[shape.pressure > 0.0]).max())
         assert shape.residual == pytest.approx(worst, abs=0.3e-6)
-        left.append(shape.residual)
-    assert left[0] > left[1] > 5e-6 > 1e-6 > left[2]
+        residuals.append(shape.residual)
+    assert residuals[0] > residuals[1] > 5e-6 > 1e-6 > residuals[2]
 
 
 @pytest.fixture(scope="module")
 def skin(fine):
     continued = coat_compliance(MESH, GELPAD, rollers=True, along=(0, 1, 2))
-    return SkinMotion(fine[0], GELPAD, coat_compliance(MESH, GELPAD)[0], continued)
+    return TangentialCorrection(fine[0], GELPAD, coat_compliance(MESH, GELPAD)[0], continued)
 
 
 def rigid(turn):
@@ -252,6 +251,6 @@ def test_sampling_is_bilinear():
 
 def test_waves_of_two_cells_are_taken_out_and_straight_lines_stay():
     lines = np.array([0.0, 0.4, 0.7, 1.2, 2.0, 2.1, 3.0])
-    even = _evening(lines)
+    even = _smoothing(lines)
     assert np.allclose(even @ (3.0 - 2.0 * lines), 3.0 - 2.0 * lines)
     assert np.abs((even @ (-1.0) ** np.arange(7))[1:-1]).max() < 1e-12

@@ -1,0 +1,1 @@
+"""Candidate pairs: primitives of two surfaces whose boxes overlap."""

@@ -1,0 +1,375 @@
+"""Broad phase: pairs of primitives whose boxes overlap, until a vertex leaves its box.
+
+Every vertex has a box around the last motion that was checked, widened by a margin; a primitive's box is the union of its vertices'
+boxes widened by d̂/2. Two primitives whose boxes do not overlap stay farther apart than d̂ as long as their vertices stay inside their
+boxes. So the list holds until a vertex leaves its box (checked for every Newton step; most steps need no new list).
+
+The search by lists: per body pair, primitives outside the other body's box are dropped first; the rest are tested all against all, which
+for a pad and a tool is a few hundred against a few hundred. :mod:`ipc.broad_phase.trees` finds the same pairs where there are more.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+__all__ = [
+    "Candidates",
+    "Surface",
+    "body_boxes",
+    "check_candidates",
+    "clear_body_boxes",
+    "find_ee",
+    "find_pt",
+    "leaves_box",
+    "put_back",
+    "rank_candidates",
+    "reset_lists",
+    "select_prims",
+    "vertex_boxes",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Surface:
+    """The surfaces of all bodies, which every environment shares."""
+
+    edges: wp.array2d(dtype=wp.int32)
+    faces: wp.array2d(dtype=wp.int32)
+    vert_area: wp.array(dtype=wp.float64)
+    edge_area: wp.array(dtype=wp.float64)
+    edge_rest2: wp.array(dtype=wp.float64)
+    plane_vert: wp.array(dtype=wp.int32)
+    plane_body: wp.array(dtype=wp.int32)
+    plane_pair: wp.array(dtype=wp.int32)
+    d_hat: wp.float64
+
+
+@wp.struct
+class Candidates:
+    """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits."""
+
+    pt: wp.array2d(dtype=wp.vec3i)
+    ee: wp.array2d(dtype=wp.vec3i)
+    pt_count: wp.array(dtype=wp.int32)
+    ee_count: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def pairs_of(candidates: Candidates, ee: wp.bool, env: wp.int32) -> wp.int32:
+    """Number of stored candidates of two edges (``ee``) or of a vertex and a face."""
+    if ee:
+        return wp.min(candidates.ee_count[env], candidates.ee.shape[1])
+    return wp.min(candidates.pt_count[env], candidates.pt.shape[1])
+
+
+@wp.func
+def pair_at(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32) -> wp.vec3i:
+    """Candidate i of two edges (``ee``) or of a vertex and a face."""
+    if ee:
+        return candidates.ee[env, i]
+    return candidates.pt[env, i]
+
+
+@wp.func
+def pair_vertices(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.vec4i:
+    """Vertices of two edges (``ee``) or of a vertex and a face."""
+    a, b = pair[0], pair[1]
+    if ee:
+        return wp.vec4i(surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1])
+    return wp.vec4i(a, surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2])
+
+
+@wp.kernel
+def leaves_box(
+    x: wp.array2d(dtype=wp.vec3d),
+    dx: wp.array2d(dtype=wp.vec3d),
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    stale: wp.array(dtype=wp.int32),
+    any_stale: wp.array(dtype=wp.int32),
+):
+    """Marks environments in which x or x + dx lies outside its vertex's box."""
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    p, q = x[env, v], x[env, v] + dx[env, v]
+    lo, hi = low[env, v], high[env, v]
+    a, b = wp.min(p, q), wp.max(p, q)
+    if not (a[0] >= lo[0] and a[1] >= lo[1] and a[2] >= lo[2] and b[0] <= hi[0] and b[1] <= hi[1] and b[2] <= hi[2]):
+        stale[env] = 1
+        any_stale[0] = 1
+
+
+@wp.kernel
+def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if a list did not fit."""
+    env = wp.tid()
+    if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
+        overflow[0] = 1
+
+
+@wp.kernel
+def vertex_boxes(
+    x: wp.array2d(dtype=wp.vec3d),
+    dx: wp.array2d(dtype=wp.vec3d),
+    margin: wp.float64,
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+):
+    """Boxes around [x, x + dx], widened by the margin."""
+    env, v = wp.tid()
+    if stale[env] == 0:
+        return
+    p, q = x[env, v], x[env, v] + dx[env, v]
+    m = wp.vec3d(margin, margin, margin)
+    low[env, v] = wp.min(p, q) - m
+    high[env, v] = wp.max(p, q) + m
+
+
+@wp.kernel
+def clear_body_boxes(stale: wp.array(dtype=wp.int32), low: wp.array3d(dtype=wp.float64), high: wp.array3d(dtype=wp.float64)):
+    """Empty boxes."""
+    env, body = wp.tid()
+    if stale[env] == 0:
+        return
+    for k in range(3):
+        low[env, body, k] = wp.float64(1.0e300)
+        high[env, body, k] = wp.float64(-1.0e300)
+
+
+@wp.kernel
+def body_boxes(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    vert_body: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    body_low: wp.array3d(dtype=wp.float64),
+    body_high: wp.array3d(dtype=wp.float64),
+):
+    """Unions of the vertices' boxes."""
+    env, v = wp.tid()
+    if stale[env] == 0:
+        return
+    body = vert_body[v]
+    for k in range(3):
+        wp.atomic_min(body_low, env, body, k, low[env, v][k])
+        wp.atomic_max(body_high, env, body, k, high[env, v][k])
+
+
+@wp.kernel
+def reset_lists(stale: wp.array(dtype=wp.int32), list_count: wp.array2d(dtype=wp.int32), candidates: Candidates):
+    """Empties the lists of the stale environments."""
+    env = wp.tid()
+    if stale[env] == 0:
+        return
+    for k in range(list_count.shape[1]):
+        list_count[env, k] = 0
+    candidates.pt_count[env] = 0
+    candidates.ee_count[env] = 0
+
+
+@wp.func
+def prim_low(low: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
+    """Lower corner of the box of vertex (kind 0), edge (1) or face (2) i."""
+    if kind == 0:
+        return low[env, i]
+    if kind == 1:
+        return wp.min(low[env, surface.edges[i, 0]], low[env, surface.edges[i, 1]])
+    return wp.min(wp.min(low[env, surface.faces[i, 0]], low[env, surface.faces[i, 1]]), low[env, surface.faces[i, 2]])
+
+
+@wp.func
+def prim_high(high: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
+    if kind == 0:
+        return high[env, i]
+    if kind == 1:
+        return wp.max(high[env, surface.edges[i, 0]], high[env, surface.edges[i, 1]])
+    return wp.max(wp.max(high[env, surface.faces[i, 0]], high[env, surface.faces[i, 1]]), high[env, surface.faces[i, 2]])
+
+
+@wp.func
+def overlap(lo: wp.vec3d, hi: wp.vec3d, lo2: wp.vec3d, hi2: wp.vec3d, reach: wp.float64) -> wp.bool:
+    return (
+        lo[0] <= hi2[0] + reach
+        and lo2[0] <= hi[0] + reach
+        and lo[1] <= hi2[1] + reach
+        and lo2[1] <= hi[1] + reach
+        and lo[2] <= hi2[2] + reach
+        and lo2[2] <= hi[2] + reach
+    )
+
+
+@wp.func
+def add_point_triangle(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    lo: wp.vec3d,
+    hi: wp.vec3d,
+    surface: Surface,
+    env: wp.int32,
+    v: wp.int32,
+    f: wp.int32,
+    pair: wp.int32,
+    candidates: Candidates,
+):
+    """Adds vertex v, with box ``lo`` to ``hi``, and face f if their boxes overlap, but for its corners."""
+    if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
+        if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
+            slot = wp.atomic_add(candidates.pt_count, env, 1)
+            if slot < candidates.pt.shape[1]:
+                candidates.pt[env, slot] = wp.vec3i(v, f, pair)
+
+
+@wp.func
+def add_edge_edge(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    lo: wp.vec3d,
+    hi: wp.vec3d,
+    surface: Surface,
+    env: wp.int32,
+    a: wp.int32,
+    b: wp.int32,
+    pair: wp.int32,
+    candidates: Candidates,
+):
+    """Adds edge a, with box ``lo`` to ``hi``, and edge b if boxes overlap, but for neighbours."""
+    if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
+        a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
+        b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
+        if a0 != b0 and a0 != b1 and a1 != b0 and a1 != b1:
+            slot = wp.atomic_add(candidates.ee_count, env, 1)
+            if slot < candidates.ee.shape[1]:
+                candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+
+
+@wp.kernel
+def select_prims(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    body_low: wp.array3d(dtype=wp.float64),
+    body_high: wp.array3d(dtype=wp.float64),
+    surface: Surface,
+    prim_kind: wp.array(dtype=wp.int32),
+    prim_index: wp.array(dtype=wp.int32),
+    prim_other: wp.array(dtype=wp.int32),
+    prim_list: wp.array(dtype=wp.int32),
+    list_start: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    list_count: wp.array2d(dtype=wp.int32),
+    members: wp.array2d(dtype=wp.int32),
+):
+    """Keeps the primitives of each list that reach the box of the body they may touch."""
+    env, i = wp.tid()
+    if stale[env] == 0:
+        return
+    kind, index, other, which = prim_kind[i], prim_index[i], prim_other[i], prim_list[i]
+    lo = prim_low(low, surface, env, kind, index)
+    hi = prim_high(high, surface, env, kind, index)
+    blo = wp.vec3d(body_low[env, other, 0], body_low[env, other, 1], body_low[env, other, 2])
+    bhi = wp.vec3d(body_high[env, other, 0], body_high[env, other, 1], body_high[env, other, 2])
+    if overlap(lo, hi, blo, bhi, surface.d_hat):
+        slot = wp.atomic_add(list_count, env, which, 1)
+        members[env, list_start[which] + slot] = index
+
+
+@wp.kernel
+def find_pt(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    members: wp.array2d(dtype=wp.int32),
+    list_start: wp.array(dtype=wp.int32),
+    list_count: wp.array2d(dtype=wp.int32),
+    first: wp.int32,
+    second: wp.int32,
+    pair: wp.int32,
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    candidates: Candidates,
+):
+    """Vertices of list ``first`` against faces of list ``second``."""
+    env, i = wp.tid()
+    if stale[env] == 0 or i >= list_count[env, first]:
+        return
+    v = members[env, list_start[first] + i]
+    lo, hi = low[env, v], high[env, v]
+    for k in range(list_count[env, second]):
+        f = members[env, list_start[second] + k]
+        add_point_triangle(low, high, lo, hi, surface, env, v, f, pair, candidates)
+
+
+@wp.kernel
+def find_ee(
+    low: wp.array2d(dtype=wp.vec3d),
+    high: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    members: wp.array2d(dtype=wp.int32),
+    list_start: wp.array(dtype=wp.int32),
+    list_count: wp.array2d(dtype=wp.int32),
+    first: wp.int32,
+    second: wp.int32,
+    pair: wp.int32,
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    candidates: Candidates,
+):
+    """Edges of list ``first`` against those of ``second``; within one body each pair once."""
+    env, i = wp.tid()
+    if stale[env] == 0 or i >= list_count[env, first]:
+        return
+    a = members[env, list_start[first] + i]
+    lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
+    for k in range(list_count[env, second]):
+        b = members[env, list_start[second] + k]
+        if first != second or a < b:
+            add_edge_edge(low, high, lo, hi, surface, env, a, b, pair, candidates)
+
+
+@wp.func
+def comes_before(a: wp.vec3i, b: wp.vec3i) -> wp.bool:
+    return a[0] < b[0] or (a[0] == b[0] and a[1] < b[1])
+
+
+@wp.kernel
+def rank_candidates(
+    items: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    ordered: wp.array2d(dtype=wp.vec3i),
+):
+    """Sorts the pairs, which are unique, so that their order does not depend on scheduling."""
+    env, i = wp.tid()
+    if stale[env] == 0 or i >= count[env]:
+        return
+    rank = wp.int32(0)
+    for k in range(wp.min(count[env], items.shape[1])):
+        if comes_before(items[env, k], items[env, i]):
+            rank += 1
+    ordered[env, rank] = items[env, i]
+
+
+@wp.kernel
+def put_back(
+    ordered: wp.array2d(dtype=wp.vec3i),
+    count: wp.array(dtype=wp.int32),
+    stale: wp.array(dtype=wp.int32),
+    # outputs
+    items: wp.array2d(dtype=wp.vec3i),
+):
+    env, i = wp.tid()
+    if stale[env] != 0 and i < count[env]:
+        items[env, i] = ordered[env, i]

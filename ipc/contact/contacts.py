@@ -1,0 +1,102 @@
+"""Buffers of contacts and of the rows of their Hessian; counts may exceed what fits."""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+__all__ = [
+    "Contacts",
+    "check_contacts",
+    "clear",
+    "mat34d",
+    "push_contact",
+    "push_matrix",
+    "push_row",
+    "rows_of",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+class mat34d(wp.types.matrix(shape=(3, 4), dtype=wp.float64)):
+    """Four vectors of three, one for each vertex of a pair."""
+
+
+@wp.struct
+class Contacts:
+    """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused."""
+
+    verts: wp.array2d(dtype=wp.vec4i)
+    coef: wp.array2d(dtype=wp.vec4d)
+    normal: wp.array2d(dtype=wp.vec3d)
+    force: wp.array2d(dtype=wp.float64)
+    gap: wp.array2d(dtype=wp.float64)
+    pair: wp.array2d(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    row_verts: wp.array2d(dtype=wp.vec4i)
+    row: wp.array2d(dtype=mat34d)
+    row_count: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def rows_of(contacts: Contacts, env: wp.int32) -> wp.int32:
+    """Rows of an environment that are stored."""
+    return wp.min(contacts.row_count[env], contacts.row.shape[1])
+
+
+@wp.func
+def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d):
+    slot = wp.atomic_add(out.row_count, env, 1)
+    if slot < out.row.shape[1]:
+        out.row_verts[env, slot] = verts
+        out.row[env, slot] = row
+
+
+@wp.func
+def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
+    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3))
+
+
+@wp.func
+def push_contact(
+    out: Contacts, env: wp.int32, verts: wp.vec4i, coef: wp.vec4d, n: wp.vec3d, d: wp.float64, force: wp.float64, pair: wp.int32
+):
+    slot = wp.atomic_add(out.count, env, 1)
+    if slot < out.force.shape[1]:
+        out.verts[env, slot] = verts
+        out.coef[env, slot] = coef
+        out.normal[env, slot] = n
+        out.force[env, slot] = force
+        out.gap[env, slot] = d
+        out.pair[env, slot] = pair
+
+
+@wp.kernel
+def clear(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """No forces, contacts or rows in the active environments."""
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    gradient[env, v] = wp.vec3d()
+    if v == 0:
+        energy[env] = wp.float64(0.0)
+        out.count[env] = 0
+        out.row_count[env] = 0
+
+
+@wp.kernel
+def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
+    """Raises the flag if contacts or rows did not fit."""
+    env = wp.tid()
+    if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
+        overflow[0] = 1

@@ -1,0 +1,242 @@
+"""Lagged Coulomb friction (Li et al. 2020, section 5).
+
+With the normal force λ, the normal n and the closest points c_i of an earlier iterate held fixed, a pair stores μ λ f0(‖u‖), where
+u = (1 − n nᵀ) Σ c_i (x_i − x_i^start) is its sliding since the start of the step and ε = ε_v h:
+
+    f0(y) = y²/ε − y³/(3 ε²) + ε/3 for y < ε, else y;    f1 = f0' = 2y/ε − y²/ε² or 1.
+
+The Hessian μ λ [(f1/y)(1 − û ûᵀ) + f1' û ûᵀ] has no negative eigenvalue: two rows, along û and across it. Below the threshold a pair
+under the tangential load r μ λ creeps at ε_v (1 − √(1 − r)).
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.contact.contacts import Contacts, push_row
+
+__all__ = [
+    "Lagged",
+    "clear_change",
+    "friction_change",
+    "friction_rows",
+    "keep_lagged",
+    "lag_contacts",
+    "lag_difference",
+    "share_of_change",
+    "size_of_change",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Lagged:
+    """The pairs whose normal force is held fixed; ``limit`` is μ λ [N]."""
+
+    verts: wp.array2d(dtype=wp.vec4i)
+    coef: wp.array2d(dtype=wp.vec4d)
+    normal: wp.array2d(dtype=wp.vec3d)
+    limit: wp.array2d(dtype=wp.float64)
+    pair: wp.array2d(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def friction_potential(y: wp.float64, eps: wp.float64) -> wp.float64:
+    """f0 [m]."""
+    if y >= eps:
+        return y
+    return y * y / eps - y * y * y / (wp.float64(3.0) * eps * eps) + eps / wp.float64(3.0)
+
+
+@wp.func
+def friction_slope_ratio(y: wp.float64, eps: wp.float64) -> wp.float64:
+    """f1(y)/y [1/m], finite at 0."""
+    if y >= eps:
+        return wp.float64(1.0) / y
+    return (wp.float64(2.0) - y / eps) / eps
+
+
+@wp.func
+def friction_curvature(y: wp.float64, eps: wp.float64) -> wp.float64:
+    """f1'(y) [1/m]."""
+    if y >= eps:
+        return wp.float64(0.0)
+    return wp.float64(2.0) * (wp.float64(1.0) - y / eps) / eps
+
+
+@wp.func
+def sliding(
+    x: wp.array2d(dtype=wp.vec3d), start: wp.array2d(dtype=wp.vec3d), env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d
+) -> wp.vec3d:
+    """u, the tangential part of Σ c_i (x_i − start_i) [m]."""
+    u = wp.vec3d()
+    for i in range(4):
+        if verts[i] >= 0:
+            u += c[i] * (x[env, verts[i]] - start[env, verts[i]])
+    return u - wp.dot(u, n) * n
+
+
+@wp.kernel
+def keep_lagged(lagged: Lagged, active: wp.array(dtype=wp.int32), out: Lagged):
+    """Copies the lagged pairs of the active environments."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        out.count[env] = lagged.count[env]
+    if i < lagged.count[env]:
+        out.verts[env, i] = lagged.verts[env, i]
+        out.coef[env, i] = lagged.coef[env, i]
+        out.normal[env, i] = lagged.normal[env, i]
+        out.limit[env, i] = lagged.limit[env, i]
+
+
+@wp.kernel
+def lag_contacts(
+    contacts: Contacts,
+    mu: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    out: Lagged,
+):
+    """Freezes the contacts of the active environments."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
+    if i < contacts.count[env]:
+        out.verts[env, i] = contacts.verts[env, i]
+        out.coef[env, i] = contacts.coef[env, i]
+        out.normal[env, i] = contacts.normal[env, i]
+        out.limit[env, i] = mu[contacts.pair[env, i]] * contacts.force[env, i]
+        out.pair[env, i] = contacts.pair[env, i]
+
+
+@wp.kernel
+def friction_rows(
+    x: wp.array2d(dtype=wp.vec3d),
+    start: wp.array2d(dtype=wp.vec3d),
+    lagged: Lagged,
+    eps: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    out: Contacts,
+):
+    """Friction forces and rows."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        limit = lagged.limit[env, i]
+        if limit <= wp.float64(0.0):
+            continue
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        u = sliding(x, start, env, verts, c, n)
+        y = wp.length(u)
+        ratio = friction_slope_ratio(y, eps)
+        for k in range(4):
+            if verts[k] >= 0:
+                wp.atomic_add(gradient, env, verts[k], (limit * ratio * c[k]) * u)
+        along = wp.vec3d()
+        if y > wp.float64(0.0):
+            along = u / y
+        else:
+            axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+            if wp.abs(n[0]) > wp.float64(0.7):
+                axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+            along = wp.normalize(axis - wp.dot(axis, n) * n)
+        across = wp.cross(n, along)
+        p, q = wp.sqrt(limit * friction_curvature(y, eps)), wp.sqrt(limit * ratio)
+        if p > wp.float64(0.0):
+            push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
+        push_row(out, env, verts, (q * c[0]) * across, (q * c[1]) * across, (q * c[2]) * across, (q * c[3]) * across)
+
+
+@wp.kernel
+def friction_change(
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    start: wp.array2d(dtype=wp.vec3d),
+    lagged: Lagged,
+    eps: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the friction potential from x0 to x1 [J]."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        y0 = wp.length(sliding(x0, start, env, verts, c, n))
+        y1 = wp.length(sliding(x1, start, env, verts, c, n))
+        wp.atomic_add(change, env, lagged.limit[env, i] * (friction_potential(y1, eps) - friction_potential(y0, eps)))
+
+
+@wp.kernel
+def lag_difference(
+    lagged: Lagged,
+    sign: wp.float64,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    force: wp.array2d(dtype=wp.vec3d),
+    size: wp.array(dtype=wp.float64),
+):
+    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
+
+    Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
+    """
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        for k in range(4):
+            if verts[k] >= 0:
+                wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
+        if sign > wp.float64(0.0):
+            wp.atomic_add(size, env, lagged.limit[env, i])
+
+
+@wp.kernel
+def clear_change(
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    change: wp.array2d(dtype=wp.vec3d),
+    force: wp.array(dtype=wp.float64),
+    changed: wp.array(dtype=wp.float64),
+):
+    env, v = wp.tid()
+    if active[env] == 0:
+        return
+    change[env, v] = wp.vec3d()
+    if v == 0:
+        force[env] = wp.float64(0.0)
+        changed[env] = wp.float64(0.0)
+
+
+@wp.kernel
+def size_of_change(change: wp.array2d(dtype=wp.vec3d), active: wp.array(dtype=wp.int32), size: wp.array2d(dtype=wp.float64)):
+    env, v = wp.tid()
+    if active[env] != 0:
+        size[env, v] = wp.length(change[env, v])
+
+
+@wp.kernel
+def share_of_change(force: wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.float64)):
+    """changed ← changed / Σ μ λ."""
+    env = wp.tid()
+    if active[env] != 0:
+        changed[env] = changed[env] / wp.max(force[env], wp.float64(1.0e-300))

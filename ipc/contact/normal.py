@@ -1,0 +1,322 @@
+"""Contact energy, forces and Hessian of point-triangle, edge-edge and point-plane pairs.
+
+Weights follow ipctk's area weighting: A_v/4 for a point-triangle pair, (A_e + A_f)/4 for two edges, A_v for a point above a plane,
+with a third of the adjacent triangles' area for each vertex and edge. Surfaces that are flat over a d̂ carry a pressure near
+κ (−∂/∂d)[d̂ b/D̂²], whatever the mesh.
+
+The Hessian is a sum of *rows*, q qᵀ with q of four vertices: positive semi-definite by construction, and already the low-rank form
+that a Woodbury update needs. An unmollified pair gives one row, the Gauss-Newton term with k = max(0, 2b' + 4D b''); a mollified pair
+gives five: two for the 2×2 Hessian in (distance, c), clamped, and three for the curvature of c.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
+from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
+from ipc.contact.distance import edge_edge_coefficients, pair_coefficients, point_triangle_coefficients, separation
+
+__all__ = [
+    "contact_ee",
+    "contact_plane",
+    "contact_pt",
+    "energy_pairs",
+    "energy_plane",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def cross_squared(a0: wp.vec3d, a1: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d) -> wp.float64:
+    """c = ‖(a1 − a0) × (b1 − b0)‖² [m⁴]."""
+    return wp.length_sq(wp.cross(a1 - a0, b1 - b0))
+
+
+@wp.func
+def mollifier_threshold(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float64:
+    """eps = 1e-3 ‖a‖² ‖b‖² of the rest edges [m⁴] (Li et al. 2020, supplement, section 5)."""
+    return wp.float64(1.0e-3) * surface.edge_rest2[a] * surface.edge_rest2[b]
+
+
+@wp.func
+def edge_weight(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float64:
+    return wp.float64(0.25) * (surface.edge_area[a] + surface.edge_area[b])
+
+
+@wp.func
+def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
+    """κ d̂ / D̂² = κ / d̂³ [Pa/m³]."""
+    return kappa / (surface.d_hat * surface.d_hat * surface.d_hat)
+
+
+@wp.func
+def push_simple(
+    out: Contacts,
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    env: wp.int32,
+    verts: wp.vec4i,
+    coef: wp.vec4d,
+    t: wp.vec3d,
+    D: wp.float64,
+    Dh: wp.float64,
+    scale: wp.float64,
+    pair: wp.int32,
+):
+    """Force, contact and row of a pair without mollifier; ``scale`` is A κ/d̂³."""
+    d = wp.sqrt(D)
+    n = t / d
+    first, second = barrier_first(D, Dh), barrier_second(D, Dh)
+    slope = scale * wp.float64(2.0) * d * first
+    k = wp.sqrt(scale * wp.max(wp.float64(0.0), wp.float64(2.0) * first + wp.float64(4.0) * D * second))
+    for i in range(4):
+        if verts[i] >= 0:
+            wp.atomic_add(gradient, env, verts[i], (slope * coef[i]) * n)
+    wp.atomic_add(energy, env, scale * barrier(D, Dh))
+    push_contact(out, env, verts, coef, n, d, -slope, pair)
+    push_row(out, env, verts, (k * coef[0]) * n, (k * coef[1]) * n, (k * coef[2]) * n, (k * coef[3]) * n)
+
+
+@wp.func
+def push_mollified(
+    out: Contacts,
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    env: wp.int32,
+    verts: wp.vec4i,
+    coef: wp.vec4d,
+    t: wp.vec3d,
+    D: wp.float64,
+    Dh: wp.float64,
+    scale: wp.float64,
+    u: wp.vec3d,
+    v: wp.vec3d,
+    c: wp.float64,
+    eps: wp.float64,
+    pair: wp.int32,
+):
+    """Force, contact and rows of nearly parallel edges along u and v; ``scale`` is A κ/d̂³."""
+    zero, two = wp.float64(0.0), wp.float64(2.0)
+    d = wp.sqrt(D)
+    n = t / d
+    first, second = barrier_first(D, Dh), barrier_second(D, Dh)
+    f = scale * barrier(D, Dh)
+    f_d = scale * two * d * first
+    f_dd = scale * (two * first + wp.float64(4.0) * D * second)
+    m, m1, m2 = mollifier(c, eps), mollifier_first(c, eps), mollifier_second(c, eps)
+    w = wp.cross(u, v)
+    ga, gb = two * wp.cross(v, w), two * wp.cross(w, u)  # ∂c/∂a1, ∂c/∂b1
+    slope = m * f_d
+    wp.atomic_add(gradient, env, verts[0], (slope * coef[0]) * n - (f * m1) * ga)
+    wp.atomic_add(gradient, env, verts[1], (slope * coef[1]) * n + (f * m1) * ga)
+    wp.atomic_add(gradient, env, verts[2], (slope * coef[2]) * n - (f * m1) * gb)
+    wp.atomic_add(gradient, env, verts[3], (slope * coef[3]) * n + (f * m1) * gb)
+    wp.atomic_add(energy, env, m * f)
+    push_contact(out, env, verts, coef, n, d, -slope, pair)
+    # As a function of d and c alone, m f has the Hessian [h00 h01; h01 h11] over their gradients. It is clamped as the matrix that it is
+    # in the space of the four vertices, over the orthonormal e1, e2 that span the gradients: ∇d = g e1, ∇c = s e1 + rest e2.
+    h00, h01, h11 = m * f_dd, f_d * m1, f * m2
+    g = wp.length(coef)
+    e1 = wp.matrix_from_cols((coef[0] / g) * n, (coef[1] / g) * n, (coef[2] / g) * n, (coef[3] / g) * n)
+    e2 = wp.matrix_from_cols(-ga, ga, -gb, gb)
+    s = wp.ddot(e1, e2)
+    e2 = e2 - s * e1
+    rest = wp.sqrt(wp.ddot(e2, e2))
+    if rest > zero:
+        e2 = e2 / rest
+    k00, k01, k11 = g * g * h00 + two * g * s * h01 + s * s * h11, rest * (g * h01 + s * h11), rest * rest * h11
+    mean, half = (k00 + k11) / two, (k00 - k11) / two
+    radius = wp.sqrt(half * half + k01 * k01)
+    ex, ey = half + radius, k01  # eigenvector of mean + radius
+    if half < zero:
+        ex, ey = k01, radius - half
+    size = wp.sqrt(ex * ex + ey * ey)
+    if size > zero:
+        ex, ey = ex / size, ey / size
+    else:
+        ex, ey = wp.float64(1.0), zero
+    for k in range(2):
+        value = mean + radius
+        px, py = ex, ey
+        if k == 1:
+            value = mean - radius
+            px, py = -ey, ex
+        if value > zero:
+            push_matrix(out, env, verts, wp.sqrt(value) * (px * e1 + py * e2))
+    r = wp.sqrt(two * f * m1)
+    for k in range(3):
+        axis = wp.vec3d(zero, zero, zero)
+        axis[k] = r
+        ra, rb = wp.cross(v, axis), wp.cross(axis, u)
+        push_row(out, env, verts, -ra, ra, -rb, rb)
+
+
+@wp.kernel
+def contact_pt(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Point-triangle pairs."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, pairs_of(candidates, False, env), lanes):
+        item = candidates.pt[env, i]
+        verts = pair_vertices(surface, False, item)
+        p, a, b, c = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+        Dh = surface.d_hat * surface.d_hat
+        coef = point_triangle_coefficients(p, a, b, c)
+        t = separation(coef, p, a, b, c)
+        D = wp.length_sq(t)
+        if Dh > D:
+            scale = wp.float64(0.25) * surface.vert_area[verts[0]] * scale_of(surface, kappa[env])
+            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
+
+
+@wp.kernel
+def contact_ee(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Edge-edge pairs, mollified where they are nearly parallel."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, pairs_of(candidates, True, env), lanes):
+        item = candidates.ee[env, i]
+        ea, eb = item[0], item[1]
+        verts = pair_vertices(surface, True, item)
+        a0, a1, b0, b1 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+        Dh = surface.d_hat * surface.d_hat
+        coef = edge_edge_coefficients(a0, a1, b0, b1)
+        t = separation(coef, a0, a1, b0, b1)
+        D = wp.length_sq(t)
+        if Dh <= D:
+            continue
+        scale = edge_weight(surface, ea, eb) * scale_of(surface, kappa[env])
+        eps = mollifier_threshold(surface, ea, eb)
+        c = cross_squared(a0, a1, b0, b1)
+        if c >= eps:
+            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
+        else:
+            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, a1 - a0, b1 - b0, c, eps, item[2])
+
+
+@wp.kernel
+def contact_plane(
+    x: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+    energy: wp.array(dtype=wp.float64),
+    out: Contacts,
+):
+    """Points above half-spaces."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, surface.plane_vert.shape[0], lanes):
+        v, body = surface.plane_vert[i], surface.plane_body[i]
+        R = frame_R[env, body]
+        n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+        d = wp.dot(n, x[env, v] - frame_t[env, body])
+        if d < surface.d_hat:
+            scale = surface.vert_area[v] * scale_of(surface, kappa[env])
+            zero, Dh, verts = wp.float64(0.0), surface.d_hat * surface.d_hat, wp.vec4i(v, -1, -1, -1)
+            coef = wp.vec4d(wp.float64(1.0), zero, zero, zero)
+            push_simple(out, gradient, energy, env, verts, coef, d * n, d * d, Dh, scale, surface.plane_pair[i])
+
+
+@wp.func
+def pair_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+    """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
+    v = pair_vertices(surface, ee, pair)
+    x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
+    b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
+    if b == wp.float64(0.0):
+        return b
+    if ee:
+        m = mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
+        return edge_weight(surface, pair[0], pair[1]) * b * m
+    return wp.float64(0.25) * surface.vert_area[v[0]] * b
+
+
+@wp.kernel
+def energy_pairs(
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    candidates: Candidates,
+    ee: wp.bool,
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        pair = pair_at(candidates, ee, env, i)
+        e = pair_energy(x1, surface, env, ee, pair) - pair_energy(x0, surface, env, ee, pair)
+        if e != wp.float64(0.0):
+            wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
+
+
+@wp.kernel
+def energy_plane(
+    x0: wp.array2d(dtype=wp.vec3d),
+    x1: wp.array2d(dtype=wp.vec3d),
+    surface: Surface,
+    frame_R: wp.array2d(dtype=wp.mat33d),
+    frame_t: wp.array2d(dtype=wp.vec3d),
+    kappa: wp.array(dtype=wp.float64),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    change: wp.array(dtype=wp.float64),
+):
+    """Adds the change of the point-plane energy from x0 to x1 [J]."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, surface.plane_vert.shape[0], lanes):
+        v, body = surface.plane_vert[i], surface.plane_body[i]
+        R = frame_R[env, body]
+        n = wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+        d0 = wp.dot(n, x0[env, v] - frame_t[env, body])
+        d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
+        if d0 < surface.d_hat or d1 < surface.d_hat:
+            Dh = surface.d_hat * surface.d_hat
+            e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
+            wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)

@@ -1,0 +1,31 @@
+"""Tetrahedral and triangle meshes."""
+
+from ipc.meshes.mesh import (
+    Cut,
+    TetMesh,
+    TriMesh,
+    box_mesh,
+    box_surface,
+    domed_pad,
+    graded,
+    icosphere,
+    surface_of,
+    surface_topology,
+    tet_volumes,
+)
+from ipc.meshes.tetwild import tetrahedralize
+
+__all__ = [
+    "Cut",
+    "TetMesh",
+    "TriMesh",
+    "box_mesh",
+    "box_surface",
+    "domed_pad",
+    "graded",
+    "icosphere",
+    "surface_of",
+    "surface_topology",
+    "tet_volumes",
+    "tetrahedralize",
+]

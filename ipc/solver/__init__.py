@@ -1,0 +1,1 @@
+"""The time step: incremental potential, Newton's method, conjugate gradients, forces."""

@@ -1,0 +1,342 @@
+"""Decisions of a step, taken on the device, one thread an environment.
+
+Flags of one element say whether any environment needs a branch; they are the conditions of the graph's ``if`` and ``while`` nodes. While
+``halt`` is set (a buffer was too small) nothing is decided and no state changes, so that the iteration can be repeated.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.solver.step_state import Decisions, Flags
+
+__all__ = [
+    "after_lag",
+    "after_solve",
+    "choose_advancing",
+    "choose_good",
+    "choose_lagging",
+    "clear_det",
+    "conclude",
+    "conclude_advance",
+    "end_search",
+    "judge_advance",
+    "judge_direction",
+    "judge_energy",
+    "set_done",
+    "set_flags",
+    "start_advance",
+    "start_limit",
+    "start_search",
+    "start_step",
+    "try_advance",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+BAD = 1e100
+"""Sizes of steps above this are not finite numbers."""
+
+
+@wp.kernel
+def start_step(friction: wp.int32, d: Decisions, f: Flags):
+    """Resets everything for a step; ``alive`` and ``progress`` are set."""
+    env = wp.tid()
+    zero = wp.float64(0.0)
+    alive = d.alive[env]
+    d.pending[env] = alive * friction
+    d.active[env] = alive * (1 - friction)
+    d.relags[env] = -friction
+    if alive == 0:
+        d.progress[env] = zero
+    d.poor[env] = 0
+    d.rested[env] = 0
+    d.ready[env] = 1
+    d.since_lag[env] = 0
+    d.good[env] = 0
+    d.failed[env] = 0
+    d.converged[env] = 0
+    d.stalled[env] = 0
+    d.newton[env] = 0
+    d.linear[env] = 0
+    d.line_search[env] = 0
+    d.project[env] = 0
+    d.speed[env] = zero
+    d.ccd[env] = wp.float64(1.0)
+    d.min_gap[env] = wp.float64(wp.inf)
+    d.min_det[env] = wp.float64(wp.inf)
+
+
+@wp.kernel
+def set_flags(d: Decisions, f: Flags):
+    """Says whether anything remains to be done; flags were cleared."""
+    env = wp.tid()
+    if f.halt[0] == 0:
+        if d.active[env] != 0 or d.pending[env] != 0:
+            f.go[0] = 1
+        if d.pending[env] != 0:
+            f.pending[0] = 1
+
+
+@wp.kernel
+def set_done(f: Flags):
+    """done = 1 unless halted."""
+    f.done[0] = 1 - f.halt[0]
+
+
+@wp.kernel
+def choose_lagging(d: Decisions, f: Flags):
+    env = wp.tid()
+    d.lagging[env] = d.pending[env] * (1 - f.halt[0])
+
+
+@wp.kernel
+def after_lag(tolerance: wp.float64, d: Decisions, f: Flags):
+    """Minimises (again) where friction is new or changed by more than the tolerance."""
+    env = wp.tid()
+    if d.lagging[env] == 0:
+        return
+    d.pending[env] = 0
+    if d.relags[env] < 0 or d.changed[env] > tolerance:
+        d.relags[env] = d.relags[env] + 1
+        d.active[env] = 1
+        d.converged[env] = 0
+        d.since_lag[env] = 0
+        d.poor[env] = 0
+        d.rested[env] = 0
+        d.ready[env] = 1
+
+
+@wp.kernel
+def choose_advancing(d: Decisions, f: Flags):
+    """Advances frames that have not arrived, but for poor ones until the unknowns rest."""
+    env = wp.tid()
+    d.pcg_iterations[env] = 0
+    go = 0
+    if d.active[env] != 0 and d.progress[env] < wp.float64(1.0) and d.ready[env] != 0:
+        if d.poor[env] == 0 or d.rested[env] != 0:
+            go = 1
+            f.advance[0] = 1
+    d.advancing[env] = go
+    d.trial_progress[env] = d.progress[env]
+    if go != 0:
+        d.trial_progress[env] = wp.float64(1.0)
+
+
+@wp.kernel
+def after_solve(
+    iterations: wp.array(dtype=wp.int32),
+    negative: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),
+    d: Decisions,
+    f: Flags,
+):
+    """Counts iterations and asks for a definite matrix after negative curvature."""
+    env = wp.tid()
+    again = 0
+    if mask[env] != 0 and f.halt[0] == 0:
+        d.pcg_iterations[env] = d.pcg_iterations[env] + iterations[env]
+        if negative[env] != 0 and d.project[env] == 0:
+            d.project[env] = 1
+            again = 1
+            f.again[0] = 1
+    d.again[env] = again
+
+
+@wp.kernel
+def judge_direction(dt: wp.float64, d: Decisions, f: Flags):
+    """Drops environments that are not finite; others advance frames or take a plain step."""
+    env = wp.tid()
+    d.plain[env] = 0
+    if f.halt[0] != 0:
+        d.advancing[env] = 0
+        return
+    if d.active[env] == 0:
+        return
+    if not (d.size[env] < wp.float64(BAD)):
+        d.failed[env] = 1
+        d.active[env] = 0
+        d.advancing[env] = 0
+        return
+    d.speed[env] = d.size[env] / dt
+    if d.advancing[env] == 0:
+        d.plain[env] = 1
+        f.plain[0] = 1
+
+
+@wp.kernel
+def start_advance(d: Decisions, f: Flags):
+    env = wp.tid()
+    d.shorten[env] = d.advancing[env]
+    d.attempts[env] = 0
+    d.length[env] = wp.float64(d.advancing[env])
+    if d.advancing[env] != 0:
+        f.shorten[0] = 1
+
+
+@wp.kernel
+def try_advance(slack: wp.float64, floor: wp.float64, d: Decisions, f: Flags):
+    """Sets the end of an advance of the present length, and what must stay of the gaps.
+
+    A shortened motion ends where a gap is about used up. It is checked again, since the path of a turning frame is no straight line, and
+    with half the limit, or rounding would refuse what was just allowed.
+    """
+    env = wp.tid()
+    one = wp.float64(1.0)
+    length, share = d.length[env], d.progress[env]
+    d.trial_progress[env] = share + length * (one - share)
+    if d.advancing[env] != 0 and length == one:
+        d.trial_progress[env] = one
+    d.alpha[env] = length
+    ease = one
+    if d.attempts[env] > 0:
+        ease = wp.float64(0.5)
+    d.slack[env] = ease * slack
+    d.floor[env] = ease * floor
+    d.trial_det[env] = wp.float64(wp.inf)
+
+
+@wp.kernel
+def judge_advance(most: wp.int32, d: Decisions, f: Flags):
+    """Shortens the advance where a gap would close or an element invert."""
+    env = wp.tid()
+    if d.shorten[env] == 0:
+        return
+    one = wp.float64(1.0)
+    if f.halt[0] != 0:
+        d.shorten[env] = 0
+        return
+    alpha = d.alpha[env]
+    if not (d.trial_det[env] > wp.float64(0.0)):
+        alpha = wp.float64(0.5) * alpha
+    d.attempts[env] = d.attempts[env] + 1
+    if alpha >= one:
+        d.shorten[env] = 0
+        return
+    if d.attempts[env] > most - 2:
+        alpha = wp.float64(0.0)
+    d.length[env] = d.length[env] * alpha * (one - wp.float64(1.0e-9))
+    if d.attempts[env] >= most:
+        d.shorten[env] = 0
+    else:
+        f.shorten[0] = 1
+
+
+@wp.kernel
+def conclude_advance(blocked: wp.float64, poor: wp.float64, d: Decisions, f: Flags):
+    """Accepts the advance; frames that hardly move after the unknowns rested are blocked."""
+    env = wp.tid()
+    d.accepted[env] = 0
+    if f.halt[0] != 0 or d.advancing[env] == 0:
+        return
+    d.accepted[env] = 1
+    advance = d.trial_progress[env] - d.progress[env]
+    d.progress[env] = d.trial_progress[env]
+    if d.poor[env] != 0 and advance < blocked:
+        d.active[env] = 0
+        d.converged[env] = 1
+    d.poor[env] = 0
+    if d.length[env] < poor:
+        d.poor[env] = 1
+    d.rested[env] = 0
+    d.ready[env] = 0
+
+
+@wp.kernel
+def start_limit(slack: wp.float64, d: Decisions, f: Flags):
+    env = wp.tid()
+    d.slack[env] = slack
+    d.floor[env] = wp.float64(0.0)
+    d.alpha[env] = wp.float64(1.0)
+
+
+@wp.kernel
+def start_search(reach: wp.array(dtype=wp.float64), d: Decisions, f: Flags):
+    """Starts the line search, which allows for rounding of positions by force × size × 1e-15."""
+    env = wp.tid()
+    d.trials[env] = 0
+    d.searching[env] = 0
+    if d.plain[env] == 0 or f.halt[0] != 0:
+        return
+    d.searching[env] = 1
+    f.search[0] = 1
+    d.allowed[env] = d.alpha[env]
+    d.ccd[env] = wp.min(d.ccd[env], d.alpha[env])
+    d.noise[env] = wp.float64(1.0e-15) * reach[env] * d.noise[env]
+
+
+@wp.kernel
+def clear_det(d: Decisions, f: Flags):
+    d.trial_det[wp.tid()] = wp.float64(wp.inf)
+
+
+@wp.kernel
+def judge_energy(armijo: wp.float64, most: wp.int32, d: Decisions, f: Flags):
+    """Ends the search where the energy fell enough (Armijo), else halves the step."""
+    env = wp.tid()
+    if d.searching[env] == 0:
+        return
+    d.trials[env] = d.trials[env] + 1
+    bound = armijo * d.alpha[env] * d.slope[env] + d.noise[env]
+    if d.change[env] <= bound and d.trial_det[env] > wp.float64(0.0):
+        d.searching[env] = 0
+    else:
+        d.alpha[env] = wp.float64(0.5) * d.alpha[env]
+        if d.trials[env] < most:
+            f.search[0] = 1
+
+
+@wp.kernel
+def end_search(d: Decisions, f: Flags):
+    env = wp.tid()
+    d.accepted[env] = 0
+    if d.plain[env] != 0 and f.halt[0] == 0:
+        d.line_search[env] = d.line_search[env] + d.trials[env]
+        d.accepted[env] = 1 - d.searching[env]
+
+
+@wp.kernel
+def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, friction: wp.int32, d: Decisions, f: Flags):
+    """Ends an iteration: environments converge, give up, or have their friction lagged again."""
+    env = wp.tid()
+    if f.halt[0] != 0:
+        return
+    was_active = d.advancing[env] + d.plain[env]
+    if was_active != 0:
+        d.newton[env] = d.newton[env] + 1
+        d.since_lag[env] = d.since_lag[env] + 1
+        d.linear[env] = d.linear[env] + d.pcg_iterations[env]
+    if d.plain[env] != 0:
+        d.ready[env] = 1
+        slow = d.speed[env] <= tolerance
+        if d.searching[env] != 0:
+            # Nothing lowered the energy: try again with a definite matrix; if it was definite, the search has stalled.
+            if d.project[env] != 0 and not slow:
+                d.stalled[env] = 1
+                d.active[env] = 0
+            d.project[env] = 1
+        # So small a step has converged, also where rounding of the energies kept it from being accepted.
+        if slow and d.allowed[env] >= wp.float64(1.0):
+            d.rested[env] = 1
+            if d.progress[env] >= wp.float64(1.0) and d.active[env] != 0:
+                d.converged[env] = 1
+                d.active[env] = 0
+    if was_active != 0 and d.since_lag[env] >= max_newton:
+        d.active[env] = 0
+    if was_active != 0 and d.active[env] == 0 and friction != 0 and d.relags[env] < max_relags:
+        d.pending[env] = 1
+
+
+@wp.kernel
+def choose_good(d: Decisions, f: Flags):
+    """Returns environments that failed, and their frames, to the start of the step."""
+    env = wp.tid()
+    d.good[env] = d.alive[env] * (1 - d.failed[env])
+    d.converged[env] = d.converged[env] * d.good[env]
+    d.accepted[env] = d.failed[env]
+    if d.failed[env] != 0:
+        d.progress[env] = wp.float64(0.0)

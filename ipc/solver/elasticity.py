@@ -1,0 +1,309 @@
+"""Stored energies of a tetrahedron and their derivatives, gathered into nodes and blocks.
+
+With F = Σ_a x_a ∇w_aᵀ and J = det F:
+
+``stable`` (code 0)      Ψ = μ/2 (I_C − 3) − μ (J − 1) + λ/2 (J − 1)²
+``stable_log`` (code 1)  Ψ = μ/2 (I_C − 3) + λ/2 (J − a)² − μ/2 ln(I_C + 1), a = 1 + 3μ/(4λ)      (Smith et al. 2018, eq. 14)
+``orthogonal`` (code 2)  Ψ = μ ‖F Fᵀ − 1‖²                                                        (Lan et al. 2022, eq. 6)
+
+To the first two comes, below J = J₀ = 0.2, the barrier −λ (J − J₀)² ln(J/J₀), of the form of the contact barrier: without it a collapsed
+element costs little, Newton's steps are cut short at det F = 0, and the step stalls. Above J₀ it is zero.
+
+For the first two, P = m F + c cof F with m = μ or μ (1 − 1/(I_C + 1)) and c = λ (J − 1) − μ or λ (J − a), plus the barrier's slope. The
+second derivative is
+
+    δP = m δF + k F (F : δF) + l cof F (cof F : δF) + c δ(cof F),        k = 0 or 2μ/(I_C + 1)², l = λ plus the barrier's curvature,
+
+and every term but the last is positive semi-definite. The blocks need no 9×9 matrix: with g_a = ∇w_a, the last term couples corners
+a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-definite, ``geometric_factor`` shrinks c toward 0 until it is;
+the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.contact.barrier import barrier, barrier_first, barrier_second
+from ipc.solver.dynamics import Masses
+
+__all__ = ["Elements", "block_hessian", "element_energy_change", "element_state", "node_elastic_gradient"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Elements:
+    """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa]."""
+
+    tets: wp.array2d(dtype=wp.int32)
+    grads: wp.array2d(dtype=wp.vec3d)
+    volume: wp.array(dtype=wp.float64)
+    model: wp.array(dtype=wp.int32)
+    mu: wp.array(dtype=wp.float64)
+    lam: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def cofactor(F: wp.mat33d) -> wp.mat33d:
+    """cof F = ∂J/∂F."""
+    f0 = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
+    f1 = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
+    f2 = wp.vec3d(F[0, 2], F[1, 2], F[2, 2])
+    return wp.matrix_from_cols(wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1))
+
+
+INVERSION = wp.constant(wp.float64(0.2))
+"""J₀: an element squeezed to less than this share of its volume meets the barrier."""
+
+
+@wp.func
+def squeeze(det: wp.float64) -> wp.float64:
+    """The barrier over λ, −(J − J₀)² ln(J/J₀) below J₀ [-]."""
+    if det <= wp.float64(0.0):
+        return wp.float64(1.0e30)
+    return barrier(det, INVERSION)
+
+
+@wp.func
+def squeeze_first(det: wp.float64) -> wp.float64:
+    """Its slope [-]."""
+    if det <= wp.float64(0.0):
+        return wp.float64(0.0)
+    return barrier_first(det, INVERSION)
+
+
+@wp.func
+def squeeze_second(det: wp.float64) -> wp.float64:
+    """Its curvature [-], never negative."""
+    if det <= wp.float64(0.0):
+        return wp.float64(0.0)
+    return barrier_second(det, INVERSION)
+
+
+@wp.func
+def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
+    """Ψ(F) [J/m³]."""
+    one, half = wp.float64(1.0), wp.float64(0.5)
+    ic = wp.ddot(F, F)
+    J = wp.determinant(F)
+    if model == 2:
+        C = F * wp.transpose(F) - wp.identity(n=3, dtype=wp.float64)
+        return mu * wp.ddot(C, C)
+    if model == 1:
+        a = one + wp.float64(0.75) * mu / lam
+        base = half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
+        return base + lam * squeeze(J)
+    return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + half * lam * (J - one) * (J - one) + lam * squeeze(J)
+
+
+@wp.func
+def stress_factors(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.vec3d:
+    """(m, c, k) of the module's docstring [Pa]."""
+    one = wp.float64(1.0)
+    pressure = lam * (J - one + squeeze_first(J))
+    if model == 1:
+        q = one / (wp.ddot(F, F) + one)
+        return wp.vec3d(mu * (one - q), pressure - wp.float64(0.75) * mu, wp.float64(2.0) * mu * q * q)
+    return wp.vec3d(mu, pressure - mu, wp.float64(0.0))
+
+
+@wp.func
+def first_piola(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
+    """P = ∂Ψ/∂F [Pa]."""
+    if model == 2:
+        return wp.float64(4.0) * mu * (F * wp.transpose(F) - wp.identity(n=3, dtype=wp.float64)) * F
+    f = stress_factors(F, J, model, mu, lam)
+    return f[0] * F + f[1] * cofactor(F)
+
+
+@wp.func
+def stretch_block_definite(s: wp.vec3d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.bool:
+    """True if the block of the stretch modes is semi-definite (leading minors ≥ 0)."""
+    p = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
+    a00 = m + k * s[0] * s[0] + lam * p[0] * p[0]
+    a11 = m + k * s[1] * s[1] + lam * p[1] * p[1]
+    a22 = m + k * s[2] * s[2] + lam * p[2] * p[2]
+    a01 = k * s[0] * s[1] + lam * p[0] * p[1] + c * s[2]
+    a02 = k * s[0] * s[2] + lam * p[0] * p[2] + c * s[1]
+    a12 = k * s[1] * s[2] + lam * p[1] * p[2] + c * s[0]
+    two = a00 * a11 - a01 * a01
+    three = a00 * (a11 * a22 - a12 * a12) - a01 * (a01 * a22 - a12 * a02) + a02 * (a01 * a12 - a11 * a02)
+    return a00 >= wp.float64(0.0) and two >= wp.float64(0.0) and three >= wp.float64(0.0)
+
+
+@wp.func
+def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64, c: wp.float64) -> wp.float64:
+    """The c' between 0 and c, closest to c, with a semi-definite second derivative."""
+    _U, s, _V = wp.svd3(F)
+    top = wp.max(wp.max(wp.abs(s[0]), wp.abs(s[1])), wp.abs(s[2]))
+    limit = m / wp.max(top, wp.float64(1.0e-30))  # twist and flip modes: m ± c s_i ≥ 0
+    high = wp.clamp(c, -limit, limit)
+    if stretch_block_definite(s, m, k, lam, high):
+        return high
+    low = wp.float64(0.0)
+    for _ in range(30):
+        middle = wp.float64(0.5) * (low + high)
+        if stretch_block_definite(s, m, k, lam, middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
+    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that it keeps its digits near rest."""
+    one, half = wp.float64(1.0), wp.float64(0.5)
+    G = F1 - F0
+    if model == 2:
+        eye = wp.identity(n=3, dtype=wp.float64)
+        sum_of = F0 * wp.transpose(F0) + F1 * wp.transpose(F1) - wp.float64(2.0) * eye
+        return mu * wp.ddot(G * wp.transpose(F1) + F0 * wp.transpose(G), sum_of)
+    ic = wp.ddot(G, F0 + F1)
+    # det(F0 + G) − det F0, term by term
+    J = wp.ddot(cofactor(F0), G) + wp.ddot(F0, cofactor(G)) + wp.determinant(G)
+    J0, J1 = wp.determinant(F0), wp.determinant(F1)
+    both = J0 + J1
+    barrier = lam * (squeeze(J1) - squeeze(J0))
+    if model == 1:
+        a = one + wp.float64(0.75) * mu / lam
+        z = ic / (wp.ddot(F0, F0) + one)
+        log1p = wp.log(one + z)
+        if wp.abs(z) < wp.float64(1.0e-3):
+            log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a) + barrier
+    return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0)) + barrier
+
+
+@wp.func
+def deformation(env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), elements: Elements) -> wp.mat33d:
+    """F of element e. Differences to corner 0, so that a common translation costs no digits."""
+    x0 = y[env, elements.tets[e, 0]]
+    F = wp.outer(y[env, elements.tets[e, 1]] - x0, elements.grads[e, 1])
+    F += wp.outer(y[env, elements.tets[e, 2]] - x0, elements.grads[e, 2])
+    F += wp.outer(y[env, elements.tets[e, 3]] - x0, elements.grads[e, 3])
+    return F
+
+
+@wp.kernel
+def element_state(
+    y: wp.array2d(dtype=wp.vec3d),
+    elements: Elements,
+    active: wp.array(dtype=wp.int32),
+    project: wp.array(dtype=wp.int32),
+    # outputs
+    el_F: wp.array2d(dtype=wp.mat33d),
+    el_P: wp.array2d(dtype=wp.mat33d),
+    el_mck: wp.array2d(dtype=wp.vec3d),
+    el_J: wp.array2d(dtype=wp.float64),
+    el_energy: wp.array2d(dtype=wp.float64),
+):
+    """F, volume·P, (m, c', k), J and energy [J] of every element of the active environments."""
+    env, e = wp.tid()
+    if active[env] == 0:
+        return
+    F = deformation(env, e, y, elements)
+    J = wp.determinant(F)
+    f = stress_factors(F, J, elements.model[e], elements.mu[e], elements.lam[e])
+    if project[env] != 0 and elements.model[e] != 2:
+        f[1] = geometric_factor(F, f[0], f[2], elements.lam[e] * (wp.float64(1.0) + squeeze_second(J)), f[1])
+    el_F[env, e] = F
+    el_P[env, e] = elements.volume[e] * first_piola(F, J, elements.model[e], elements.mu[e], elements.lam[e])
+    el_mck[env, e] = f
+    el_J[env, e] = J
+    el_energy[env, e] = elements.volume[e] * strain_energy(F, elements.model[e], elements.mu[e], elements.lam[e])
+
+
+@wp.kernel
+def node_elastic_gradient(
+    corner_start: wp.array(dtype=wp.int32),
+    corner: wp.array(dtype=wp.int32),
+    elements: Elements,
+    el_P: wp.array2d(dtype=wp.mat33d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    gradient: wp.array2d(dtype=wp.vec3d),
+):
+    """∂Ψ/∂y of every node [N], body frame; gathered, so the order of the sum never changes."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    g = wp.vec3d()
+    for k in range(corner_start[i], corner_start[i + 1]):
+        e = corner[k] / 4
+        g += el_P[env, e] * elements.grads[e, corner[k] - 4 * e]
+    gradient[env, i] = g
+
+
+@wp.kernel
+def block_hessian(
+    upper: wp.array2d(dtype=wp.int32),
+    part_start: wp.array(dtype=wp.int32),
+    part: wp.array(dtype=wp.int32),
+    elements: Elements,
+    masses: Masses,
+    inertia_scale: wp.float64,
+    el_F: wp.array2d(dtype=wp.mat33d),
+    el_mck: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    blocks: wp.array2d(dtype=wp.mat33d),
+):
+    """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements.
+
+    Each row of ``upper`` names a block on or above the diagonal, where it is to lie, and where its transpose.
+    """
+    env, u = wp.tid()
+    if active[env] == 0:
+        return
+    k = upper[u, 0]
+    one = wp.identity(n=3, dtype=wp.float64)
+    H = (masses.inertia[k] * inertia_scale + masses.drag[k]) * one
+    for s in range(part_start[k], part_start[k + 1]):
+        e = part[s] / 16
+        code = part[s] - 16 * e
+        ga = elements.grads[e, code / 4]
+        gb = elements.grads[e, code % 4]
+        F = el_F[env, e]
+        f = el_mck[env, e]
+        ba = F * ga
+        bb = F * gb
+        if elements.model[e] == 2:
+            # The Gauss-Newton part; (F Fᵀ − 1) stays tiny while the body is near-rigid, and is not always positive.
+            H += (wp.float64(4.0) * elements.mu[e] * elements.volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
+        else:
+            C = cofactor(F)
+            stiff = elements.lam[e] * (wp.float64(1.0) + squeeze_second(wp.determinant(F)))
+            H += elements.volume[e] * (
+                (f[0] * wp.dot(ga, gb)) * one
+                + f[2] * wp.outer(ba, bb)
+                + stiff * wp.outer(C * ga, C * gb)
+                - f[1] * wp.skew(F * wp.cross(ga, gb))
+            )
+    blocks[env, upper[u, 1]] = H
+    if upper[u, 2] != upper[u, 1]:
+        blocks[env, upper[u, 2]] = wp.transpose(H)
+
+
+@wp.kernel
+def element_energy_change(
+    y0: wp.array2d(dtype=wp.vec3d),
+    y1: wp.array2d(dtype=wp.vec3d),
+    elements: Elements,
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    change: wp.array2d(dtype=wp.float64),
+    det: wp.array2d(dtype=wp.float64),
+):
+    """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; sums of differences keep digits."""
+    env, e = wp.tid()
+    if active[env] == 0:
+        return
+    F0 = deformation(env, e, y0, elements)
+    F1 = deformation(env, e, y1, elements)
+    change[env, e] = elements.volume[e] * strain_energy_change(F0, F1, elements.model[e], elements.mu[e], elements.lam[e])
+    det[env, e] = wp.determinant(F1)

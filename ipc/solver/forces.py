@@ -1,0 +1,173 @@
+"""Forces and motions after a step, by body and by pair; world frame, on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ipc.bodies.layout import Layout
+from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
+from ipc.solver.potential import Potential
+
+__all__ = ["bond_wrench", "contact_pairs", "contact_wrench", "host", "pair_forces", "rigid_motion", "touching"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
+
+
+def host(array: wp.array) -> NDArray[Any]:
+    """An array of the device in NumPy: a view on the CPU, a copy from CUDA."""
+    return array.numpy()
+
+
+@dataclass(frozen=True)
+class _Forces:
+    """C forces between primitives, of all environments; coef · force acts on a vertex."""
+
+    env: Ints
+    pair: Ints
+    verts: Ints
+    """(C, 4), −1 unused."""
+    coef: Floats
+    """(C, 4)."""
+    force: Floats
+    """[N] (C, 3)."""
+
+    def side(self, layout: Layout) -> Floats:
+        """+1 or −1 (C,): the force on the pair's first body is side · force."""
+        return np.where(layout.vert_body[self.verts[:, 0]] == layout.pairs[self.pair, 0], 1.0, -1.0)
+
+    def points(self, layout: Layout, x: Floats) -> Floats:
+        """Points of action on the pair's first body [m], (C, 3); ``x``: all vertices, (B, V, 3)."""
+        coef = self.side(layout)[:, None] * self.coef
+        weights = np.where((coef > 0.0) & (self.verts >= 0), coef, 0.0)
+        at = x[self.env[:, None], np.maximum(self.verts, 0)]
+        return np.einsum("cn,cni->ci", weights, at) / weights.sum(axis=1, keepdims=True)
+
+
+def _normal_forces(potential: Potential) -> _Forces:
+    """Normal forces of the contacts at the end of the step."""
+    contacts = potential.collision.contacts
+    pair = host(contacts.pair)
+    at = np.nonzero(np.arange(pair.shape[1]) < host(contacts.count)[:, None])
+    force = host(contacts.force)[at][:, None] * host(contacts.normal)[at]
+    return _Forces(at[0], pair[at], host(contacts.verts)[at], host(contacts.coef)[at], force)
+
+
+def _friction_forces(potential: Potential) -> _Forces:
+    """Friction forces −μ λ f1(|u|) u / |u| of the lagged contacts, u their sliding in the step."""
+    lagged = potential.collision.lagged
+    pair = host(lagged.pair)
+    at = np.nonzero(np.arange(pair.shape[1]) < host(lagged.count)[:, None])
+    verts, coef, normal = host(lagged.verts)[at], host(lagged.coef)[at], host(lagged.normal)[at]
+    moved = host(potential.x) - host(potential.x_start)
+    u = np.einsum("cn,cni->ci", np.where(verts >= 0, coef, 0.0), moved[at[0][:, None], np.maximum(verts, 0)])
+    u -= (u * normal).sum(axis=1, keepdims=True) * normal
+    y, eps = np.linalg.norm(u, axis=1), potential.friction_eps
+    ratio = np.where(y >= eps, 1.0 / np.maximum(y, eps), (2.0 - y / eps) / eps)
+    return _Forces(at[0], pair[at], verts, coef, -(host(lagged.limit)[at] * ratio)[:, None] * u)
+
+
+def _all_forces(potential: Potential) -> list[_Forces]:
+    return [_normal_forces(potential), *([_friction_forces(potential)] if potential.collision.friction else [])]
+
+
+def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wrench:
+    """Force and torque of a body's bonded ``nodes`` on their frame, about its origin."""
+    R, t = host(potential.R)[:, body], host(potential.t)
+    forces = -np.einsum("bij,bnj->bni", R, host(potential.gradient)[:, nodes])
+    points = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None, body]
+    return Wrench(forces.sum(axis=1), np.cross(points - t[:, None, frame], forces).sum(axis=1))
+
+
+def contact_wrench(layout: Layout, potential: Potential, body: int) -> Wrench:
+    """Contact and friction forces on a body, about its frame's origin or the world's.
+
+    Those on a half-space are the reactions on the vertices that touch it.
+    """
+    x, t = host(potential.x), host(potential.t)
+    if layout.half_space[body]:
+        points, forces = x, np.zeros_like(x)
+        for some in _all_forces(potential):
+            mine = (some.verts[:, 1] < 0) & (layout.pairs[some.pair, 1] == body)
+            np.add.at(forces, (some.env[mine], some.verts[mine, 0]), -some.force[mine])
+    else:
+        first, last = layout.vert_start[body : body + 2]
+        points, forces = x[:, first:last], -host(potential.vert_gradient)[:, first:last]
+    origin = t[:, None, body] if layout.framed[body] else 0.0
+    return Wrench(forces.sum(axis=1), np.cross(points - origin, forces).sum(axis=1))
+
+
+def contact_pairs(layout: Layout, potential: Potential, env: int) -> ContactPairs:
+    """The contact pairs of one environment at the end of the last step."""
+    contacts = potential.collision.contacts
+    n = int(host(contacts.count)[env])
+    pairs = layout.pairs[host(contacts.pair)[env, :n]]
+    return ContactPairs(
+        bodies=tuple((layout.names[a], layout.names[b]) for a, b in pairs),
+        vertices=host(contacts.verts)[env, :n].copy(),
+        weights=host(contacts.coef)[env, :n].copy(),
+        normal=host(contacts.normal)[env, :n].copy(),
+        gap=host(contacts.gap)[env, :n].copy(),
+        force=host(contacts.force)[env, :n].copy(),
+    )
+
+
+def pair_forces(layout: Layout, potential: Potential) -> dict[tuple[str, str], PairForces]:
+    """Forces by names of the two bodies; pairs that touch in no environment are left out."""
+    x = host(potential.x)
+    batch, forces = len(x), _all_forces(potential)
+    points, signs = [f.points(layout, x) for f in forces], [f.side(layout)[:, None] for f in forces]
+    result = {}
+    for p in np.unique(forces[0].pair):
+        normal, middle, weight, wrench = np.zeros((batch, 3)), np.zeros((batch, 3)), np.zeros(batch), np.zeros((batch, 6))
+        for k, (some, at, sign) in enumerate(zip(forces, points, signs, strict=True)):
+            mine = some.pair == p
+            env, force = some.env[mine], (sign * some.force)[mine]
+            if k == 0:
+                size = np.linalg.norm(force, axis=1)
+                np.add.at(normal, env, force)
+                np.add.at(middle, env, size[:, None] * at[mine])
+                np.add.at(weight, env, size)
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    place = middle / weight[:, None]
+            arm = at[mine] - np.nan_to_num(place)[env]
+            np.add.at(wrench, env, np.concatenate([force, np.cross(arm, force)], axis=1))
+        result[tuple(layout.names[b] for b in layout.pairs[p])] = PairForces(normal, place, wrench)
+    return result
+
+
+def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion:
+    """Mass, centre, inertia and velocities of a body with nodes as if it moved as a whole."""
+    first, last = layout.node_start[body : body + 2]
+    row, end = layout.row_start[[first, last]]
+    rows = np.repeat(np.arange(last - first), np.diff(layout.row_start[first : last + 1]))
+    mass = np.zeros((last - first, last - first))
+    mass[rows, layout.col[row:end] - first] = layout.mass[row:end]
+    R, t, nodes = host(potential.R)[:, body], host(potential.t)[:, body], slice(first, last)
+    x = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None]
+    v, share = host(potential.v)[:, nodes], mass.sum(axis=0)
+    total = float(share.sum())
+    centre, velocity = (np.einsum("n,bni->bi", share / total, a) for a in (x, v))
+    arm = x - centre[:, None]
+    second = np.einsum("bni,nm,bmj->bij", arm, mass, arm)
+    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    momentum = np.cross(arm, np.einsum("nm,bmi->bni", mass, v - velocity[:, None])).sum(axis=1)
+    spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
+    return RigidMotion(total, centre, inertia, velocity, spin)
+
+
+def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:
+    """Masks (B,) of other bodies that were closer than d̂ at the end of the last step, by name."""
+    contacts = potential.collision.contacts
+    pair = host(contacts.pair)
+    near = np.zeros((len(pair), len(layout.pairs)), bool)
+    env, k = np.nonzero(np.arange(pair.shape[1]) < host(contacts.count)[:, None])
+    near[env, pair[env, k]] = True
+    mine = np.flatnonzero((layout.pairs == body).any(axis=1) & near.any(axis=0))
+    other = layout.pairs[mine].sum(axis=1) - body
+    return {layout.names[b]: near[:, p] for p, b in zip(mine, other, strict=True)}

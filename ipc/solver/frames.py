@@ -1,0 +1,175 @@
+"""Driven frames, and the maps between nodes and vertices.
+
+Nodes are unknowns, in the frame of their body; vertices are surface points, in the world.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+__all__ = [
+    "VertexMap",
+    "compare_frames",
+    "frames_at",
+    "lift_grips",
+    "node_world",
+    "place_grips",
+    "vertex_motion",
+    "vertex_positions",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class VertexMap:
+    """Nodes that vertices follow, and the inverse; see :class:`ipc.bodies.layout.Layout`."""
+
+    body: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    nodes: wp.array2d(dtype=wp.int32)
+    weight: wp.array2d(dtype=wp.float64)
+    local: wp.array(dtype=wp.vec3d)
+    follower_start: wp.array(dtype=wp.int32)
+    follower: wp.array(dtype=wp.int32)
+    follower_weight: wp.array(dtype=wp.float64)
+
+
+@wp.kernel
+def frames_at(
+    start_q: wp.array2d(dtype=wp.quatd),
+    start_p: wp.array2d(dtype=wp.vec3d),
+    end_q: wp.array2d(dtype=wp.quatd),
+    end_p: wp.array2d(dtype=wp.vec3d),
+    progress: wp.array(dtype=wp.float64),
+    # outputs
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    now_q: wp.array2d(dtype=wp.quatd),
+):
+    """Frames at a share of the motion: positions on a line, rotations on the shorter arc."""
+    env, b = wp.tid()
+    s = progress[env]
+    q0 = start_q[env, b]
+    sign = wp.float64(1.0)
+    if wp.dot(q0, end_q[env, b]) < wp.float64(0.0):
+        sign = wp.float64(-1.0)
+    q1 = sign * end_q[env, b]
+    q = sign * end_q[env, b]
+    if s < wp.float64(1.0):
+        if wp.dot(q0, q1) < wp.float64(0.99999999999999):
+            q = wp.normalize(wp.quat_slerp(q0, q1, s))
+        else:
+            # A turn of less than 3e-7 rad, whose arc and chord are the same to rounding.
+            q = wp.normalize((wp.float64(1.0) - s) * q0 + s * q1)
+    now_q[env, b] = q
+    R[env, b] = wp.quat_to_matrix(q)
+    t[env, b] = start_p[env, b] + s * (end_p[env, b] - start_p[env, b])
+    if s == wp.float64(1.0):
+        t[env, b] = end_p[env, b]
+
+
+@wp.kernel
+def compare_frames(
+    frame_q: wp.array2d(dtype=wp.quatd),
+    frame_p: wp.array2d(dtype=wp.vec3d),
+    goal_q: wp.array2d(dtype=wp.quatd),
+    goal_p: wp.array2d(dtype=wp.vec3d),
+    moves: wp.array(dtype=wp.int32),
+    # outputs
+    progress: wp.array(dtype=wp.float64),
+):
+    """progress = 0 where a frame has to move, else 1."""
+    env = wp.tid()
+    progress[env] = wp.float64(1.0)
+    for b in range(frame_q.shape[1]):
+        if moves[b] != 0:
+            p, q = frame_p[env, b], goal_p[env, b]
+            r, s = frame_q[env, b], goal_q[env, b]
+            if p[0] != q[0] or p[1] != q[1] or p[2] != q[2] or r[0] != s[0] or r[1] != s[1] or r[2] != s[2] or r[3] != s[3]:
+                progress[env] = wp.float64(0.0)
+
+
+@wp.kernel
+def vertex_positions(
+    y: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    verts: VertexMap,
+    # outputs
+    x: wp.array2d(dtype=wp.vec3d),
+):
+    """World positions of the vertices."""
+    env, v = wp.tid()
+    local = wp.vec3d()
+    if verts.count[v] == 0:
+        local = verts.local[v]
+    for k in range(verts.count[v]):
+        local += verts.weight[v, k] * y[env, verts.nodes[v, k]]
+    x[env, v] = R[env, verts.body[v]] * local + t[env, verts.body[v]]
+
+
+@wp.kernel
+def vertex_motion(
+    p: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    verts: VertexMap,
+    # outputs
+    dx: wp.array2d(dtype=wp.vec3d),
+):
+    """World displacements of the vertices for the node displacements p."""
+    env, v = wp.tid()
+    local = wp.vec3d()
+    for k in range(verts.count[v]):
+        local += verts.weight[v, k] * p[env, verts.nodes[v, k]]
+    dx[env, v] = R[env, verts.body[v]] * local
+
+
+@wp.kernel
+def node_world(
+    y: wp.array2d(dtype=wp.vec3d),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    node_body: wp.array(dtype=wp.int32),
+    # outputs
+    xw: wp.array2d(dtype=wp.vec3d),
+):
+    """World positions of the nodes."""
+    env, i = wp.tid()
+    xw[env, i] = R[env, node_body[i]] * y[env, i] + t[env, node_body[i]]
+
+
+@wp.kernel
+def place_grips(
+    grip_node: wp.array(dtype=wp.int32),
+    grip_frame: wp.array(dtype=wp.int32),
+    grip_local: wp.array(dtype=wp.vec3d),
+    node_body: wp.array(dtype=wp.int32),
+    R: wp.array2d(dtype=wp.mat33d),
+    t: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    y: wp.array2d(dtype=wp.vec3d),
+):
+    """Positions y of gripped nodes, moved by their grip, in the frame of their body."""
+    env, g = wp.tid()
+    node, frame = grip_node[g], grip_frame[g]
+    body = node_body[node]
+    world = R[env, frame] * grip_local[g] + t[env, frame]
+    y[env, node] = wp.transpose(R[env, body]) * (world - t[env, body])
+
+
+@wp.kernel
+def lift_grips(
+    grip_node: wp.array(dtype=wp.int32),
+    y: wp.array2d(dtype=wp.vec3d),
+    y1: wp.array2d(dtype=wp.vec3d),
+    # outputs
+    lift: wp.array2d(dtype=wp.vec3d),
+):
+    """lift = y1 − y of the gripped nodes."""
+    env, g = wp.tid()
+    lift[env, grip_node[g]] = y1[env, grip_node[g]] - y[env, grip_node[g]]

@@ -1,0 +1,312 @@
+"""The Newton matrix H = blocks + Σ q qᵀ: a block matrix of one pattern, and contact rows.
+
+Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
+dimensions, counts are read on the device.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ipc.contact.contacts import Contacts, mat34d, rows_of
+from ipc.solver.frames import VertexMap
+
+__all__ = [
+    "BlockJacobi",
+    "Preconditioner",
+    "SystemView",
+    "add_row",
+    "block_row",
+    "multiply_blocks",
+    "multiply_rows",
+    "push_blocks",
+    "push_rows",
+    "slice_rows",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class SystemView:
+    """Arrays that a product with H reads; ``free`` is 1 on the unknowns.
+
+    Block s of row i lies at ``row_base[i] + s·stride``: rows are dealt out in slices of ``stride``, so that threads of neighbouring rows
+    read neighbouring blocks (Monakov et al. 2010, sliced ELLPACK); with a stride of 1 the rows lie one after the other.
+    """
+
+    row_base: wp.array(dtype=wp.int32)
+    row_length: wp.array(dtype=wp.int32)
+    stride: wp.int32
+    col: wp.array(dtype=wp.int32)
+    diagonal: wp.array(dtype=wp.int32)
+    free: wp.array(dtype=wp.int32)
+    verts: VertexMap
+    blocks: wp.array2d(dtype=wp.mat33d)
+    R: wp.array2d(dtype=wp.mat33d)
+
+
+def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Deal the blocks of a sparse matrix out in slices of ``width`` rows.
+
+    Args:
+        row_start: first block of each row and the total, (N+1,).
+        width: rows that are interleaved.
+
+    Returns:
+        Position of each row's first block (N,), and of each block (K,); the largest position may exceed K.
+    """
+    length = np.diff(row_start)
+    rows = np.arange(len(length))
+    longest = np.array([length[a : a + width].max() for a in range(0, len(length), width)])
+    base = np.concatenate([[0], np.cumsum(longest * width)])[rows // width] + rows % width
+    inside = np.arange(row_start[-1]) - np.repeat(row_start[:-1], length)
+    return base.astype(np.int32), (np.repeat(base, length) + inside * width).astype(np.int32)
+
+
+@wp.func
+def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: wp.array2d(dtype=wp.vec3d)) -> wp.vec3d:
+    """Row i of blocks · p."""
+    f = wp.vec3d()
+    k = system.row_base[i]
+    for _ in range(system.row_length[i]):
+        f += system.blocks[env, k] * p[env, system.col[k]]
+        k += system.stride
+    return f
+
+
+@wp.kernel
+def multiply_blocks(
+    system: SystemView,
+    p: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    threads: wp.int32,
+    # outputs
+    out: wp.array2d(dtype=wp.vec3d),
+    partial: wp.array2d(dtype=wp.float64),
+):
+    """out = blocks p on the unknowns, else 0, and shares of p·out; threads (B, chunks, n)."""
+    env, c, lane = wp.tid()
+    total = wp.float64(0.0)
+    if active[env] != 0:
+        for i in range(c * threads + lane, p.shape[1], partial.shape[1] * threads):
+            f = wp.vec3d()
+            if system.free[i] != 0:
+                f = block_row(system, env, i, p)
+                total += wp.dot(p[env, i], f)
+            out[env, i] = f
+    wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
+
+
+@wp.func
+def row_column(row: mat34d, k: wp.int32) -> wp.vec3d:
+    return wp.vec3d(row[0, k], row[1, k], row[2, k])
+
+
+@wp.func
+def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, p: wp.array2d(dtype=wp.vec3d)) -> wp.float64:
+    """q·p with node motions p in their bodies' frames."""
+    s = wp.float64(0.0)
+    for k in range(4):
+        v = verts[k]
+        if v >= 0:
+            if system.verts.count[v] > 0:
+                local = wp.vec3d()
+                for m in range(system.verts.count[v]):
+                    local += system.verts.weight[v, m] * p[env, system.verts.nodes[v, m]]
+                s += wp.dot(row_column(row, k), system.R[env, system.verts.body[v]] * local)
+    return s
+
+
+@wp.func
+def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, s: wp.float64, out: wp.array2d(dtype=wp.vec3d)):
+    """out += s q on the unknowns."""
+    for k in range(4):
+        v = verts[k]
+        if v >= 0:
+            if system.verts.count[v] > 0:
+                q = s * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
+                for m in range(system.verts.count[v]):
+                    node = system.verts.nodes[v, m]
+                    if system.free[node] != 0:
+                        wp.atomic_add(out, env, node, system.verts.weight[v, m] * q)
+
+
+@wp.func
+def add_row(
+    system: SystemView,
+    contacts: Contacts,
+    env: wp.int32,
+    r: wp.int32,
+    p: wp.array2d(dtype=wp.vec3d),
+    out: wp.array2d(dtype=wp.vec3d),
+) -> wp.float64:
+    """out += q (q·p) of row r, on the unknowns; returns (q·p)²."""
+    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    s = row_motion(system, verts, row, env, p)
+    spread_row(system, verts, row, env, s, out)
+    return s * s
+
+
+@wp.kernel
+def multiply_rows(
+    system: SystemView,
+    contacts: Contacts,
+    p: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    threads: wp.int32,
+    # outputs
+    out: wp.array2d(dtype=wp.vec3d),
+    partial: wp.array2d(dtype=wp.float64),
+):
+    """out += Σ q (q·p), and the shares of Σ (q·p)²; bonded nodes have p = 0 and get nothing.
+
+    Threads as in multiply_blocks, of which ``lanes`` in all share the rows of an environment.
+    """
+    env, c, lane = wp.tid()
+    total = wp.float64(0.0)
+    first = c * threads + lane
+    if active[env] != 0 and first < lanes:
+        for r in range(first, rows_of(contacts, env), lanes):
+            total += add_row(system, contacts, env, r, p, out)
+    wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
+
+
+@wp.kernel
+def push_rows(
+    system: SystemView,
+    contacts: Contacts,
+    dx: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    residual: wp.array2d(dtype=wp.vec3d),
+):
+    """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for r in range(lane, rows_of(contacts, env), lanes):
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        s = wp.float64(0.0)
+        for k in range(4):
+            if verts[k] >= 0:
+                s += wp.dot(row_column(row, k), dx[env, verts[k]])
+        spread_row(system, verts, row, env, -s, residual)
+
+
+@wp.kernel
+def push_blocks(
+    system: SystemView,
+    lift: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    # outputs
+    residual: wp.array2d(dtype=wp.vec3d),
+):
+    """residual −= blocks · lift on the unknowns, for the prescribed motion of gripped nodes."""
+    env, i = wp.tid()
+    if active[env] != 0 and system.free[i] != 0:
+        residual[env, i] = residual[env, i] - block_row(system, env, i, lift)
+
+
+@wp.kernel
+def diagonal_blocks(system: SystemView, active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.mat33d)):
+    env, i = wp.tid()
+    if active[env] != 0:
+        out[env, i] = system.blocks[env, system.diagonal[i]]
+
+
+@wp.kernel
+def diagonal_rows(
+    system: SystemView,
+    contacts: Contacts,
+    active: wp.array(dtype=wp.int32),
+    lanes: wp.int32,
+    # outputs
+    out: wp.array2d(dtype=wp.mat33d),
+):
+    """Adds the diagonal blocks of Σ q qᵀ."""
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for r in range(lane, rows_of(contacts, env), lanes):
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        for k in range(4):
+            v = verts[k]
+            if v >= 0:
+                q = wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k)
+                for m in range(system.verts.count[v]):
+                    w = system.verts.weight[v, m]
+                    wp.atomic_add(out, env, system.verts.nodes[v, m], (w * w) * wp.outer(q, q))
+
+
+@wp.kernel
+def invert_blocks(free: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), blocks: wp.array2d(dtype=wp.mat33d)):
+    """Inverts in place; one that is not positive becomes the inverse of its mean diagonal."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    A = blocks[env, i]
+    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    det = wp.determinant(A)
+    size = wp.trace(A) / wp.float64(3.0)
+    zero = wp.float64(0.0)
+    if free[i] == 0:
+        blocks[env, i] = wp.mat33d()
+    elif A[0, 0] > zero and minor > zero and det > wp.float64(1.0e-12) * size * size * size:
+        B = wp.inverse(A)
+        blocks[env, i] = wp.float64(0.5) * (B + wp.transpose(B))
+    else:
+        blocks[env, i] = (wp.float64(1.0) / wp.max(wp.abs(size), wp.float64(1.0e-30))) * wp.identity(n=3, dtype=wp.float64)
+
+
+@wp.kernel
+def apply_blocks(
+    inverse: wp.array2d(dtype=wp.mat33d),
+    r: wp.array2d(dtype=wp.vec3d),
+    running: wp.array(dtype=wp.int32),
+    z: wp.array2d(dtype=wp.vec3d),
+):
+    env, i = wp.tid()
+    if running[env] != 0:
+        z[env, i] = inverse[env, i] * r[env, i]
+
+
+class Preconditioner(Protocol):
+    """Approximates H⁻¹, symmetric and positive definite."""
+
+    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+        """Take in the matrix of the active environments; ``rows`` is the largest row count."""
+        ...
+
+    def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
+        """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
+        ...
+
+
+class BlockJacobi:
+    """Inverses of the 3×3 diagonal blocks with contact rows, shared by ``lanes`` threads."""
+
+    def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
+        self.lanes = lanes
+        self.inverse = wp.zeros((batch, nodes), dtype=wp.mat33d, device=device)
+
+    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+        device, dim = self.inverse.device, self.inverse.shape
+        wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self.inverse], device=device)
+        if rows:
+            inputs = [system, contacts, active, self.lanes]
+            wp.launch(diagonal_rows, dim=(dim[0], self.lanes), inputs=inputs, outputs=[self.inverse], device=device)
+        wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
+
+    def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
+        wp.launch(apply_blocks, dim=r.shape, inputs=[self.inverse, r, running], outputs=[z], device=r.device)

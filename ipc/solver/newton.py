@@ -1,0 +1,295 @@
+"""One time step: driven bodies advance, and Newton minimises the incremental potential.
+
+A Newton iteration has four parts:
+(i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
+Frames and unknowns then move together as far as gaps allow.
+(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one once negative curvature is met
+(projection on demand, after Longva et al. 2023, "Pitfalls of Projection").
+(iii) Continuous collision detection limits the step.
+(iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
+
+An environment is done when p is small and its frames have arrived, or are blocked. Its friction is then lagged again, as often as the
+settings say. Environments never wait on or change each other's arithmetic: every decision is a mask.
+
+The loop itself is made of conditional nodes, so that on CUDA a whole step is one graph launch without the host. On a CPU the same functions
+run as they stand. If a buffer was too small, the step halts before anything changes, the host lets the buffer grow, and the step goes on
+from there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ipc.bodies.layout import Layout
+from ipc.errors import SolverError
+from ipc.reduce import MIN
+from ipc.settings import Settings
+from ipc.solver import decisions, dynamics, frames
+from ipc.solver.pcg import Pcg
+from ipc.solver.potential import Potential
+from ipc.solver.preconditioners import make_preconditioner
+from ipc.solver.step_state import StepState
+
+__all__ = ["Newton"]
+
+
+class Newton:
+    """The step of a batch.
+
+    Args:
+        potential: state and energy; the step moves its state.
+        layout: the flat arrays.
+        settings: how to step.
+    """
+
+    def __init__(self, potential: Potential, layout: Layout, settings: Settings) -> None:
+        self.potential, self.settings = potential, settings
+        self.batch, self.device = potential.batch, potential.device
+        self.state = StepState(self.batch, potential.project, potential.collision.overflow, self.device)
+        nodes, lanes = len(layout.node_rest), potential.collision.lanes
+        self.pcg = Pcg(self.batch, nodes, lanes, self.device)
+        self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
+        self._still = wp.zeros_like(potential.x)
+        self._friction = int(potential.collision.friction)
+        self._graphs: dict[tuple[str, float], Any] = {}
+        self._recording = False
+        self.timers: dict[str, float] = {}
+
+    # --- timing and recording --------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Add a stage's time to ``timers``; nothing while it is recorded."""
+        if self._recording:
+            yield
+            return
+        start = time.perf_counter()
+        yield
+        if self.device.is_cuda:
+            wp.synchronize_device(self.device)
+        self.timers[name] = self.timers.get(name, 0.0) + time.perf_counter() - start
+
+    def _run(self, body: Callable[[], None]) -> None:
+        """Run ``body``, on CUDA from a recording made at the first call and after buffers grow."""
+        if not (self.device.is_cuda and self.settings.cuda_graph):
+            body()
+            return
+        key = body.__name__, self.potential.dt  # a recording holds the length of its step
+        if key not in self._graphs:
+            wp.load_module("ipc", device=self.device, recursive=True)
+            self._recording = True
+            try:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    body()
+            finally:
+                self._recording = False
+            self._graphs[key] = capture.graph
+        wp.capture_launch(self._graphs[key])
+
+    # --- the step --------------------------------------------------------------------------------------------------------------
+
+    def step(self, alive: NDArray[np.bool_]) -> dict[str, NDArray]:
+        """Advance the environments of ``alive`` (B,) by a step; returns decisions (B,) by name."""
+        since = time.perf_counter()
+        self.state.write_alive(alive)
+        self._run(self._whole)
+        values = self.state.read()
+        for _ in range(64):
+            if not self.potential.collision.overflow.numpy()[0]:
+                break
+            self.potential.collision.grow()
+            self._graphs.clear()
+            self._run(self._rest)
+            values = self.state.read()
+        else:
+            raise SolverError("contact buffers grew 64 times in one step and are still too small")
+        self.timers["step"] = self.timers.get("step", 0.0) + time.perf_counter() - since
+        return values
+
+    def _whole(self) -> None:
+        with self._stage("begin"):
+            self._begin()
+        self._rest()
+
+    def _rest(self) -> None:
+        """Everything after the preparation; repeated once buffers have grown."""
+        pot, state = self.potential, self.state
+        with self._stage("broad"):
+            pot.collision.refresh(pot.x, self._still, state.decisions.alive)
+        self._set_flags()
+        wp.capture_while(state.flags.go, self._iterate)
+        wp.launch(decisions.set_done, dim=1, inputs=[state.flags], device=self.device)
+        wp.capture_if(state.flags.done, self._assemble_end)
+        wp.launch(decisions.set_done, dim=1, inputs=[state.flags], device=self.device)
+        wp.capture_if(state.flags.done, self._end)
+
+    def _begin(self) -> None:
+        pot, state = self.potential, self.state
+        inputs = [pot.frame_q, pot.frame_p, pot.goal_q, pot.goal_p, pot.frame_moves]
+        pot.launch(frames.compare_frames, self.batch, inputs, [state.decisions.progress])
+        state.launch(decisions.start_step, self._friction)
+        pot.set_frames(state.decisions.progress, pot.R, pot.t)
+        pot.place_grips(pot.y, pot.R, pot.t)
+        pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+        wp.copy(pot.x_start, pot.x)
+        wp.copy(pot.y_start, pot.y)
+        pot.place_nodes(pot.xw)
+        pot.aim()
+        pot.aim_inertia(pot.R, pot.t)
+        pot.measure_reach()
+
+    def _set_flags(self) -> None:
+        self.state.clear_flags()
+        self.state.launch(decisions.set_flags)
+
+    def _note_extremes(self, mask: wp.array) -> None:
+        """Least gap and determinant of the state just assembled."""
+        pot, d = self.potential, self.state.decisions
+        contacts = pot.collision.contacts
+        pot.reduce(contacts.gap, mask, MIN, d.min_gap, contacts.count)
+        pot.reduce(pot.el_J, mask, MIN, d.min_det)
+
+    def _iterate(self) -> None:
+        """One Newton iteration of every active environment."""
+        pot, state, settings = self.potential, self.state, self.settings
+        d, f = state.decisions, state.flags
+        if self._friction:
+            wp.capture_if(f.pending, self._lag)
+        state.launch(decisions.choose_advancing)
+        wp.capture_if(f.advance, pot.prescribe, progress=d.trial_progress)
+        with self._stage("forces"):
+            pot.assemble(d.active)
+            self._note_extremes(d.active)
+        with self._stage("matrix"):
+            pot.fill_matrix(d.active)
+            wp.capture_if(f.advance, pot.push_prescribed, mask=d.advancing)
+        self._solve()
+        pot.size_of_step(d.active, d.size)
+        state.launch(decisions.judge_direction, pot.dt)
+        with self._stage("advance"):
+            wp.capture_if(f.advance, self._advance)
+        wp.capture_if(f.plain, self._line_search)
+        tolerance = settings.velocity_tolerance
+        state.launch(decisions.conclude, tolerance, settings.max_newton, settings.friction_relags, self._friction)
+        self._set_flags()
+
+    def _lag(self) -> None:
+        """Friction of the environments that rest, or begin, from their contacts as they are."""
+        pot, state = self.potential, self.state
+        with self._stage("lag"):
+            pot.touch(state.decisions.pending)
+            state.launch(decisions.choose_lagging)
+            pot.collision.lag(state.decisions.lagging, state.decisions.changed)
+            state.launch(decisions.after_lag, self.settings.friction_tolerance)
+
+    def _solve(self) -> None:
+        """p for the active environments; with a definite matrix where negative curvature was met."""
+        pot, state = self.potential, self.state
+        pot.p.zero_()
+        wp.copy(pot.right_side, pot.residual)
+        self._solve_for(state.decisions.active)
+        wp.capture_if(state.flags.again, self._solve_again)
+
+    def _solve_for(self, mask: wp.array) -> None:
+        pot, state, settings, s = self.potential, self.state, self.settings, self.pcg.scalars
+        contacts = pot.collision.contacts
+        with self._stage("preconditioner"):
+            self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
+        with self._stage("pcg"):
+            self.pcg.solve(
+                *(pot.system, contacts, self.preconditioner, pot.residual, pot.p),
+                *(settings.linear_tolerance, settings.max_linear, mask),
+            )
+        state.launch(decisions.after_solve, s.iterations, s.negative, mask)
+
+    def _solve_again(self) -> None:
+        pot, again = self.potential, self.state.decisions.again
+        pot.evaluate_elements(again)
+        pot.fill_matrix(again)
+        pot.launch(dynamics.restart, pot.p.shape, [pot.right_side, again], [pot.residual, pot.p])
+        self._solve_for(again)
+
+    def _advance(self) -> None:
+        """Move frames and unknowns together as far as gaps allow."""
+        pot, state = self.potential, self.state
+        d = state.decisions
+        state.launch(decisions.start_advance)
+        wp.capture_while(state.flags.shorten, self._try_advance)
+        state.launch(decisions.conclude_advance, self.settings.blocked_advance, self.settings.poor_advance)
+        for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.R, pot.R1), (pot.t, pot.t1)):
+            pot.launch(dynamics.take, old.shape, [new, d.accepted], [old])
+        pot.aim_inertia(pot.R, pot.t)
+
+    def _try_advance(self) -> None:
+        pot, state = self.potential, self.state
+        d = state.decisions
+        slack, floor = 1.0 - self.settings.motion_fraction, self.settings.gap_floor * pot.collision.d_hat
+        state.launch(decisions.try_advance, slack, floor)
+        pot.set_frames(d.trial_progress, pot.R1, pot.t1)
+        pot.launch(dynamics.advance_nodes, pot.y.shape, [pot.y, pot.p, d.alpha, pot.y1])
+        pot.place_grips(pot.y1, pot.R1, pot.t1)
+        pot.place_vertices(pot.y1, pot.R1, pot.t1, pot.x1)
+        pot.launch(dynamics.difference, pot.x.shape, [pot.x1, pot.x], [pot.dx])
+        pot.collision.refresh(pot.x, pot.dx, d.shorten)
+        d.alpha.fill_(1.0)
+        pot.collision.limit_step(pot.x, pot.dx, (pot.R, pot.t), (pot.R1, pot.t1), d.slack, d.floor, pot.reach, d.shorten, d.alpha)
+        pot.elastic_change(d.shorten, d.trial_det)
+        state.flags.shorten.zero_()
+        state.launch(decisions.judge_advance, self.settings.max_advance_attempts)
+
+    def _line_search(self) -> None:
+        """Take the step p as far as contacts, energy and inversion allow."""
+        pot, state = self.potential, self.state
+        d = state.decisions
+        pot.launch(frames.vertex_motion, pot.x.shape, [pot.p, pot.R, pot.verts], [pot.dx])
+        with self._stage("broad"):
+            pot.collision.refresh(pot.x, pot.dx, d.plain)
+        with self._stage("ccd"):
+            state.launch(decisions.start_limit, self.settings.ccd_slack)
+            Rt = (pot.R, pot.t)
+            pot.collision.limit_step(pot.x, pot.dx, Rt, Rt, d.slack, d.floor, pot.reach, d.plain, d.alpha)
+        with self._stage("line_search"):
+            pot.slope(d.plain, d.slope, d.noise)
+            state.launch(decisions.start_search, pot.reach)
+            wp.capture_while(state.flags.search, self._try_step)
+            state.launch(decisions.end_search)
+            pot.launch(dynamics.take, pot.y.shape, [pot.y1, d.accepted], [pot.y])
+            pot.launch(dynamics.take, pot.x.shape, [pot.x1, d.accepted], [pot.x])
+
+    def _try_step(self) -> None:
+        pot, state = self.potential, self.state
+        d = state.decisions
+        pot.try_step(d.alpha)
+        state.launch(decisions.clear_det)
+        pot.change(d.searching, d.change, d.trial_det)
+        state.flags.search.zero_()
+        state.launch(decisions.judge_energy, self.settings.armijo, self.settings.max_line_search)
+
+    def _assemble_end(self) -> None:
+        """Forces and contacts of the last state."""
+        state = self.state
+        state.launch(decisions.choose_good)
+        with self._stage("forces"):
+            self.potential.assemble(state.decisions.good)
+            self._note_extremes(state.decisions.good)
+
+    def _end(self) -> None:
+        """Velocities and frames for the next step; failed environments return to their start."""
+        pot, state = self.potential, self.state
+        d = state.decisions
+        with self._stage("end"):
+            pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
+            pot.place_nodes(pot.xw1)
+            pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
+            pot.set_frames(d.progress, pot.R, pot.t)
+            pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+            wp.copy(pot.frame_q, pot.now_q)
+            wp.copy(pot.frame_p, pot.t)
+            pot.energies()

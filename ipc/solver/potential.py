@@ -1,0 +1,287 @@
+"""The incremental potential of a batch: its state, its value, its gradient and its Hessian.
+
+    E(x) = ½ ‖x − x̃‖²_M / h² + elastic energy + contact barrier + lagged friction      (Li et al. 2020, equation 3, divided by h²)
+
+Everything is written by kernel launches of fixed dimensions into arrays of fixed address; nothing waits for the device, so a step can be
+recorded as one CUDA graph. Only buffers of :class:`ipc.contact.collision.Collision` may grow, between recordings.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ipc.bodies.layout import Layout
+from ipc.contact.collision import Collision
+from ipc.reduce import MAX, MIN, SUM, Reducer
+from ipc.settings import Settings
+from ipc.solver import dynamics, elasticity, frames
+from ipc.solver.linear import SystemView, push_blocks, push_rows, slice_rows
+
+__all__ = ["Potential"]
+
+_SLICE = 32
+"""Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
+
+
+class Potential:
+    """State and work space of a batch, and the launches that evaluate them.
+
+    Args:
+        layout: the flat arrays.
+        settings: how to step.
+        batch: number of environments.
+        d_hat: [m].    kappa: [Pa].
+        device: Warp device.
+    """
+
+    def __init__(self, layout: Layout, settings: Settings, batch: int, d_hat: float, kappa: float, device: wp.Device) -> None:
+        self.layout, self.settings, self.batch, self.device = layout, settings, batch, device
+        nodes, verts, elements = len(layout.node_rest), int(layout.vert_start[-1]), len(layout.tets)
+        count = len(layout.frame_names)
+
+        def ints(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=wp.int32, device=device)
+
+        def floats(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=wp.float64, device=device)
+
+        def vectors(n: int) -> wp.array:
+            return wp.zeros((batch, n), dtype=wp.vec3d, device=device)
+
+        def matrices(n: int) -> wp.array:
+            return wp.zeros((batch, n), dtype=wp.mat33d, device=device)
+
+        def numbers(*shape: int) -> wp.array:
+            return wp.zeros(shape or batch, dtype=wp.float64, device=device)
+
+        self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device, settings.broad_phase)
+        self.reduce = Reducer(batch, max(nodes, verts, elements), device)
+        self.reduce.prepare(nodes, verts, elements)
+        self.elements = elasticity.Elements()
+        self.elements.tets, self.elements.model = ints(layout.tets), ints(layout.model)
+        self.elements.grads = wp.array(layout.grads, dtype=wp.vec3d, device=device)
+        self.elements.volume, self.elements.mu, self.elements.lam = floats(layout.volume), floats(layout.mu), floats(layout.lam)
+        self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
+        rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
+        diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
+        self.dt = settings.dt
+        self._damping = np.zeros(len(layout.col))
+        self._damping[diagonal] = layout.node_damping
+        self.masses = dynamics.Masses()
+        self.masses.row_start, self.masses.col = ints(layout.row_start), ints(layout.col)
+        self.masses.mass, self.masses.drag = floats(layout.mass), floats(self._damping / self.dt)
+        self.masses.inertia = floats(layout.mass * (1.0 + layout.node_drive[rows]))
+        self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
+        self.driven = bool((layout.node_aim >= 0).any())
+        self.grips = len(layout.grip_node)
+        self.grip = [
+            *(ints(layout.grip_node), ints(layout.grip_frame)),
+            *(wp.array(layout.grip_local, dtype=wp.vec3d, device=device), self.node_body),
+        ]
+        self.frame_moves = ints(layout.frame_moves)
+        self.part_start, self.part = ints(layout.part_start), ints(layout.part)
+        self.corner_start, self.corner = ints(layout.corner_start), ints(layout.corner)
+        self.verts = frames.VertexMap()
+        self.verts.body, self.verts.count, self.verts.nodes = (
+            ints(layout.vert_body),
+            ints(layout.vert_count),
+            ints(layout.vert_nodes),
+        )
+        self.verts.weight = floats(layout.vert_weight)
+        self.verts.local = wp.array(layout.vert_local, dtype=wp.vec3d, device=device)
+        self.verts.follower_start, self.verts.follower = ints(layout.node_vert_start), ints(layout.node_vert)
+        self.verts.follower_weight = floats(layout.node_vert_weight)
+
+        # State: node positions in their bodies' frames, world velocities, frames as they are, and their goals.
+        self.y, self.v = vectors(nodes), vectors(nodes)
+        self.frame_q, self.goal_q, self.now_q = (wp.zeros((batch, count), dtype=wp.quatd, device=device) for _ in range(3))
+        self.frame_p, self.goal_p = vectors(count), vectors(count)
+        self.R, self.R1, self.t, self.t1 = matrices(count), matrices(count), vectors(count), vectors(count)
+        self.kappa = wp.full(batch, kappa, dtype=wp.float64, device=device)
+        self.acceleration = wp.full(batch, wp.vec3d(*settings.gravity), dtype=wp.vec3d, device=device)
+
+        # Work space: x are vertices in the world; names with a 1 belong to the state that is tried.
+        self.x, self.x1, self.dx, self.x_start, self.vert_gradient = (vectors(verts) for _ in range(5))
+        self.y_start, self.y1, self.p, self.lift = (vectors(nodes) for _ in range(4))
+        self.gradient, self.residual, self.right_side = (vectors(nodes) for _ in range(3))
+        self.xw, self.xw1, self.target, self.local_target, self.local_start = (vectors(nodes) for _ in range(5))
+        self.el_F, self.el_P, self.el_mck = matrices(elements), matrices(elements), vectors(elements)
+        self.el_J, self.el_energy, self.el_change, self.el_J1 = (numbers(batch, elements) for _ in range(4))
+        self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
+        self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
+        self.project = wp.zeros(batch, dtype=wp.int32, device=device)
+        self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
+
+        self.system = SystemView()
+        width = _SLICE if device.is_cuda else 1
+        base, self.where = slice_rows(layout.row_start, width)
+        columns = np.zeros(int(self.where.max()) + 1, np.int32)
+        columns[self.where] = layout.col
+        above = np.flatnonzero(layout.col >= rows)
+        mirror = np.searchsorted(rows * nodes + layout.col, layout.col[above].astype(np.int64) * nodes + rows[above])
+        self.upper = ints(np.stack([above, self.where[above], self.where[mirror]], axis=1))
+        self.system.row_base, self.system.row_length = ints(base), ints(np.diff(layout.row_start))
+        self.system.stride = width
+        self.system.col, self.system.diagonal = ints(columns), ints(self.where[diagonal])
+        self.system.free = self.node_free
+        self.system.verts = self.verts
+        self.system.blocks = matrices(len(columns))
+        self.system.R = self.R
+
+    def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
+        """Launch a kernel on the device of the batch."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs or [], device=self.device)
+
+    @property
+    def inertia_scale(self) -> float:
+        """1/h² [1/s²]."""
+        return 1.0 / (self.dt * self.dt)
+
+    @property
+    def friction_eps(self) -> float:
+        """ε = ε_v h [m]."""
+        return self.settings.friction_velocity * self.dt
+
+    def set_dt(self, dt: float) -> None:
+        """Let the next steps be ``dt`` [s] long."""
+        if dt != self.dt:
+            self.dt = dt
+            self.masses.drag.assign(self._damping / dt)
+
+    # --- places ----------------------------------------------------------------------------------------------------------------
+
+    def set_frames(self, progress: wp.array, R: wp.array, t: wp.array) -> None:
+        """Frames at a share ``progress`` (B,) of their motion in this step."""
+        inputs = [self.frame_q, self.frame_p, self.goal_q, self.goal_p, progress]
+        self.launch(frames.frames_at, self.frame_q.shape, inputs, [R, t, self.now_q])
+
+    def place_grips(self, y: wp.array, R: wp.array, t: wp.array) -> None:
+        """Move the gripped nodes to their places in their frames."""
+        if self.grips:
+            self.launch(frames.place_grips, (self.batch, self.grips), [*self.grip, R, t], [y])
+
+    def place_vertices(self, y: wp.array, R: wp.array, t: wp.array, x: wp.array) -> None:
+        """World positions of the vertices."""
+        self.launch(frames.vertex_positions, x.shape, [y, R, t, self.verts], [x])
+
+    def place_nodes(self, out: wp.array) -> None:
+        """World positions of the nodes."""
+        self.launch(frames.node_world, out.shape, [self.y, self.R, self.t, self.node_body], [out])
+
+    def aim_inertia(self, R: wp.array, t: wp.array) -> None:
+        """Inertia's target and the start of the step, in the given frames."""
+        inputs = [self.target, self.xw, R, t, self.node_body]
+        self.launch(dynamics.inertia_target, self.xw.shape, inputs, [self.local_target, self.local_start])
+
+    def aim(self) -> None:
+        """x̃ from the start of the step."""
+        self.launch(dynamics.predict, self.xw.shape, [self.xw, self.v, self.acceleration, self.dt], [self.target])
+        if self.driven:
+            self.launch(dynamics.aim_bodies, self.xw.shape, [self.goal_q, self.goal_p, *self.drive], [self.target])
+
+    def prescribe(self, progress: wp.array) -> None:
+        """Prescribed motion to ``progress`` (B,): ``dx``, ``lift`` of gripped nodes, inertia."""
+        self.set_frames(progress, self.R1, self.t1)
+        if self.grips:
+            wp.copy(self.y1, self.y)
+            self.place_grips(self.y1, self.R1, self.t1)
+            self.launch(frames.lift_grips, (self.batch, self.grips), [self.grip[0], self.y, self.y1], [self.lift])
+        self.place_vertices(self.y1 if self.grips else self.y, self.R1, self.t1, self.x1)
+        self.launch(dynamics.difference, self.x.shape, [self.x1, self.x], [self.dx])
+        self.aim_inertia(self.R1, self.t1)
+
+    def push_prescribed(self, mask: wp.array) -> None:
+        """Residual −= H times the prescribed motion, which pushes the unknowns ahead."""
+        contacts = self.collision.contacts
+        lanes = self.collision.lanes
+        self.launch(push_rows, (self.batch, lanes), [self.system, contacts, self.dx, mask, lanes], [self.residual])
+        if self.grips:
+            self.launch(push_blocks, self.y.shape, [self.system, self.lift, mask], [self.residual])
+
+    # --- value, gradient, Hessian ----------------------------------------------------------------------------------------------
+
+    def evaluate_elements(self, active: wp.array) -> None:
+        """F, stress, energy and Hessian factors of the elements at y."""
+        inputs = [self.y, self.elements, active, self.project]
+        outputs = [self.el_F, self.el_P, self.el_mck, self.el_J, self.el_energy]
+        self.launch(elasticity.element_state, self.el_J.shape, inputs, outputs)
+
+    def touch(self, active: wp.array) -> None:
+        """Contacts, their forces and rows at x."""
+        self.collision.assemble(
+            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
+        )
+
+    def assemble(self, active: wp.array) -> None:
+        """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns."""
+        self.evaluate_elements(active)
+        inputs = [self.corner_start, self.corner, self.elements, self.el_P, active]
+        self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
+        self.touch(active)
+        inputs = [
+            *(self.y, self.local_target, self.local_start, self.masses, self.inertia_scale, self.vert_gradient),
+            *(self.R, self.node_body, self.node_free, self.verts, active),
+        ]
+        self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
+
+    def fill_matrix(self, active: wp.array) -> None:
+        """The blocks of inertia and elasticity, from results of :meth:`evaluate_elements`."""
+        inputs = [
+            *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
+            *(self.el_F, self.el_mck, active),
+        ]
+        self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
+
+    def try_step(self, alpha: wp.array) -> None:
+        """y1 = y + alpha p and its vertices, in the frames as they are."""
+        self.launch(dynamics.advance_nodes, self.y.shape, [self.y, self.p, alpha, self.y1])
+        self.place_vertices(self.y1, self.R, self.t, self.x1)
+
+    def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
+        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
+        inputs = [self.y, self.y1, self.elements, active]
+        self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, [self.el_change, self.el_J1])
+        self.reduce(self.el_J1, active, MIN, min_det)
+
+    def change(self, active: wp.array, change: wp.array, min_det: wp.array) -> None:
+        """``change`` (B,) becomes E(y1) − E(y) [J], summed from differences."""
+        change.zero_()
+        self.elastic_change(active, min_det)
+        self.reduce(self.el_change, active, SUM, change)
+        inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.inertia_scale, active]
+        self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
+        self.reduce(self.node_change, active, SUM, change)
+        self.collision.energy_change(
+            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, change)
+        )
+
+    def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:
+        """``slope`` (B,) ← g·p [J]; ``noise`` (B,) ← Σ ‖force‖ [N], for rounding of energies."""
+        slope.zero_()
+        noise.zero_()
+        self.launch(dynamics.slope_of, self.p.shape, [self.p, self.gradient], [self.node_change])
+        self.reduce(self.node_change, active, SUM, slope)
+        self.reduce(self.force_size, active, SUM, noise)
+
+    def size_of_step(self, active: wp.array, size: wp.array) -> None:
+        """``size`` (B,) ← largest ‖p‖ of a node [m]; above 1e100 where p is not finite."""
+        size.zero_()
+        self.launch(dynamics.lengths, self.p.shape, [self.p, self.residual], [self.node_change])
+        self.reduce(self.node_change, active, MAX, size)
+
+    def measure_reach(self) -> None:
+        """``reach`` (B,) ← largest distance of a vertex from the origin [m]."""
+        self.reach.zero_()
+        self.launch(dynamics.lengths, self.x.shape, [self.x, self.x], [self.vert_size])
+        self.reduce(self.vert_size, self.everyone, MAX, self.reach)
+
+    def energies(self) -> None:
+        """Elastic and kinetic energies (B,) [J]."""
+        self.elastic_energy.zero_()
+        self.kinetic.zero_()
+        self.reduce(self.el_energy, self.everyone, SUM, self.elastic_energy)
+        self.launch(dynamics.kinetic_energy, self.v.shape, [self.v, self.masses], [self.node_change])
+        self.reduce(self.node_change, self.everyone, SUM, self.kinetic)

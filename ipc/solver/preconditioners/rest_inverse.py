@@ -1,0 +1,384 @@
+"""A preconditioner for bonded pads: the inverse of the rest matrix, corrected for contacts.
+
+A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
+(``substructure.py``), in single precision, and the contacts are added as a low-rank part (``low_rank.py``): M is exact as long as
+the body is at rest, and PCG deals with what deformation changes. Nodes of other bodies, and environments with more contacts than there
+is room for, have block-Jacobi. Across a batch the application is a product of matrices that every environment shares. On CUDA
+everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ipc.bodies.layout import Layout
+from ipc.contact.contacts import Contacts
+from ipc.settings import Settings
+from ipc.solver.linear import BlockJacobi, SystemView
+from ipc.solver.preconditioners.low_rank import LANES, LowRank, Rest, Small, fits, rest_entry, sum_of_parts
+from ipc.solver.preconditioners.rest_stiffness import bonded_bodies, rest_blocks
+from ipc.solver.preconditioners.substructure import Patch, choose_partition, condense
+
+__all__ = ["RestInverse"]
+
+wp.set_module_options({"enable_backward": False})
+
+TILE_ENVS, TILE_OUT, TILE_IN = 32, 64, 32
+"""Tile of the product of matrices: environments × outputs, inputs summed at a time."""
+TILED_FROM = 8
+"""Number of environments from which tiles are used instead of products with vectors."""
+THREADS = 200_000
+"""Threads of a product with vectors; a GPU needs many to read memory at its full rate."""
+MAX_CONTACTS = 48
+"""Contact nodes that an environment may have; factoring costs their number cubed."""
+
+
+@wp.kernel
+def multiply_vectors(
+    matrix: wp.array3d(dtype=wp.float32),
+    x: wp.array2d(dtype=wp.float32),
+    x_first: wp.int32,
+    y_first: wp.int32,
+    length: wp.int32,
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    y: wp.array3d(dtype=wp.float32),
+):
+    """y[c] = the share of ``length`` inputs in matrixᵀ x, patch by patch."""
+    c, env, e = wp.tid()
+    if running[env] == 0:
+        return
+    inputs, outputs = matrix.shape[1], matrix.shape[2]
+    patch = e / outputs
+    i = e - patch * outputs
+    first = x_first + patch * inputs
+    total = wp.float32(0.0)
+    for j in range(c * length, wp.min((c + 1) * length, inputs)):
+        total += matrix[patch, j, i] * x[env, first + j]
+    y[c, env, y_first + e] = total
+
+
+@wp.kernel
+def multiply_tiles(
+    matrix: wp.array3d(dtype=wp.float32),
+    x: wp.array2d(dtype=wp.float32),
+    x_first: wp.int32,
+    y_first: wp.int32,
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    y: wp.array2d(dtype=wp.float32),
+):
+    """y = x · matrix in tiles, patch by patch, without those that have nothing running."""
+    patch, i, j = wp.tid()
+    some = wp.int32(0)
+    for env in range(i * TILE_ENVS, wp.min((i + 1) * TILE_ENVS, running.shape[0])):
+        some += running[env]
+    if some == 0:
+        return
+    inputs, outputs = matrix.shape[1], matrix.shape[2]
+    block = matrix[patch]
+    total = wp.tile_zeros(shape=(TILE_ENVS, TILE_OUT), dtype=wp.float32)
+    for k in range(inputs / TILE_IN):
+        a = wp.tile_load(x, shape=(TILE_ENVS, TILE_IN), offset=(i * TILE_ENVS, x_first + patch * inputs + k * TILE_IN))
+        b = wp.tile_load(block, shape=(TILE_IN, TILE_OUT), offset=(k * TILE_IN, j * TILE_OUT))
+        wp.tile_matmul(a, b, total)
+    wp.tile_store(y, total, offset=(i * TILE_ENVS, y_first + patch * outputs + j * TILE_OUT))
+
+
+class Product:
+    """A matrix for each patch times a vector for each environment: y = Σ_c y[c] = matrixᵀ x.
+
+    Args:
+        matrix: shape (patches, inputs, outputs), both a multiple of the tile.
+        x: (B or more, …) and y: (parts, B or more, …), where patch p has inputs from x_first + p·inputs and outputs likewise.
+        batch: number of environments.
+    """
+
+    def __init__(self, matrix: wp.array, x: wp.array, y: wp.array, x_first: int, y_first: int, batch: int) -> None:
+        self.matrix, self.x, self.y, self.batch = matrix, x, y, batch
+        self.x_first, self.y_first = x_first, y_first
+        self.y_whole = y[0]
+
+    def compute(self, running: wp.array) -> None:
+        """Compute the products of the running environments."""
+        patches, inputs, outputs = self.matrix.shape
+        common = [self.matrix, self.x, self.x_first, self.y_first]
+        device = wp.get_device(self.matrix.device)
+        if not device.is_cuda:
+            for p in range(patches):
+                x = self.x.numpy()[:, self.x_first + p * inputs :][:, :inputs]
+                y = self.y_whole.numpy()[:, self.y_first + p * outputs :][:, :outputs]
+                np.matmul(x, self.matrix.numpy()[p], out=y)
+        elif tiled(self.batch, device):
+            dim = (patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
+            wp.launch_tiled(
+                multiply_tiles, dim=dim, inputs=[*common, running], outputs=[self.y_whole], block_dim=LANES, device=device
+            )
+        else:
+            parts = self.y.shape[0]
+            inputs_of = [*common, -(-inputs // parts), running]
+            wp.launch(
+                multiply_vectors, dim=(parts, self.batch, patches * outputs), inputs=inputs_of, outputs=[self.y], device=device
+            )
+
+
+def tiled(batch: int, device: wp.Device) -> bool:
+    """True if products are computed in tiles."""
+    return device.is_cuda and batch >= TILED_FROM
+
+
+@wp.struct
+class Inside:
+    """Positions of nodes in the vectors of the patches.
+
+    ``unknown`` (N,): first unknown of a node inside a patch, or −1.    ``patch_out`` (N,): where the first product leaves K_pp⁻¹ r of it.
+    ``twin_start`` (N + 1,): the patches that an interface node borders on; ``twin_out`` is where the first product leaves Eᵀ r,
+    ``twin_in`` where the second one reads x_Γ.
+    """
+
+    unknown: wp.array(dtype=wp.int32)
+    patch_out: wp.array(dtype=wp.int32)
+    twin_start: wp.array(dtype=wp.int32)
+    twin_out: wp.array(dtype=wp.int32)
+    twin_in: wp.array(dtype=wp.int32)
+
+
+@wp.kernel
+def gather_inside(
+    inside: Inside, r: wp.array2d(dtype=wp.vec3d), running: wp.array(dtype=wp.int32), x: wp.array2d(dtype=wp.float32)
+):
+    """r_p of every patch, in single precision."""
+    env, i = wp.tid()
+    u = inside.unknown[i]
+    if running[env] != 0 and u >= 0:
+        for c in range(3):
+            x[env, u + c] = wp.float32(r[env, i][c])
+
+
+@wp.kernel
+def gather_interface(
+    rest: Rest,
+    inside: Inside,
+    r: wp.array2d(dtype=wp.vec3d),
+    y_inside: wp.array3d(dtype=wp.float32),
+    small: Small,
+    jacobi: wp.array2d(dtype=wp.mat33d),
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    x: wp.array2d(dtype=wp.float32),
+    z: wp.array2d(dtype=wp.vec3d),
+):
+    """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi."""
+    env, i = wp.tid()
+    if running[env] == 0:
+        return
+    u = rest.unknown[i]
+    if (u < 0 and inside.unknown[i] < 0) or not fits(small, env):
+        z[env, i] = jacobi[env, i] * r[env, i]
+        return
+    if u < 0:
+        return
+    for c in range(3):
+        value = wp.float32(r[env, i][c])
+        for k in range(inside.twin_start[i], inside.twin_start[i + 1]):
+            value -= sum_of_parts(y_inside, env, inside.twin_out[k] + c)
+        x[env, u + c] = value
+
+
+@wp.kernel
+def scatter_interface(
+    rest: Rest,
+    inside: Inside,
+    small: Small,
+    y: wp.array3d(dtype=wp.float32),
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    z: wp.array2d(dtype=wp.vec3d),
+    x_back: wp.array2d(dtype=wp.float32),
+):
+    """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node."""
+    env, i = wp.tid()
+    u = rest.unknown[i]
+    if running[env] == 0 or u < 0 or not fits(small, env):
+        return
+    part = rest.part[i]
+    value = wp.vec3(sum_of_parts(y, env, u), sum_of_parts(y, env, u + 1), sum_of_parts(y, env, u + 2))
+    for k in range(small.count[env]):
+        node = small.node[env, k]
+        if rest.part[node] == part:
+            v = rest.unknown[node]
+            for c in range(3):
+                f = small.force[env, 3 * k + c]
+                for d in range(3):
+                    value[d] = value[d] - f * rest_entry(rest, part, v + c, u + d)
+    z[env, i] = wp.vec3d(wp.float64(value[0]), wp.float64(value[1]), wp.float64(value[2]))
+    for k in range(inside.twin_start[i], inside.twin_start[i + 1]):
+        for d in range(3):
+            x_back[env, inside.twin_in[k] + d] = value[d]
+
+
+@wp.kernel
+def scatter_inside(
+    inside: Inside,
+    y_inside: wp.array3d(dtype=wp.float32),
+    y_back: wp.array3d(dtype=wp.float32),
+    small: Small,
+    running: wp.array(dtype=wp.int32),
+    # outputs
+    z: wp.array2d(dtype=wp.vec3d),
+):
+    """x_p = K_pp⁻¹ r_p − E_p x_Γ."""
+    env, i = wp.tid()
+    u = inside.unknown[i]
+    if running[env] == 0 or u < 0 or not fits(small, env):
+        return
+    at = inside.patch_out[i]
+    value = wp.vec3d()
+    for c in range(3):
+        value[c] = wp.float64(sum_of_parts(y_inside, env, at + c) - sum_of_parts(y_back, env, u + c))
+    z[env, i] = value
+
+
+def padded(n: int) -> int:
+    """The next multiple of a tile."""
+    return -(-n // TILE_OUT) * TILE_OUT
+
+
+class RestInverse:
+    """K_0⁻¹ of the bonded bodies with their contacts, and block-Jacobi elsewhere.
+
+    Args:
+        layout: with a bonded body at least.
+        settings: time step.
+        batch: number of environments.
+        lanes: threads that share the contact rows of an environment.
+        device: Warp device.
+        max_contacts: contact nodes that an environment may have; with more it has block-Jacobi.
+        patches: into how many the inside of every body is cut, a power of two; 0 for none; None: as few operations as possible.
+
+    Raises:
+        numpy.linalg.LinAlgError: if a rest matrix is too ill-conditioned for single precision.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings,
+        batch: int,
+        lanes: int,
+        device: wp.Device,
+        max_contacts: int = MAX_CONTACTS,
+        patches: int | None = None,
+    ) -> None:
+        self.batch, self.device = batch, device
+        count = len(layout.node_rest)
+        blocks = rest_blocks(layout, settings)
+        bodies = [condense(layout, blocks, *choose_partition(layout, body, patches)) for body in bonded_bodies(layout)]
+        unknown, part, surface = np.full(count, -1), np.full(count, -1), np.full(count, -1)
+        widths = [padded(len(body.inverse)) for body in bodies]
+        firsts, starts = np.cumsum([0, *widths]), np.cumsum([0, *(w * w for w in widths)])
+        matrices = []
+        for p, body in enumerate(bodies):
+            unknown[body.interface], part[body.interface] = firsts[p] + 3 * np.arange(len(body.interface)), p
+            padding = widths[p] - len(body.inverse)
+            matrices.append(np.pad(body.inverse, ((0, padding), (0, padding))).ravel())
+        on_surface = np.unique(layout.vert_nodes[layout.vert_count == 1, 0])
+        on_surface = on_surface[unknown[on_surface] >= 0]
+        surface[on_surface] = np.arange(len(on_surface))
+
+        def ints(values: np.ndarray | list[int]) -> wp.array:
+            return wp.array(np.asarray(values), dtype=wp.int32, device=device)
+
+        rest = Rest()
+        rest.inverse = wp.array(np.concatenate(matrices), dtype=wp.float32, device=device)
+        rest.start, rest.first, rest.width = ints(starts[:-1]), ints(firsts[:-1]), ints(widths)
+        rest.unknown, rest.part, rest.surface, rest.surface_node = ints(unknown), ints(part), ints(surface), ints(on_surface)
+        self.rest = rest
+        self.low_rank = LowRank(rest, batch, max_contacts, lanes, device)
+        self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
+        views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
+        self.products = [
+            Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
+        ]
+        self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
+        self.jacobi = BlockJacobi(batch, count, lanes, device)
+
+    def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
+        """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""
+        parts, rows = 1, self.batch
+        if tiled(self.batch, self.device):
+            rows = -(-rows // TILE_ENVS) * TILE_ENVS
+        elif self.device.is_cuda:
+            parts = int(np.clip(THREADS // max(1, rows * outputs), 1, 64))
+        x, y = (rows, inputs), (parts, rows, outputs)
+        return tuple(wp.zeros(shape, dtype=wp.float32, device=self.device) for shape in (x, y))  # pyright: ignore[reportReturnType]
+
+    def _lay_out_patches(self, patches: list[Patch], count: int) -> None:
+        """The two products of the patches, all of one padded size: [K_pp⁻¹, E_p] and E_pᵀ."""
+        inner = padded(max((3 * len(p.nodes) for p in patches), default=0))
+        border = padded(max((3 * len(p.border) for p in patches), default=0))
+        forward, backward = (
+            np.zeros((len(patches), inner, inner + border), np.float32),
+            np.zeros((len(patches), border, inner), np.float32),
+        )
+        unknown, patch_out = np.full(count, -1), np.full(count, -1)
+        twins, outs, ins = [], [], []
+        for p, patch in enumerate(patches):
+            n, g = patch.extension.shape
+            forward[p, :n, :n], forward[p, :n, inner : inner + g], backward[p, :g, :n] = (
+                patch.inverse,
+                patch.extension,
+                patch.extension.T,
+            )
+            unknown[patch.nodes] = p * inner + 3 * np.arange(len(patch.nodes))
+            patch_out[patch.nodes] = p * (inner + border) + 3 * np.arange(len(patch.nodes))
+            twins.append(patch.border)
+            outs.append(p * (inner + border) + inner + 3 * np.arange(len(patch.border)))
+            ins.append(p * border + 3 * np.arange(len(patch.border)))
+        nodes = np.concatenate([np.zeros(0, int), *twins])
+        order = np.argsort(nodes, kind="stable")
+
+        def ints(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=wp.int32, device=self.device)
+
+        self.inside = Inside()
+        self.inside.unknown, self.inside.patch_out = ints(unknown), ints(patch_out)
+        self.inside.twin_start = ints(np.concatenate([[0], np.cumsum(np.bincount(nodes, minlength=count))]))
+        self.inside.twin_out = ints(np.concatenate([np.zeros(0, int), *outs])[order])
+        self.inside.twin_in = ints(np.concatenate([np.zeros(0, int), *ins])[order])
+        self.patched = bool(patches)
+        self.x_inside, self.y_inside = self._vectors(len(patches) * inner, len(patches) * (inner + border))
+        self.x_back, self.y_back = self._vectors(len(patches) * border, len(patches) * inner)
+        if patches:
+            matrices = [wp.array(m, dtype=wp.float32, device=self.device) for m in (forward, backward)]
+            self.to_interface = Product(matrices[0], self.x_inside, self.y_inside, 0, 0, self.batch)
+            self.from_interface = Product(matrices[1], self.x_back, self.y_back, 0, 0, self.batch)
+
+    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+        """Take in the contacts of the active environments, and the diagonal of their matrix."""
+        self.jacobi.update(system, contacts, rows, active)
+        self.low_rank.update(system, contacts, rows, active)
+
+    def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
+        """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
+        rest, inside, small = self.rest, self.inside, self.low_rank.small
+        if self.patched:
+            self._launch(gather_inside, r.shape, [inside, r, running], [self.x_inside])
+            self.to_interface.compute(running)
+        inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running]
+        self._launch(gather_interface, r.shape, inputs, [self.x, z])
+        for product in self.products:
+            product.compute(running)
+        self.low_rank.find_forces(self.y, running)
+        self._launch(scatter_interface, r.shape, [rest, inside, small, self.y, running], [z, self.x_back])
+        if self.patched:
+            self.from_interface.compute(running)
+            self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, small, running], [z])

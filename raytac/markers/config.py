@@ -1,0 +1,79 @@
+"""Configurations of the marker models that come with raytac."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from raytac.checks import check_known, check_whole
+from raytac.gel.surface import PadGrid
+from raytac.markers.base import MarkerModel, MarkersConfig, marker_motion_of
+from raytac.markers.contacts import ContactCells
+from raytac.specs.marker_motion import MarkerMotionSpec
+from raytac.specs.press import PADS
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["ForceField", "Fots", "FotsPublished", "Superposition", "SurfaceMarkers"]
+
+
+@dataclass(frozen=True)
+class Fots(MarkersConfig):
+    """FOTS: dilation, shear and twist by closed forms, around a disc that sticks if the sensor's marker motion has a ``punch``."""
+
+    def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
+        from raytac.markers.fots import FotsModel
+
+        return FotsModel(self._motion(sensor), ContactCells.over(grid, self.contacts), device=device)
+
+    def _motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
+        return marker_motion_of(sensor)
+
+
+@dataclass(frozen=True)
+class FotsPublished(Fots):
+    """FOTS as published: Gaussians with one λ for all contacts, whether or not the sensor's marker motion has a ``punch``."""
+
+    def _motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
+        return replace(marker_motion_of(sensor), punch=None)
+
+
+@dataclass(frozen=True)
+class SurfaceMarkers(MarkersConfig):
+    """Surface tracking: each marker is a point of the soft pad's coat."""
+
+    needs_coat: ClassVar[bool] = True
+
+    def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
+        from raytac.markers.surface import SurfaceModel
+
+        return SurfaceModel()
+
+
+@dataclass(frozen=True)
+class Superposition(MarkersConfig):
+    """Superposition of the pad's unit-load fields; needs ``raytac[ipc]`` for the pad's tetrahedra, and no fit."""
+
+    level: str = "coarse"
+    """Level of the soft pad whose unit-load fields are used; their memory grows with the square of its vertices."""
+    rounds: int = 8
+    """Most solutions a frame, after each of which vertices lose contact or slide; it bounds the time of a frame."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_known("level", self.level, PADS)
+        check_whole("rounds", self.rounds)
+
+    def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
+        from raytac.markers.superposition import SuperpositionModel
+
+        return SuperpositionModel(sensor, self.level, self.rounds)
+
+
+@dataclass(frozen=True)
+class ForceField(MarkersConfig):
+    """Penalty forces at the markers themselves, scaled to displacements by the sensor's marker motion."""
+
+    def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
+        from raytac.markers.force_field import ForceFieldModel
+
+        return ForceFieldModel(marker_motion_of(sensor))

@@ -1,0 +1,267 @@
+"""``DeviceMode``: what all our optical modes share. Dr.Jit code over arrays of all environments, recorded once a batch size."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.checks import check_names
+from raytac.device import total_memory
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.base import OpticsConfig, OpticsImages
+from raytac.optics.camera import Pinhole
+from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
+from raytac.optics.ink import checked_ink
+from raytac.optics.refraction import Slab
+from raytac.optics.runtime import check_batch, largest_batch, load_mitsuba, no_collection
+from raytac.specs.sensor import SensorSpec
+
+__all__ = ["DeviceFrame", "DeviceMode", "Float", "FrameInputs", "UInt8"]
+
+Float = Any  # Dr.Jit array of float32
+UInt8 = Any  # Dr.Jit array of bytes
+
+ROUNDING = 2
+"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
+
+
+@dataclass(frozen=True)
+class FrameInputs:
+    """Every device array that a recorded frame reads besides the surface; Dr.Jit wants them named as inputs."""
+
+    rest: Float
+    """Heights at rest [m], Ny·Nx."""
+    own: Any
+    """Further arrays of the mode."""
+    ink: Float | None = None
+    """Share of marker dots at the nodes, B·Ny·Nx; None without dots."""
+
+
+@dataclass(frozen=True)
+class DeviceFrame:
+    """Images of B sensors on the device."""
+
+    rgb: UInt8
+    """B·H·W·3."""
+    layers: list[Float]
+    """Linear radiance, three channels a layer, each B·H·W; empty where not asked for."""
+    flags: UInt8
+    """Marks of every pixel (B·H·W), or one unused value."""
+
+
+class DeviceMode(ABC):
+    """Base of our optical modes; fulfils ``raytac.optics.base.OpticalMode``.
+
+    A mode says how a frame is made (``_frame``), which arrays that needs (``_build``) and what memory it takes.
+    """
+
+    label: str
+    needs_contact = False
+    """Whether a frame reads where the object touches."""
+    _smallest_side = 1
+    """Least width and height of an image [px]."""
+    _longest_row = 3
+    """Values a pixel of the longest array."""
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        config: OpticsConfig[Any],
+        *,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        """Build what does not depend on the surface's grid; arguments and errors as of ``OpticsConfig.build``."""
+        outputs = check_names("outputs", outputs, config.outputs)
+        least = self._smallest_side
+        if resolution is not None and (len(resolution) != 2 or min(resolution) < least):
+            rule = f"must be (width, height), each >= {least} pixel{'s' * (least > 1)}"
+            raise InputError("resolution", value=resolution, rule=rule)
+        self.mi, self.device = load_mitsuba(device)
+        self.sensor, self.config, self.outputs, self.seed = sensor, config, tuple(outputs), seed
+        self.label = config.label
+        self.slab = Slab.from_spec(sensor)
+        self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
+        self._memory = total_memory(self.device)
+        self._grid: PadGrid | None = None
+        # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
+        self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
+
+    # ---------------------------------------------------------------- what a mode gives
+
+    @abstractmethod
+    def _build(self, grid: PadGrid) -> Any:
+        """Device arrays that a frame reads besides the surface, a frozen dataclass; called once, for the first grid."""
+
+    def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
+        """Fields of ``DeviceFrame``, from heights (B·Ny·Nx) [m]."""
+        raise NotImplementedError
+
+    def _bytes_per_env(self, grid: PadGrid) -> int:
+        """Most device memory that an environment's image takes [byte], before Dr.Jit's rounding."""
+        return 0
+
+    # ---------------------------------------------------------------- grid and memory
+
+    def prepare(self, grid: PadGrid) -> None:
+        """Build what depends on the pad's grid; done at the first frame and kept.
+
+        Raises:
+            InputError: the camera sees beyond the pad, or a second grid.
+        """
+        if self._grid is not None:
+            same = all(np.array_equal(getattr(grid, name), getattr(self._grid, name)) for name in ("x", "y", "rest"))
+            if grid is not self._grid and not same:
+                rule = f"one optical mode renders one grid and rest surface, the first that it was given, {self._grid.shape} here"
+                raise InputError("surface.grid", value=grid.shape, rule=rule)
+            return
+        check_view(self.camera, grid)
+        self.layout = CoatLayout.from_grid(grid)
+        # A copy: an array on NumPy memory that a surface shares would be one input twice for a recording.
+        self._rest = self.mi.Float(grid.rest.astype(np.float32).ravel())
+        self._inputs = FrameInputs(self._rest, self._build(grid))
+        self._grid = grid
+
+    def memory_per_env(self, grid: PadGrid) -> int:
+        """Most device memory that an environment of a batch on ``grid`` takes [byte]."""
+        width, height = self.camera.resolution
+        seen = 0
+        if {"normals", "depth"} & set(self.outputs):
+            seen = 8 * grid.rest.size + CoatField.memory_per_env(CoatLayout.from_grid(grid)) + 24 * width * height
+        return ROUNDING * max(seen, self._bytes_per_env(grid))
+
+    def largest_batch(self, grid: PadGrid) -> int:
+        """Largest number of environments that one call may render on ``grid``; a path tracer's images are made one by one."""
+        width, height = self.camera.resolution
+        longest = max(4 * grid.rest.size, self._longest_row * width * height)
+        return largest_batch(self._memory, max(self.memory_per_env(grid), 1), longest)
+
+    def _check_batch(self, envs: int, grid: PadGrid) -> None:
+        each = self.memory_per_env(grid)
+        if each == 0:
+            return
+        check_batch(envs, self.largest_batch(grid), per_env=each, memory=self._memory, device=self.device)
+
+    # ---------------------------------------------------------------- images
+
+    @property
+    def _lit(self) -> bool:
+        """Whether any output needs light."""
+        return bool({"rgb", "layers"} & set(self.outputs))
+
+    def render(self, surface: GelSurface) -> OpticsImages:
+        """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
+
+        An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
+
+        Raises:
+            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
+        """
+        heights, failed = self._checked(surface)
+        return self._images(surface, heights, failed, self._lit_images(surface, heights, failed) if self._lit else {})
+
+    def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
+        """Images on the device, of device arrays; nothing leaves it.
+
+        Dr.Jit records the kernels at the first call of a batch size and replays them afterwards.
+
+        Args:
+            heights: of the coat [m], B·Ny·Nx; must be finite, which is not checked here.
+            contact: where the object touches, B·Ny·Nx bytes; only for modes with ``needs_contact``.
+            ink: share of marker dots at each node, B·Ny·Nx, in [0, 1].
+
+        Raises:
+            InputError: nothing was rendered or prepared before, heights of no whole number of grids, contact or ink of another width, a
+                batch too large, or a mode with noise.
+        """
+        if self._grid is None:
+            raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
+        others = ({"contact": contact} if self.needs_contact else {}) | ({} if ink is None else {"ink": ink})
+        self._check_batch(device_envs(self.layout.nx * self.layout.ny, heights, **others), self._grid)
+        return DeviceFrame(*self._recorded(self._frame, heights, contact if self.needs_contact else None, ink))
+
+    def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
+        """Fields of ``OpticsImages`` that show light, of heights (B, Ny, Nx) that are safe to trace."""
+        device = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
+        return {"rgb": np.array(device.rgb).reshape(*self._shape(len(heights)), 3)}
+
+    def _images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray, images: dict[str, Any]) -> OpticsImages:
+        """``images`` and those of the geometry, with the failed environments marked."""
+        if {"normals", "depth"} & set(self.outputs):
+            p, n = self._recorded(self._seen, self._upload(heights), None, None)
+            images = images | seen_images(p, n, surface, self.camera, self.outputs)
+        if failed.any():
+            layers = images.get("layers") or {}
+            for image in (*(one for one in images.values() if isinstance(one, np.ndarray)), *layers.values()):
+                image[failed] = np.nan if image.dtype.kind == "f" else 0
+        return OpticsImages(**images)
+
+    def _recorded(self, function: Callable[..., Any], heights: Float, contact: UInt8 | None, ink: Float | None) -> Any:
+        """``function(heights, contact, inputs)``, recorded once for each number of environments and replayed afterwards."""
+        key = function.__name__, ink is not None, dr.width(heights)
+        if key not in self._frozen:
+            self._frozen[key] = dr.freeze(function)
+        with no_collection():
+            return self._frozen[key](heights, contact, self._inputs if ink is None else replace(self._inputs, ink=ink))
+
+    def _seen(self, heights: Float, contact: None, inputs: FrameInputs) -> tuple[Any, Any]:
+        """Point and normal of the coat through every pixel's centre."""
+        field = CoatField(self.mi, self.layout, inputs.rest, heights)
+        seen = see(self.mi, field, self.camera, dr.width(heights) // (self.layout.nx * self.layout.ny))
+        return seen.p, seen.n
+
+    # ---------------------------------------------------------------- from host to device
+
+    def _shape(self, envs: int) -> tuple[int, int, int]:
+        """(B, H, W)."""
+        width, height = self.camera.resolution
+        return envs, height, width
+
+    def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
+        """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
+        if surface.batch < 1:
+            raise InputError("surface.height", value=surface.height.shape, rule="must have at least one environment")
+        self._check_batch(surface.batch, surface.grid)
+        self.prepare(surface.grid)
+        heights = np.ascontiguousarray(surface.height, dtype=np.float32)
+        # One NaN or infinity makes the sum of squares one, and no height is so large that it does: cheaper than asking every node.
+        flat = heights.reshape(len(heights), -1)
+        failed = ~np.isfinite(np.vecdot(flat, flat))
+        # A NaN would become an index into device memory.
+        if failed.any():
+            heights = heights.copy()
+            heights[failed] = surface.grid.rest
+        return heights, failed
+
+    def _upload(self, values: np.ndarray) -> Float:
+        return self.mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
+
+    def _upload_contact(self, surface: GelSurface, failed: np.ndarray) -> UInt8 | None:
+        if not self.needs_contact:
+            return None
+        touched = surface.contact & ~failed[:, None, None] if failed.any() else surface.contact
+        return self.mi.UInt8(np.ascontiguousarray(touched).view(np.uint8).ravel())
+
+    def _upload_ink(self, surface: GelSurface) -> Float | None:
+        ink = checked_ink(surface)
+        return None if ink is None else self._upload(ink)
+
+
+def device_envs(nodes: int, heights: Float, **others: Any) -> int:
+    """Number of environments B in device heights (B·``nodes``); raise InputError unless each of ``others`` has one value a node too."""
+    width = dr.width(heights)
+    if width == 0 or width % nodes:
+        raise InputError("heights", value=width, rule=f"must hold a whole number of grids of {nodes} nodes")
+    for name, array in others.items():
+        if array is None or dr.width(array) != width:
+            value = None if array is None else dr.width(array)
+            raise InputError(name, value=value, rule=f"must have one value a node, {width} here")
+    return width // nodes

@@ -1,0 +1,309 @@
+"""Geometry below all optical modes: the coat as a height field on the device, camera rays on it, normals, depth, shadow rays.
+
+The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
+a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
+a few cells. Rebuilding a bounding volume hierarchy each frame costs more than all of its rays (docs/optics.md has the measurement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.camera import Pinhole
+
+__all__ = ["CoatField", "CoatLayout", "PixelSample", "check_view", "see", "seen_images"]
+
+TILE = 0.5e-3
+"""Edge of a tile of the bounds map [m]. The bounds on z hold two edges around a place: a camera ray of slope t may be that over t above
+or below the height where its tile is looked up, 2.8 mm for the Mini's steepest ray. The bound on the indentation holds one edge."""
+LOOK_UP_Z = -1.0e-3
+"""Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
+
+
+@dataclass(frozen=True)
+class CoatLayout:
+    """What does not change from frame to frame: the grid, its rest surface and the tiling."""
+
+    nx: int
+    ny: int
+    x0: float
+    y0: float
+    dx: float
+    dy: float
+    tile_x: int
+    tile_y: int
+    tiles_x: int
+    tiles_y: int
+
+    @classmethod
+    def from_grid(cls, grid: PadGrid) -> CoatLayout:
+        ny, nx = grid.shape
+        dx, dy = grid.pitch
+        tile_x, tile_y = max(1, round(TILE / dx)), max(1, round(TILE / dy))
+        return cls(
+            nx=nx,
+            ny=ny,
+            x0=float(grid.x[0]),
+            y0=float(grid.y[0]),
+            dx=dx,
+            dy=dy,
+            tile_x=tile_x,
+            tile_y=tile_y,
+            tiles_x=-(-nx // tile_x),
+            tiles_y=-(-ny // tile_y),
+        )
+
+
+class CoatField:
+    """B coat surfaces as device arrays, made anew each frame from heights.
+
+    ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
+    four corners of a cell, for the walks; the normal points to the
+    camera side (n_z < 0) and comes from central differences, as the vertex normals of the reference's mesh do.
+    """
+
+    def __init__(self, mi: Any, layout: CoatLayout, rest: Any, height: Any) -> None:
+        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx) are device Floats [m]."""
+        self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
+        nodes = pack_nodes(mi, layout, height)
+        self.nodes, self.cells = dr.ravel(nodes), dr.ravel(pack_cells(mi, layout, height))
+        dr.eval(self.nodes, self.cells)
+        self.lowest, self.highest, self.deepest = bounds_map(mi, layout, rest, height)
+        self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
+        dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
+
+    @staticmethod
+    def memory_per_env(layout: CoatLayout) -> int:
+        """Bytes of one surface: normals and corners of every node, and three bounds of the tiles by rows, then by columns, then spread."""
+        g = layout
+        return 32 * g.nx * g.ny + 12 * g.ny * g.tiles_x + 24 * g.tiles_x * g.tiles_y
+
+    def _cell(self, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        mi, g = self.mi, self.layout
+        fx = dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001)
+        fy = dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)
+        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
+        return (env * g.ny + iy) * g.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
+
+    def z(self, env: Any, x: Any, y: Any, active: Any = True) -> Any:
+        """Bilinear height [m] at (x, y) [m]."""
+        i, wx, wy = self._cell(env, x, y)
+        c = dr.gather(self.mi.Vector4f, self.cells, i, active)
+        return dr.lerp(dr.lerp(c.x, c.y, wx), dr.lerp(c.z, c.w, wx), wy)
+
+    def normal(self, env: Any, x: Any, y: Any) -> Any:
+        """The unit normal at (x, y) [m], interpolated between nodes."""
+        mi, nx = self.mi, self.layout.nx
+        i, wx, wy = self._cell(env, x, y)
+        a, b = dr.gather(mi.Vector4f, self.nodes, i), dr.gather(mi.Vector4f, self.nodes, i + 1)
+        c, d = dr.gather(mi.Vector4f, self.nodes, i + nx), dr.gather(mi.Vector4f, self.nodes, i + nx + 1)
+        node = dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+        return dr.normalize(mi.Normal3f(node.y, node.z, node.w))
+
+    def tile(self, env: Any, x: Any, y: Any) -> Any:
+        """Index into the bounds map of the tile under (x, y)."""
+        mi, g = self.mi, self.layout
+        tx = dr.minimum(mi.UInt32(dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001)) // g.tile_x, g.tiles_x - 1)
+        ty = dr.minimum(mi.UInt32(dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)) // g.tile_y, g.tiles_y - 1)
+        return (env * g.tiles_y + ty) * g.tiles_x + tx
+
+    def camera_hit(self, env: Any, origin: tuple[Any, Any, Any], tx: Any, ty: Any) -> Any:
+        """First meeting of the camera ray origin + s (tx, ty, 1) with the surface; returns the point. The origin may differ by pixel.
+
+        The tile's bounds bracket the hit; the bracket is walked in steps of one cell until the ray is behind the surface, then
+        refined by the secant rule (bilinear patches are nearly linear along so short a way).
+        """
+        mi, g = self.mi, self.layout
+        ox, oy, oz = origin
+        tile = self.tile(env, ox + (LOOK_UP_Z - oz) * tx, oy + (LOOK_UP_Z - oz) * ty)
+        lo, hi = dr.gather(mi.Float, self.lowest, tile), dr.gather(mi.Float, self.highest, tile)
+        lo, hi = lo - 1e-6, hi + 1e-6
+        steps = dr.ceil((hi - lo) * dr.sqrt(tx * tx + ty * ty) / min(g.dx, g.dy)) + 1
+        dz = (hi - lo) / steps
+
+        def gap(z: Any, active: Any = True) -> Any:
+            """Height of the surface above the ray's point at ``z``: positive before the hit."""
+            return self.z(env, ox + (z - oz) * tx, oy + (z - oz) * ty, active) - z
+
+        def before(za: Any, ga: Any, zb: Any, gb: Any) -> Any:
+            return (gb > 0) & (zb < hi)
+
+        def walk(za: Any, ga: Any, zb: Any, gb: Any) -> tuple[Any, ...]:
+            zn = zb + dz
+            return zb, gb, zn, gap(zn)
+
+        z1 = lo + dz
+        za, ga, zb, gb = dr.while_loop((lo, gap(lo), z1, gap(z1)), before, walk, label="camera hit")
+        for _ in range(2):
+            z = za + (zb - za) * dr.clip(ga / dr.maximum(ga - gb, 1e-12), 0, 1)
+            gz = gap(z)
+            front = gz > 0
+            za, ga = dr.select(front, z, za), dr.select(front, gz, ga)
+            zb, gb = dr.select(front, zb, z), dr.select(front, gb, gz)
+        z = za + (zb - za) * dr.clip(ga / dr.maximum(ga - gb, 1e-12), 0, 1)
+        return mi.Point3f(ox + (z - oz) * tx, oy + (z - oz) * ty, z)
+
+    def visibility(self, env: Any, p: Any, light: Any, tan_half: Any, active: Any) -> Any:
+        """Share of an emitter at ``light`` that point ``p`` of the surface sees past the surface itself, in [0, 1].
+
+        Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
+        from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
+        a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: the rest surface of a pad is convex
+        towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the
+        light, and only indentation deeper than that can block it. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
+        rule that out, the walk skips a whole tile; where the deepest point of the pad does, it ends.
+        """
+        mi, g = self.mi, self.layout
+        d = light - p
+        reach = dr.sqrt(d.x * d.x + d.y * d.y)
+        ux, uy, rise = d.x / reach, d.y / reach, -d.z / reach
+        # Clearance of the ray's lower edge above the resting surface: at least above_p + gain · s, which the coat must exceed to block.
+        above_p = self._rest(p.x, p.y) - p.z
+        gain = (self._rest(light.x, light.y) - light.z - above_p) / reach - tan_half
+        overall = dr.gather(mi.Float, self.pad_deepest, env, active)
+        end = dr.minimum(dr.select(gain > 0, (overall - above_p) / gain, reach), reach)
+        step, edge = min(g.dx, g.dy), min(g.tile_x * g.dx, g.tile_y * g.dy)
+
+        def inside(s: Any, least: Any) -> Any:
+            return active & (s < end) & (least > -tan_half)
+
+        def walk(s: Any, least: Any) -> tuple[Any, Any]:
+            x, y = p.x + s * ux, p.y + s * uy
+            bound = dr.gather(mi.Float, self.deepest, self.tile(env, x, y))
+            free = above_p + dr.minimum(gain * s, gain * (s + edge)) > bound
+            clearance = self.z(env, x, y, ~free) - (p.z - s * rise)
+            least = dr.select(free, least, dr.minimum(least, clearance / s))
+            return s + dr.select(free, edge, step), least
+
+        # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
+        _, least = dr.while_loop((mi.Float(step), mi.Float(tan_half)), inside, walk, label="shadow ray")
+        return dr.clip(0.5 + 0.5 * least / tan_half, 0, 1)
+
+    def _rest(self, x: Any, y: Any) -> Any:
+        mi, g = self.mi, self.layout
+        ix = mi.UInt32(dr.clip((x - g.x0) / g.dx + 0.5, 0, g.nx - 1))
+        iy = mi.UInt32(dr.clip((y - g.y0) / g.dy + 0.5, 0, g.ny - 1))
+        return dr.gather(mi.Float, self.rest, iy * g.nx + ix)
+
+
+def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
+    """(z, n_x, n_y, n_z) at every node of ``height`` (B·Ny·Nx); central differences, one-sided on the pad's rim."""
+    i = dr.arange(mi.UInt32, dr.width(height))
+    ix, iy = i % g.nx, (i // g.nx) % g.ny
+    left, right = dr.select(ix > 0, i - 1, i), dr.select(ix < g.nx - 1, i + 1, i)
+    up, down = dr.select(iy > 0, i - g.nx, i), dr.select(iy < g.ny - 1, i + g.nx, i)
+    zx = (dr.gather(mi.Float, height, right) - dr.gather(mi.Float, height, left)) / (mi.Float(right - left) * g.dx)
+    zy = (dr.gather(mi.Float, height, down) - dr.gather(mi.Float, height, up)) / (mi.Float((down - up) // g.nx) * g.dy)
+    inv = dr.rsqrt(zx * zx + zy * zy + 1)
+    return mi.Vector4f(height, zx * inv, zy * inv, -inv)
+
+
+def pack_cells(mi: Any, g: CoatLayout, height: Any) -> Any:
+    """The four corners of the cell right of and below every node: one packet gather where a walk would need four."""
+    i = dr.arange(mi.UInt32, dr.width(height))
+    right, down = dr.select(i % g.nx < g.nx - 1, 1, 0), dr.select((i // g.nx) % g.ny < g.ny - 1, g.nx, 0)
+    corners = (0, right, down, right + down)
+    return mi.Vector4f([dr.gather(mi.Float, height, i + offset) for offset in corners])
+
+
+def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any]:
+    """Per tile: lowest and highest z of the 5 × 5 tiles around it, deepest indentation of the 3 × 3; each (B·tiles_y·tiles_x) [m]."""
+    envs = dr.width(height) // (g.nx * g.ny)
+    rows = dr.arange(mi.UInt32, envs * g.ny * g.tiles_x)
+    tx, row = rows % g.tiles_x, rows // g.tiles_x
+    lo, hi, deep = mi.Float(np.inf), mi.Float(-np.inf), mi.Float(0)
+    for k in range(-1, g.tile_x + 1):
+        ix = mi.UInt32(dr.clip(mi.Int32(tx * g.tile_x) + k, 0, g.nx - 1))
+        z = dr.gather(mi.Float, height, row * g.nx + ix)
+        depth = dr.gather(mi.Float, rest, (row % g.ny) * g.nx + ix) - z
+        lo, hi, deep = dr.minimum(lo, z), dr.maximum(hi, z), dr.maximum(deep, depth)
+    dr.eval(lo, hi, deep)
+    tiles = dr.arange(mi.UInt32, envs * g.tiles_y * g.tiles_x)
+    tx, ty, env = tiles % g.tiles_x, (tiles // g.tiles_x) % g.tiles_y, tiles // (g.tiles_x * g.tiles_y)
+    lo2, hi2, deep2 = mi.Float(np.inf), mi.Float(-np.inf), mi.Float(0)
+    for k in range(-1, g.tile_y + 1):
+        iy = mi.UInt32(dr.clip(mi.Int32(ty * g.tile_y) + k, 0, g.ny - 1))
+        i = (env * g.ny + iy) * g.tiles_x + tx
+        lo2 = dr.minimum(lo2, dr.gather(mi.Float, lo, i))
+        hi2 = dr.maximum(hi2, dr.gather(mi.Float, hi, i))
+        deep2 = dr.maximum(deep2, dr.gather(mi.Float, deep, i))
+    dr.eval(lo2, hi2, deep2)
+    lo3, hi3, deep3 = lo2, hi2, deep2
+    for sx in range(-2, 3):
+        for sy in range(-2, 3):
+            nx = mi.UInt32(dr.clip(mi.Int32(tx) + sx, 0, g.tiles_x - 1))
+            ny = mi.UInt32(dr.clip(mi.Int32(ty) + sy, 0, g.tiles_y - 1))
+            i = (env * g.tiles_y + ny) * g.tiles_x + nx
+            lo3 = dr.minimum(lo3, dr.gather(mi.Float, lo2, i))
+            hi3 = dr.maximum(hi3, dr.gather(mi.Float, hi2, i))
+            if max(abs(sx), abs(sy)) <= 1:
+                deep3 = dr.maximum(deep3, dr.gather(mi.Float, deep2, i))
+    return lo3, hi3, deep3
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """What one camera ray of every pixel meets: environment index, point, normal and direction to the camera (pad frame)."""
+
+    env: Any
+    p: Any
+    n: Any
+    wo: Any
+    exit: Any = None
+    """Radiance that leaves the slab per radiance at p, T / n²; None without a slab."""
+
+
+def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[float, float] = (0.5, 0.5)) -> PixelSample:
+    """Trace one ray through every pixel of ``envs`` images, at ``jitter`` inside the pixel."""
+    width, height = camera.resolution
+    i = dr.arange(mi.UInt32, envs * width * height)
+    env = i // (width * height)
+    pixel = i - env * (width * height)
+    u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
+    origin, (tx, ty) = camera.ray(u, v)
+    p = field.camera_hit(env, origin, tx, ty)
+    n = field.normal(env, p.x, p.y)
+    exit = None
+    if camera.slab is not None:
+        ax, ay = camera.slope(u, v)
+        exit = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
+    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), exit)
+
+
+def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
+    """Contact, and what ``outputs`` name of normals with positions and of camera depth, by the fields of ``OpticsImages``.
+
+    ``p`` and ``n``: points and normals that the pixels of all environments see, on the device.
+    """
+    width, height = camera.resolution
+    shape, grid = (surface.batch, height, width), surface.grid
+    points = np.array(p).T.reshape(*shape, 3)
+    ix = np.clip(np.rint((points[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)
+    iy = np.clip(np.rint((points[..., 1] - grid.y[0]) / grid.pitch[1]).astype(int), 0, len(grid.y) - 1)
+    images = {"contact": surface.contact[np.arange(shape[0])[:, None, None], iy, ix]}
+    if "normals" in outputs:
+        images["normals"] = np.ascontiguousarray(np.array(n).T.reshape(*shape, 3))
+        images["position"] = np.ascontiguousarray(points)
+    if "depth" in outputs:
+        images["depth"] = (points[..., 2] - camera.position[2]).astype(np.float32)
+    return images
+
+
+def check_view(camera: Pinhole, grid: PadGrid) -> None:
+    """Raise InputError if the camera sees beyond the pad's edge on the plane z = 0."""
+    # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
+    width, height = camera.resolution
+    cx, cy = camera.principal
+    views = camera.ray(np.array([0.0, width]), cy), camera.ray(cx, np.array([0.0, height]))
+    for k, (axis, nodes, (origin, slope)) in enumerate(zip("xy", (grid.x, grid.y), views, strict=True)):
+        seen = origin[k] - slope[k] * origin[2]
+        if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
+            rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
+            raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)

@@ -1,0 +1,139 @@
+"""``Tracer``: what the deterministic and the sampled ray tracer share: LEDs, layers, camera response, flat field."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from dataclasses import replace
+
+import numpy as np
+
+from raytac.checks import check_seed, is_number
+from raytac.errors import InputError, SpecError
+from raytac.gel.surface import GelSurface, PadGrid
+from raytac.optics.device_mode import DeviceMode
+from raytac.optics.ink import checked_ink
+from raytac.optics.response import SATURATED, Response, mid_grey_exposure, saturated_share
+from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.scene import UNIT
+from raytac.specs.sensor import AUTO, SensorSpec
+
+__all__ = ["Tracer", "total"]
+
+
+def total(layers: dict[str, np.ndarray]) -> np.ndarray:
+    """The linear image: the sum of its layers."""
+    return np.asarray(np.sum(np.stack(list(layers.values())), axis=0, dtype=np.float32))
+
+
+class Tracer(DeviceMode):
+    """Base of the ray tracers: one sensor, one resolution, one scene."""
+
+    config: RayTraced
+
+    def __init__(
+        self,
+        sensor: SensorSpec,
+        config: RayTraced,
+        *,
+        resolution: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("rgb",),
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        """As ``OpticsConfig.build``; ``seed`` is of path tracing and of the fit of the case's light.
+
+        Raises:
+            SpecError: with ``refraction.model = "slab"``, a camera or LED that is not below the slab.
+        """
+        check_seed("seed", seed)
+        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
+        leds = sensor.lights.leds
+        by_colour = config.layers == "colour"
+        self.layer_names = sensor.lights.layers if by_colour else tuple(led.name for led in leds)
+        self.groups = [self.layer_names.index(led.layer if by_colour else led.name) for led in leds]
+        self._scene_lamps = [Lamp.from_spec(self.mi, led, UNIT) for led in leds]
+        # Of a mode without images, nobody asks how bright they are.
+        unlit = replace(sensor.response, exposure=1.0)
+        self.response = Response(unlit if sensor.response.exposure == AUTO else sensor.response, self.camera)
+        if config.flat_field is not None:
+            image, (_, height, width) = config.flat_field, self._shape(1)
+            if image.shape != (height, width, 3) or image.dtype != np.uint8:
+                rule = f"must be a uint8 image of shape ({height}, {width}, 3)"
+                raise InputError("flat_field", value=f"{image.dtype} {image.shape}", rule=rule)
+
+    # ---------------------------------------------------------------- what a tracer gives
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Rays or samples of a pixel."""
+
+    @abstractmethod
+    def _layers(self, heights: np.ndarray, ink: np.ndarray | None = None, **sampling: int | None) -> dict[str, np.ndarray]:
+        """Linear radiance by layer, each (B, H, W, 3) float32."""
+
+    @abstractmethod
+    def _rest_image(self, rest: np.ndarray) -> np.ndarray:
+        """8-bit image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx), exact enough to tell how much of it is white."""
+
+    def _rest_light(self, rest: np.ndarray) -> np.ndarray:
+        """Linear image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx)."""
+        return total(self._layers(rest))[0]
+
+    # ---------------------------------------------------------------- shared
+
+    @property
+    def sampling(self) -> dict[str, int | float | str]:
+        """``integrator``, ``spp`` and ``exposure``, for headers; the exposure is absent where it is ``AUTO`` and no output needs it."""
+        exposure = self.sensor.response.exposure
+        known = {"exposure": float(exposure)} if is_number(exposure) else {}
+        return {"integrator": self.config.integrator, "spp": self.samples, **known}
+
+    def prepare(self, grid: PadGrid) -> None:
+        is_first = self._grid is None
+        super().prepare(grid)
+        if is_first and "rgb" in self.outputs and self.config.flat_field is None:
+            self._warn_if_saturated(grid)
+
+    def render_layers(self, surface: GelSurface, **sampling: int | None) -> dict[str, np.ndarray]:
+        """Linear radiance by layer, each (B, H, W, 3) float32; whatever ``outputs`` say about rgb.
+
+        ``sampling``: ``spp`` and ``seed`` of a sampled tracer, as of its ``render``.
+
+        Raises:
+            InputError: no output needs light; and as ``render``.
+        """
+        if not self._lit:
+            rule = "layers need a tracer with an output of light"
+            raise InputError("outputs", value=self.outputs, rule=rule, choices=("rgb", "layers"))
+        heights, failed = self._checked(surface)
+        layers = self._layers(heights, checked_ink(surface), **sampling)
+        for image in layers.values():
+            image[failed] = np.nan
+        return layers
+
+    def _set_flat_field(self, grid: PadGrid) -> None:
+        """Make the image at rest that of the configuration, if it has one."""
+        if self.config.flat_field is not None and self._lit:
+            self.response.set_flat_field(self.config.flat_field, self._rest_light(grid.rest[None].astype(np.float32)))
+
+    def _warn_if_saturated(self, grid: PadGrid) -> None:
+        """Warn of an image at rest that is white over a large part, and name the exposure that would make it mid-grey."""
+        rest = grid.rest[None].astype(np.float32)
+        share = saturated_share(self._rest_image(rest))
+        if share <= SATURATED:
+            return
+        response, advice = self.sensor.response, "the light is too uneven for any exposure"
+        try:
+            grey = mid_grey_exposure(self.sensor, self._rest_light(rest) * self.response.scale / response.gain)
+        except SpecError:
+            grey = response.gain
+        if abs(grey - response.gain) > 0.1 * grey:
+            advice = f'exposure = {grey:g} makes it mid-grey on average, and exposure = "auto" finds that by itself'
+        warnings.warn(
+            f"sensor {self.sensor.name!r}: {100 * share:.0f} % of the pixels are at 255 at rest with "
+            f"exposure = {response.gain:g}; {advice}",
+            stacklevel=3,
+        )

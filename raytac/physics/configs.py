@@ -1,0 +1,70 @@
+"""Configurations of the physics that come with raytac; making one imports neither MuJoCo nor the solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from raytac.checks import check_known, check_methods
+from raytac.device import resolve_device
+from raytac.specs.press import PADS, PressScene
+from raytac.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from raytac.physics.rigid.pad import RigidPad
+    from raytac.physics.soft.mesh import PadMesh
+    from raytac.physics.soft.pad import SoftPad
+
+__all__ = ["Ipc", "Rigid"]
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """Rigid pad on MuJoCo: geometry and Gaussians give the gel's surface, a load law ties force to depth."""
+
+    is_simulated: ClassVar[bool] = False
+
+    @property
+    def label(self) -> str:
+        return "rigid"
+
+    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> RigidPad:
+        """The pad of a press; always on the CPU. See ``PhysicsConfig.build``."""
+        from raytac.physics.rigid.pad import RigidPad
+
+        return RigidPad(spec, press, **settings)
+
+
+@dataclass(frozen=True)
+class Ipc:
+    """Soft pad: the gel solved with contact, friction and large deformation by ``ipc``.
+
+    Raises:
+        InputError: an unknown level.
+    """
+
+    level: str | PadMesh | None = None
+    """Resolution of the mesh, one of ``PADS``, or a mesh of one's own; None is the scene's, else ``coarse``."""
+    # A field ``correction`` (None: the plain finite-element surface) belongs here.
+    is_simulated: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.level, str):
+            check_known("level", self.level, PADS)
+        elif self.level is not None:
+            check_methods("level", self.level, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
+
+    @property
+    def label(self) -> str:
+        level = self.level or PADS[0]
+        return f"ipc-{level if isinstance(level, str) else 'own'}"
+
+    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
+        """The pad of a press; the solver traces no rays, so that CUDA needs no OptiX. See ``PhysicsConfig.build``."""
+        from raytac.physics.soft.availability import check_solver
+
+        check_solver("physics='ipc'")
+        from raytac.physics.soft.pad import SoftPad
+
+        device = resolve_device(device, ray_tracing=False)
+        return SoftPad(spec, press, level=self.level or PADS[0], device=device, **settings)

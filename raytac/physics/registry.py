@@ -1,0 +1,65 @@
+"""Physics of the gel by name, and which one a scene is pressed with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from raytac.checks import check_methods
+from raytac.errors import InputError, SpecError
+from raytac.physics.base import PhysicsConfig
+from raytac.registry import Registry
+from raytac.specs.press import PADS
+
+__all__ = ["PHYSICS", "checked_physics", "register", "scene_physics"]
+
+PHYSICS: Registry[PhysicsConfig] = Registry(
+    "physics", {"rigid": "raytac.physics.configs:Rigid", "ipc": "raytac.physics.configs:Ipc"}
+)
+register = PHYSICS.register
+
+
+def checked_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None:
+    """The configuration of a name, or the configuration itself; None stays None.
+
+    Raises:
+        InputError: an unknown name, or what is no configuration.
+    """
+    if physics is None:
+        return None
+    config = PHYSICS.config(physics)
+    check_methods(
+        "physics", config, ("build",), ("label", "is_simulated"), f"one of {', '.join(PHYSICS.names)}, or a configuration"
+    )
+    return config
+
+
+class _Scene(Protocol):
+    """What a press, a task and a sweep say of physics."""
+
+    @property
+    def physics(self) -> str | None: ...
+
+    @property
+    def pad(self) -> str | None: ...
+
+    @property
+    def source(self) -> Path | None: ...
+
+
+def scene_physics(physics: PhysicsConfig | None, scene: _Scene) -> PhysicsConfig:
+    """What a scene is pressed with: what is asked for, else what the scene names, else ``rigid``.
+
+    A ``level`` that is not given is the scene's, else the coarsest.
+
+    Raises:
+        SpecError: the scene names a physics that is not known; names file, key and choices.
+    """
+    if physics is None:
+        try:
+            physics = PHYSICS.config(scene.physics or "rigid")
+        except InputError as error:
+            raise SpecError(error.rule, file=scene.source, key="physics", value=error.value, choices=error.choices) from error
+    options: dict[str, Any] = {"level": scene.pad or PADS[0]}
+    return replace(physics, **options) if getattr(physics, "level", "") is None else physics  # type: ignore[type-var]

@@ -1,0 +1,73 @@
+"""Pads of a world: what every physics must offer there, and the implementations by the name of the physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from raytac.gel.surface import PadGrid
+from raytac.physics.base import PadReading
+from raytac.registry import Registry
+from raytac.world.state import Drive
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from raytac.physics.soft.scene import SoftScene
+
+__all__ = ["WORLD_PADS", "WorldPads"]
+
+WORLD_PADS: Registry[Any] = Registry(
+    "physics", {"rigid": "raytac.world.rigid_pads:RigidPads", "ipc": "raytac.world.soft_pads:SoftPads"}
+)
+"""Classes of world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
+
+
+class WorldPads(Protocol):
+    """All pads of a world, B environments."""
+
+    report: dict[str, np.ndarray]
+    """Figures of the solver in the last step, each (B,); empty without one."""
+
+    @property
+    def soft(self) -> SoftScene | None:
+        """The contact solver's scene; None without one."""
+        ...
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Names of all that ``soft`` has a surface of."""
+        ...
+
+    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+        """Put environments back to the start.
+
+        Args:
+            envs: the environments.
+            datas: MuJoCo's states of all environments, at the start.
+            bodies: not None if bodies or the robot start elsewhere: name to poses (n, 4, 4).
+
+        Raises:
+            OverlapError: bodies overlap there.
+        """
+        ...
+
+    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
+        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
+        ...
+
+    def wrench(self, name: str) -> np.ndarray:
+        """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
+        ...
+
+    def reading(
+        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
+    ) -> PadReading:
+        """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
+        ...
+
+    def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
+        """Sensor, body and depth [m] of every overlap at the present poses."""
+        ...

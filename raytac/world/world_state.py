@@ -1,0 +1,60 @@
+"""State of a world after a step, and the controllers that drive it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+__all__ = ["BatchController", "Control", "Controller", "Drive", "WorldState", "lost"]
+
+_LARGEST_SPEED = 1e4
+"""Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
+
+Controller = Callable[[mujoco.MjData, float], None]
+"""Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
+and bias forces are up to date."""
+Drive = Callable[[Sequence[int] | np.ndarray], None]
+"""Writes ``data.ctrl`` of the environments named, at the same moments."""
+
+
+class BatchController(ABC):
+    """Controller of all environments in one call."""
+
+    @abstractmethod
+    def drive(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
+        """Write ``ctrl`` of ``datas[b]`` for every b of ``envs``, when a ``Controller`` would be called; the others have failed."""
+
+
+Control = Controller | BatchController | Sequence[Controller] | np.ndarray
+"""Controllers of a world: one for all environments, one for each, or constant controls (nu,) or (B, nu)."""
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """B environments at one instant, world frame unless said otherwise. An environment that failed holds NaN."""
+
+    time: np.ndarray
+    """Time since the reset [s], shape (B,)."""
+    joints: np.ndarray | None
+    """Positions of the arm's joints [rad or m], shape (B, n); None without an arm."""
+    world_from_pad: dict[str, np.ndarray]
+    """Pose (B, 4, 4) of every sensor's pad frame."""
+    world_from_body: dict[str, np.ndarray]
+    """Pose (B, 4, 4) of every rigid body."""
+    wrench: dict[str, np.ndarray]
+    """Contact force on each pad [N] and its torque about the pad frame's origin [N m], **pad frame**, shape (B, 6)."""
+    failed: np.ndarray
+    """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
+    report: dict[str, np.ndarray] = field(default_factory=dict)
+    """Report of the pads' solver on this step, each (B,); empty with the rigid pad."""
+
+
+def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
+    """True (n,) for states of MuJoCo that are invalid: a number is not finite, or a joint is far too fast."""
+    speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
+    # One number that is not finite makes the sum such.
+    return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < _LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))

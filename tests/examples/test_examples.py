@@ -1,0 +1,42 @@
+"""Examples are short, and each runs as a visitor would run it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+SAYS = {
+    "batch": "load",
+    "gym_env": "return after five random actions",
+    "press": "force",
+    "relight": "without blue",
+}
+"""A word that the last line of an example must hold, or any line where it has several kinds."""
+
+
+def test_there_are_examples_and_each_has_its_test() -> None:
+    assert {path.stem for path in EXAMPLES} >= set(SAYS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    assert f"python examples/{path.name}" in text and text.startswith('"""')
+
+
+@pytest.mark.parametrize("name", sorted(SAYS))
+def test_an_example_runs(name: str, tmp_path: Path) -> None:
+    if name == "gym_env":
+        pytest.importorskip("gymnasium")
+    command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert SAYS[name] in done.stdout
