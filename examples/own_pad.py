@@ -1,4 +1,4 @@
-"""A physics of one's own in one file: a Winkler foundation, each point of which yields by itself, pressed by its name."""
+"""How do I add a physics of my own? Here a Winkler foundation: each point of the gel yields by itself. `python examples/own_pad.py`"""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -19,6 +19,7 @@ import tyro
 from experiments.running import recorded, run
 from raytac.calibrate import FitSettings, by_press, fit_models, images_of, leds_at_walls, read_photographs
 from raytac.io import CommonOptions
+from raytac.optics import RayTraced
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor, with_lights
 
@@ -62,7 +63,7 @@ def main(args: Args) -> None:
             starts=args.starts,
             rounds=args.rounds,
             prior=args.prior,
-            options={"shadows": False},
+            tracing=RayTraced(shadows=False),
             tick=lambda stage, cost: print(f"{stage}: cost {cost:.4g}", flush=True),
         )
         unseen = shots.take(test)

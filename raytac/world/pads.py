@@ -10,7 +10,7 @@ import numpy as np
 from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.registry import Registry
-from raytac.world.state import Drive
+from raytac.world.world_state import Drive
 
 if TYPE_CHECKING:
     import mujoco

@@ -131,8 +131,8 @@ def test_no_two_sensors_of_a_vector_have_the_same_noise() -> None:
 @pytest.mark.renderer
 def test_with_noise_in_every_frame_too_when_they_begin_anew_at_different_times(mode: AutoresetMode) -> None:
     disturbed = MarkerPerturbation(noise_px=0.3, dropout=0.1, shift=5e-5)
-    direct = {"optics": RayTraced(bounce=False)}  # quickest to build
-    tactile = ObservationSettings(("rgb", "markers", "wrench"), resolution=(16, 12), difference=True, stack=2, **direct)
+    direct = RayTraced(bounce=False)  # quickest to build
+    tactile = ObservationSettings(("rgb", "markers", "wrench"), resolution=(16, 12), difference=True, stack=2, optics=direct)
     options = {
         "tactile": tactile,
         "randomization": Randomization(noise=2.0, exposure=0.2, markers=disturbed),

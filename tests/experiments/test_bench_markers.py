@@ -11,6 +11,7 @@ import pytest
 from experiments import bench_markers as bench
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
+from raytac.markers import MARKERS
 from raytac.specs import load_sensor
 from tests.clock import steady_clock
 
@@ -36,7 +37,7 @@ def test_a_small_run_times_every_model(
                 assert metrics[f"{key}{suffix}.ms_per_frame{which}"] == pytest.approx(1.0 / envs)
             assert metrics[f"{key}{suffix}.device"] == "cpu"
     printed = capsys.readouterr().out
-    for model in bench.MODELS:
+    for model in MARKERS.names:
         for envs, ms in ((1, "1.000"), (3, "0.333")):
             assert re.search(rf"^{model} +{envs} environments +{ms} ms a frame  \(least {ms}\)  on cpu$", printed, re.MULTILINE)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def dotted(sensor: SensorSpec, grid: PadGrid) -> tuple[GelSurface, GelSurface, n
 
 
 @pytest.mark.parametrize("integrator", ["fast", "reference", "path"])
-def test_ray_traced_dots(integrator: str, sensor: SensorSpec, dotted: tuple[GelSurface, GelSurface, np.ndarray]) -> None:
+def test_ray_traced_dots(integrator: Any, sensor: SensorSpec, dotted: tuple[GelSurface, GelSurface, np.ndarray]) -> None:
     """On a Lambertian coat under direct light a dot returns its share of albedo, and nothing changes beside it."""
     lambertian = replace(sensor, coat=replace(sensor.coat, specular=0.0))
     spp, depth = (None, -1) if integrator == "fast" else (16, 1 if integrator == "reference" else 2)

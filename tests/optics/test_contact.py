@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import GelSurface
-from raytac.optics.trace.fast_tracer import image_seed
+from raytac.optics.trace.sampled_tracer import image_seed
 from raytac.specs.sensor import SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.scenes import at_rest, ball, grid_of, like_a_mini, surface

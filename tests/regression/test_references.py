@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raytac.io.png import read_png, write_png
 
 from raytac import TactileFrame, TactileSensor, load_press, load_sensor
+from raytac.io.images import read_png, write_png
+from raytac.optics import Mlp, Phong, RayTraced, Taxim
 from raytac.optics.image.mlp_weights import INPUTS, MlpWeights
 from raytac.optics.taxim.table import PolyTable, ShadowTable
 from raytac.physics.soft.contact_width import NarrowContactWarning
@@ -79,13 +80,13 @@ def network() -> MlpWeights:
 
 @functools.cache
 def sensor(mode: str) -> TactileSensor:
-    options: dict[str, Any] = {
-        "raytrace": {},
-        "taxim": {"calibration": table(), "shadows": True},
-        "phong": {"background": background().astype(np.uint8)},
-        "mlp": {"calibration": network()},
+    optics = {
+        "raytrace": RayTraced(),
+        "taxim": Taxim(table(), shadows=True),
+        "phong": Phong(background=background().astype(np.uint8)),
+        "mlp": Mlp(network()),
     }[mode]
-    return TactileSensor(SENSOR, optics=mode, resolution=RESOLUTION, device="cpu", optics_options=options)
+    return TactileSensor(SENSOR, optics=optics, resolution=RESOLUTION, device="cpu")
 
 
 def image(mode: str, scene: str) -> np.ndarray:

@@ -16,6 +16,7 @@ import pytest
 
 from raytac.cli import view as view_module
 from raytac.cli.view import ViewArgs
+from raytac.physics import Rigid
 from raytac.specs import SensorSpec, load_press, load_sensor
 from tests.view.page_client import PageClient
 
@@ -104,5 +105,5 @@ def test_the_image_is_as_large_as_can_be_drawn_and_has_the_shape_of_the_sensor(n
 def test_an_upright_sensor_is_shown_upright(monkeypatch):
     monkeypatch.setattr(view_module, "sensor_spec", lambda name: upright(240, 320))
     args = ViewArgs(scene="sphere", optics="phong", device="cpu")
-    (view,) = args._press(load_press("sphere"), "rigid").snapshot().pads.values()
+    (view,) = args._press(load_press("sphere"), Rigid()).snapshot().pads.values()
     assert view.rgb is not None and view.rgb.shape == (320, 240, 3)
