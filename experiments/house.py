@@ -118,8 +118,8 @@ def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
     if not (root / EXAMPLE).exists():
         return None
     tree = ast.parse((root / EXAMPLE).read_text(encoding="utf-8"))
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
-    registered = [call.args[0] for call in calls if call.func.attr == "register" and call.args]  # type: ignore[union-attr]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    registered = [call.args[0] for call in calls if ast.unparse(call.func).rpartition(".")[2] == "register"]
     names = {node.value for node in registered if isinstance(node, ast.Constant)}
     if not names:
         raise ValueError(f"{EXAMPLE} must register its mode: register(NAME) with a string")
