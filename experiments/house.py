@@ -23,6 +23,7 @@ PACKAGES = ("raytac", "ipc")
 SMALL_FILE = 130
 LONG_FILE = 400
 EXAMPLE = Path("examples", "own_optical_mode.py")
+OTHER_MODES = {"raytrace", "taxim", "phong", "mlp"}
 QUESTION = re.compile(r"(What|Whether|How|Where|Which|Who)\b")
 WORDS = ("found", "way", "left", "borne", "led", "held", "told", "anew")
 """Words that stand for "result", "displacement", "residual", "carried", "prescribed", "constrained", "reported" and "again"."""
@@ -106,11 +107,19 @@ def names_bound(tree: ast.AST) -> Iterator[str]:
             yield node.name
 
 
+def strings_in(node: ast.AST) -> Iterator[str]:
+    """Strings that a tuple, list, set, dictionary or call holds side by side."""
+    fields = [getattr(node, name, None) for name in ("elts", "keys", "values", "args")]
+    for item in (item for field in fields if isinstance(field, list) for item in field):
+        if isinstance(item, ast.Constant) and isinstance(item.value, str):
+            yield item.value
+
+
 def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
     """Files of the optical mode that ``EXAMPLE`` adds; None without the example.
 
-    They are the example, modules of its folder that it imports, and each module of the library that names the mode: where a mode has to
-    be listed, its name is a string there.
+    They are the example, modules of its folder that it imports, and each module of the library that lists the mode's name beside that of
+    another mode: in a tuple, list, set, dictionary or call.
 
     Raises:
         ValueError: the example registers no mode by name.
@@ -118,8 +127,8 @@ def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
     if not (root / EXAMPLE).exists():
         return None
     tree = ast.parse((root / EXAMPLE).read_text(encoding="utf-8"))
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
-    registered = [call.args[0] for call in calls if call.func.attr == "register" and call.args]  # type: ignore[union-attr]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    registered = [call.args[0] for call in calls if ast.unparse(call.func).rpartition(".")[2] == "register"]
     names = {node.value for node in registered if isinstance(node, ast.Constant)}
     if not names:
         raise ValueError(f"{EXAMPLE} must register its mode: register(NAME) with a string")
@@ -129,7 +138,7 @@ def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
     listed = [
         module
         for module, code in library.items()
-        if any(isinstance(node, ast.Constant) and node.value in names for node in ast.walk(code))
+        if any(names & (together := set(strings_in(node))) and together & OTHER_MODES for node in ast.walk(code))
     ]
     return [str(EXAMPLE), *sorted(str(path.relative_to(root)) for path in own), *listed]
 

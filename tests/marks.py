@@ -25,6 +25,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "markers/test_dots.py",
         "markers/test_fots.py",
         "markers/test_fots_punch.py",
+        "markers/test_own_model.py",
         "markers/test_sensor.py",
         "observe/test_device_images.py",
         "observe/test_wrapper.py",
@@ -35,6 +36,8 @@ PLACES: dict[str, tuple[str, ...]] = {
         "report/test_press_sheet.py",
         "report/test_real.py",
         "report/test_tracers.py",
+        "robots/test_picture.py",  # MuJoCo's own pictures
+        "specs/test_press_of.py",
         "test_bake_end_to_end.py",
         "test_cli.py",
         "test_doctor.py",
@@ -54,7 +57,16 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world/test_held.py",
         "world/test_soft_world.py",
     ),
-    "script": ("dataset/test_ray_cluster.py", "envs/test_sb3.py", "experiments", "test_packaging.py"),
+    "script": (
+        "dataset/test_ray_cluster.py",
+        "envs/test_sb3.py",
+        "examples",
+        "experiments",
+        "test_packaging.py",
+        "view/test_browser.py",
+        "view/test_guard.py",
+        "view/test_page.py",
+    ),
 }
 PACKAGES = {"renderer": ("mitsuba", "drjit"), "solver": ("warp",)}
 

@@ -64,9 +64,10 @@ def test_files_of_a_toy_optical_mode(root: Path) -> None:
     example.parent.mkdir()
     example.write_text("from raytac.optics import MODES\n@MODES.register('toy')\nclass Toy: pass\n", encoding="utf-8")
     assert house.measure(root)[1]["mode_files"] == [str(house.EXAMPLE)]
+    (root / "raytac/outputs.py").write_text("OUTPUTS = ('rgb', 'toy')\n", encoding="utf-8")  # a word that means something else
     (root / "raytac/options.py").write_text("OPTICS = ('phong', 'toy')\n", encoding="utf-8")
     (example.parent / "toy_kernel.py").write_text("", encoding="utf-8")
-    example.write_text("import toy_kernel\nMODES.register('toy')(Toy)\n", encoding="utf-8")
+    example.write_text("import toy_kernel\nfrom raytac.optics import register\nregister('toy')(Toy)\n", encoding="utf-8")
     assert house.measure(root)[1]["mode_files"] == [str(house.EXAMPLE), "examples/toy_kernel.py", "raytac.options"]
     example.write_text("class Toy: pass\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"own_optical_mode\.py must register"):

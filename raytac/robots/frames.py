@@ -1,8 +1,5 @@
 """Poses of sites and bodies in MuJoCo's states, as the last ``mj_kinematics`` or step left them."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

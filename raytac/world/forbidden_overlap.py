@@ -1,8 +1,5 @@
 """Overlaps that no pad can have: bodies beyond a bonded face, where no gel remains to press, and bodies of the solver inside the robot."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -1,8 +1,5 @@
 """Pads of a world: what every physics must offer there, and the implementations by the name of the physics."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module names its types at run time.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -154,6 +154,7 @@ def test_configurations_refuse_what_cannot_be(make: Callable[[], object], match:
         make()
 
 
+@pytest.mark.renderer
 def test_contact_settings_reach_sampling_and_tracking(sensor: SensorSpec, grid: PadGrid) -> None:
     """A contact 3.1 mm from where the object carries it is the same one with the default reach, and a new one with a short reach."""
     first = pressed(grid, [(0, 0, DEEP)], poses=[pose()])

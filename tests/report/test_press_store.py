@@ -64,6 +64,7 @@ def test_it_is_of_this_press_gel_pad_device_and_code_only(tmp_path: Path, sensor
     assert store(tmp_path, sensor, said).read(PRESS) is not None and not said
 
 
+@pytest.mark.solver
 def test_the_code_is_that_of_solver_physics_and_presses(monkeypatch: pytest.MonkeyPatch) -> None:
     before, read = press_code(), Path.read_bytes
     seen = set()
