@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from raytac.checks import is_number
 from raytac.errors import SpecError
 from raytac.specs.sensor import Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
@@ -95,10 +97,13 @@ class ObjectSpec:
     def __post_init__(self) -> None:
         if not isinstance(self.kind, str) or self.kind not in OBJECT_KINDS:
             raise SpecError("must be a known kind of object", key="object.kind", value=self.kind, choices=tuple(OBJECT_KINDS))
-        if bool(self.heights) != (self.kind == "heights"):
-            raise SpecError(
-                'must be given for the kind "heights", and for no other', key="object.heights", value=len(self.heights)
-            )
+        rows = self.heights if isinstance(self.heights, tuple) else None
+        if rows is None or any(not isinstance(row, tuple) or len(row) != len(rows[0]) for row in rows):
+            raise SpecError("must be a tuple of rows, each a tuple of as many numbers", key="object.heights", value=self.heights)
+        if bool(rows) != (self.kind == "heights"):
+            raise SpecError('must be given for the kind "heights", and for no other', key="object.heights", value=len(rows))
+        if not all(is_number(value) and 0.0 <= value < math.inf for row in rows for value in row):
+            raise SpecError("must be finite numbers >= 0 [m]", key="object.heights", value=f"{len(rows)} rows")
         if self.kind == "none":
             return
         check_params(self.kind, self.params, OBJECT_KINDS[self.kind], "object")
