@@ -1,4 +1,4 @@
-"""What a sensor returns: one record of arrays, of which outputs are present only if they were asked for."""
+"""Result of a sensor: one record of arrays. An output is present only if it was asked for."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ _ASK = {
     "force_law_area": "is of the rigid pad's presses alone: physics='rigid'",
     "unconverged": "is of soft pads alone: physics='ipc'",
 }
-"""How to ask for what is not named in ``outputs=`` by its own name."""
+"""Advice on asking for an array that ``outputs=`` does not list by its own name."""
 
 
 @dataclass(frozen=True, repr=False, eq=False, init=False)
 class TactileFrame:
-    """What B sensors see and feel at one instant. All images are (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
+    """Images, forces and markers of B sensors at one instant.
+
+    All images are (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
 
     ``surface``, ``failed``, ``time_ms`` and ``label`` are always there, and ``force`` too unless the frame was made from a bare surface.
     What ``OUTPUTS`` names is there if the sensor was asked for it, so ``wrench``, which holds the same force with its torque; markers if
@@ -68,7 +70,7 @@ class TactileFrame:
     """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact;
     of the mode ``taxim`` alone, where the table tells its coverage."""
     markers: MarkerFrame
-    """Where the markers have gone, in metres and pixels; there if the sensor was given a marker model."""
+    """Positions of the markers, in metres and pixels; present if the sensor has a marker model."""
     wrench: np.ndarray
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
     traction: np.ndarray

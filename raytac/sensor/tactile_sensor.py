@@ -62,13 +62,13 @@ class TactileSensor:
     grid: PadGrid
     """Nodes of the pad's surface."""
     optics: OpticsConfig[Any]
-    """How images are made."""
+    """Configuration of the optical mode."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     markers: MarkersConfig | None
     """Configuration of the marker model; None without markers."""
     physics: PhysicsConfig | None
-    """How the gel deforms, as asked for; None is as each scene says, else ``rigid``."""
+    """Configuration of the physics, as asked for; None is as each scene says, else ``rigid``."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class TactileSensor:
         self._mode: OpticalMode | None = None
         self._pad: Pad | None = None
         self._is_narrow = False
-        """Whether this press was warned of already."""
+        """True if this press was warned of already."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
@@ -301,19 +301,19 @@ class TactileSensor:
         if not reading.has_forces:
             return {}
         surface, failed = reading.surface, reading.failed
-        found: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
-        found["unconverged"] = reading.unconverged
+        outputs: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
+        outputs["unconverged"] = reading.unconverged
         if "wrench" in self.outputs:
-            found["wrench"] = reading.wrench
+            outputs["wrench"] = reading.wrench
         if "traction" in self.outputs:
-            found["traction"] = reading.traction()
+            outputs["traction"] = reading.traction()
         if {"wrench", "traction"} & set(self.outputs):
             area = cell_areas(surface.grid)
-            found["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
+            outputs["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
             if surface.coat is not None:
-                found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
-                self._check_width(reading, found["contact_cells"])
-        return found
+                outputs["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
+                self._check_width(reading, outputs["contact_cells"])
+        return outputs
 
     def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
         """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.

@@ -217,7 +217,7 @@ class SensorScene:
         return si.shape == self._coat
 
     def on_case(self, si: Any) -> Any:
-        """Whether ``si`` lies on a wall or the floor, its inner side."""
+        """True if ``si`` lies on the inner side of a wall or the floor."""
         case = si.is_valid() & (si.wi.z > 0)
         for other in (self._coat, *self._leds):
             case &= si.shape != other

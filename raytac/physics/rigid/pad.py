@@ -26,7 +26,7 @@ __all__ = ["RigidPad"]
 
 @dataclass
 class _Environment:
-    """What one environment remembers between stages."""
+    """State of one environment between stages."""
 
     origin: np.ndarray
     """Pad-frame position of the object's origin at first touch, zero shear and twist (3,) [m]."""
@@ -64,7 +64,7 @@ class RigidPad(PressPad):
         self._surround = ElasticSurround(self.grid)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
         self._environments: list[_Environment] = []
-        """Where the last reading left the object; empty before the first, and without an object."""
+        """State of every environment at the last reading; empty before the first, and without an object."""
         self._begun: tuple[int, int, list[_Environment]] = -1, 1, []
         """Index and readings of the stage that was begun last, and the environments as they were before it."""
 
