@@ -75,12 +75,12 @@ class TactileFrame:
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
     traction: np.ndarray
     """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
-    Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
+    Of a soft pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
     over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is the wrench's force."""
     contact_area: np.ndarray
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
     contact_cells: np.ndarray
-    """Width of the narrowest patch of contact in cells of a simulated pad, shape (B,), NaN without contact (comes with ``wrench`` or
+    """Width of the narrowest patch of contact in cells of a soft pad, shape (B,), NaN without contact (comes with ``wrench`` or
     ``traction``): with fewer than 6 the force at a given depth is too large."""
     force: np.ndarray
     """Force of the object on the pad, pad frame [N], shape (B, 3); not of a bare surface."""
@@ -90,13 +90,13 @@ class TactileFrame:
     failed: np.ndarray
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use."""
     unconverged: np.ndarray
-    """Steps of a simulated pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
+    """Steps of a soft pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
     shape (B,), int. An environment whose last step is one of them has ``failed``."""
     time_ms: dict[str, float]
     """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 
     label: str
-    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not told."""
+    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not known."""
 
     def __init__(self, surface: GelSurface, **values: Any) -> None:
         """``values``: further fields; None is as if it were not given."""

@@ -62,7 +62,7 @@ class CoatLayout:
 
 
 class CoatField:
-    """B coat surfaces as device arrays, made anew each frame from heights.
+    """B coat surfaces as device arrays, computed each frame from heights.
 
     ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
     four corners of a cell, for the walks; the normal points to the

@@ -1,4 +1,4 @@
-"""Finished presses of the simulated pad, kept on disk so that an interrupted calibration goes on where it stopped."""
+"""Finished presses of the soft pad, kept on disk so that an interrupted calibration goes on where it stopped."""
 
 from __future__ import annotations
 

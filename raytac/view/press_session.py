@@ -43,7 +43,7 @@ _DEEPEST = 0.4
 _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
 """Ends of the sliders for force [N], shear [mm] and twist [degrees], until the object goes beyond them."""
 _STATES, _SIMULATED_STATES = 20, 10
-"""States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
+"""States a stage of the scene's own trajectory is shown in; of a soft pad each costs at least one step of the solver."""
 _SAG = 1e-5
 """Largest depth of the drawn facets below a curved object's true surface [m]."""
 _OBJECT_COLOUR = (150, 156, 166)
@@ -69,7 +69,7 @@ class PressSession:
         self._sensor, self._stages = sensor, len(scene.trajectory)
         self._is_drivable = scene.object.kind != "none" and scene.object.dynamics != "affine"
         if self._is_drivable:
-            # One more stage, never played: it makes a simulated pad keep as much of the object as the sliders can bring near the gel.
+            # One more stage, never played: it makes a soft pad keep as much of the object as the sliders can bring near the gel.
             scene = replace(scene, trajectory=(*scene.trajectory, StageSpec("indent", force=_STRONGEST)))
         self._pad = sensor.load(scene)
         self.title = f"{scene.name} · {sensor.spec.name} · {sensor.label}"
@@ -216,7 +216,7 @@ class PressSession:
         return vertices[0], faces
 
     def _coat_lines(self) -> tuple[Lines, ...]:
-        """Edges of the simulated pad's own mesh over the smooth coat."""
+        """Edges of the soft pad's own mesh over the smooth coat."""
         if not isinstance(self._pad, SoftPad):
             return ()
         return (Lines("coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH),)  # laid on the first state's surface

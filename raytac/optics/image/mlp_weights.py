@@ -144,7 +144,7 @@ def _check_version(path: Path) -> None:
     for key, expected in (("format", FORMAT), ("version", str(VERSION))):
         if header.get(key) != expected:
             rule = (
-                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it anew"
+                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it again"
             )
             raise CalibrationError(rule, file=path, key=key, value=header.get(key, "missing"))
 

@@ -100,7 +100,7 @@ def patch_counts(layout: CoatLayout) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class BounceField:
-    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, made anew each frame.
+    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, computed each frame.
 
     (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal.
     """

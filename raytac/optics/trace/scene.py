@@ -80,7 +80,7 @@ class SensorScene:
         self._coat = mi.ShapePtr(shapes["coat"])
         self._coat_bsdf = shapes["coat"].bsdf()
         self._leds = [mi.ShapePtr(shapes[f"led_{k}"]) for k in range(len(sensor.lights.leds))]
-        # Opaque, or their addresses become constants of the kernels, which then compile anew for every scene.
+        # Opaque, or their addresses become constants of the kernels, which then compile again for every scene.
         drjit.make_opaque(self._coat, *self._leds)
         self._context = mi.BSDFContext()
         self.set_surface(grid.rest)

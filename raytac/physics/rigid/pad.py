@@ -57,7 +57,7 @@ class RigidPad(PressPad):
     def __init__(self, sensor: SensorSpec, scene: PressScene, **settings: Any) -> None:
         """Build the grid, the object and the elastic surround; ``settings`` and errors as of ``PressPad``."""
         if scene.object.dynamics == "soft":
-            rule = "is for the simulated pad, physics='ipc': the rigid pad's object does not give way"
+            rule = "is for the soft pad, physics='ipc': the rigid pad's object does not give way"
             choices = tuple(name for name in DYNAMICS if name != "soft")
             raise SpecError(rule, file=scene.source, key="object.dynamics", value="soft", choices=choices)
         super().__init__(sensor, scene, **settings)
