@@ -1,9 +1,9 @@
 """A new optical mode in one file: the image shows how deep the gel is pressed, as a grey value.
 
 python examples/own_optical_mode.py                            # press with it, and with a Taxim table (baked at first use)
-python examples/own_optical_mode.py press coin --optics depth  # every command of raytac knows the new name
+python examples/own_optical_mode.py press coin --optics grey   # every command of raytac knows the new name
 python examples/own_optical_mode.py compare --quick            # error and time beside all other modes
-python examples/own_optical_mode.py view sphere --optics depth
+python examples/own_optical_mode.py view sphere --optics grey
 """
 
 import sys
@@ -17,10 +17,10 @@ from raytac.gel import GelSurface
 from raytac.optics import OpticsConfig, OpticsImages, register
 
 
-class DepthMode:
-    """What makes the images. Anything with ``label``, ``device`` and ``render`` will do."""
+class GreyMode:
+    """Maker of the images. Anything with ``label``, ``device`` and ``render`` will do."""
 
-    label, device = "depth", "cpu"
+    label, device = "grey", "cpu"
 
     def __init__(self, spec, config, *, resolution=None, outputs=("rgb",), device="auto", seed=0):
         self.width, self.height = resolution or spec.camera.resolution
@@ -34,27 +34,27 @@ class DepthMode:
         return OpticsImages(rgb=np.repeat(grey[..., None], 3, axis=-1))
 
 
-@register("depth")
+@register("grey")
 @dataclass(frozen=True)
-class Depth(OpticsConfig):
-    """What users write: ``optics="depth"`` or ``optics=Depth(deepest=2e-3)``."""
+class Grey(OpticsConfig):
+    """Configuration, as users write it: ``optics="grey"`` or ``optics=Grey(deepest=2e-3)``."""
 
     deepest: float = 1e-3
     """Depth that is white [m]."""
     outputs = ("rgb",)
 
     def maker(self):
-        return DepthMode
+        return GreyMode
 
 
 def compare(other: str | OpticsConfig = "taxim") -> float:
     """Mean difference [levels] between what both modes show of a sphere pressed into the gel, less the image at rest."""
     changes = []
-    for optics in ("depth", other):
+    for optics in ("grey", other):
         sensor = raytac.TactileSensor("gelsight_mini", optics=optics, resolution=(80, 60))
         changes.append(np.abs(sensor.press("sphere").rgb[0].astype(int) - sensor.rest().rgb[0]))
     return float(np.abs(changes[0] - changes[1]).mean())
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]) if sys.argv[1:] else print(f"depth against taxim: {compare():.1f} levels"))
+    sys.exit(main(sys.argv[1:]) if sys.argv[1:] else print(f"grey against taxim: {compare():.1f} levels"))

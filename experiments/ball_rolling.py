@@ -1,4 +1,4 @@
-"""How far is a ball from its goals when a Panda rolls it under one sensor, with a rigid and with a simulated pad, and how fast is that?
+"""How far is a ball from its goals when a Panda rolls it under one sensor, with a rigid and with a soft pad, and how fast is that?
 
     python experiments/ball_rolling.py --out runs/ball_rolling
 
@@ -63,7 +63,7 @@ class Record:
     part: list[tuple[float, float, float]]
     """Of it, control, physics and sensor."""
     resolved: list[tuple[float, float]]
-    """Least gap [m] and least det F of a simulated pad."""
+    """Least gap [m] and least det F of a soft pad."""
 
 
 def main(args: Args) -> None:
@@ -91,7 +91,7 @@ def main(args: Args) -> None:
 OPTICS = {"rigid": "taxim", "ipc": "raytrace"}
 """How the image is made: by the table with the rigid pad, by fast ray tracing with the simulated one."""
 STROKES = {"rigid": Strokes(), "ipc": Strokes(roll_speed=0.015, press_speed=0.005, lift_speed=0.02, travel_speed=0.05)}
-"""The simulated pad is solved in one go where it moves by 0.1 mm or less against the ball in 10 ms."""
+"""The soft pad is solved in one go where it moves by 0.1 mm or less against the ball in 10 ms."""
 PITCH = 1e-4
 """Spacing of the nodes of the gel's surface [m]: a ball needs no finer ones."""
 MARKERS = {"rigid": "fots", "ipc": "surface"}

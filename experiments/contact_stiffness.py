@@ -1,4 +1,4 @@
-"""How stiff is the contact of a simulated pad, and by how much is the bound that two-way coupling takes for it too large?
+"""How stiff is the contact of a soft pad, and by how much is the bound that two-way coupling takes for it too large?
 
     python experiments/contact_stiffness.py --out runs/contact_stiffness
 

@@ -1,4 +1,4 @@
-"""Does anything wear in ten thousand control steps of picking up, holding and letting go with two simulated pads?
+"""Does anything wear in ten thousand control steps of picking up, holding and letting go with two soft pads?
 
     python experiments/endurance.py --out runs/endurance                    # all of it; goes on where an earlier run stopped
     python experiments/endurance.py --out runs/endurance --most-s 540       # as much as fits into nine minutes

@@ -25,8 +25,9 @@ LONG_FILE = 400
 EXAMPLE = Path("examples", "own_optical_mode.py")
 OTHER_MODES = {"raytrace", "taxim", "phong", "mlp"}
 QUESTION = re.compile(r"(What|Whether|How|Where|Which|Who)\b")
-WORDS = ("found", "way", "left", "borne", "led", "held", "told", "anew")
-"""Words that stand for "result", "displacement", "residual", "carried", "prescribed", "constrained", "reported" and "again"."""
+# "led" is not among them: the code models LEDs.
+WORDS = ("found", "way", "left", "borne", "held", "told", "anew")
+"""Words that stand for "result", "displacement", "residual", "carried", "constrained", "reported" and "again"."""
 
 
 def modules(root: Path) -> dict[str, Path]:

@@ -38,7 +38,7 @@ class Args(CommonOptions):
     physics: tuple[str, ...] = ("rigid", "ipc")
     """Pads to do it with; the soft object needs ipc and is left out with rigid."""
     pad: str = "coarse"
-    """How finely simulated pads are cut."""
+    """How finely soft pads are cut."""
     force: float = 4.0
     """That each pad is to press with [N]."""
     height_mm: float = 10.0

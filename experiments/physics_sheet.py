@@ -7,7 +7,7 @@
 One row a scene at its peak stage: tactile images of the two, their indentation on one scale, and the second's height less the first's, on a
 scale of its own. No scale cuts anything off.
 ``metrics.json``: ``<scene>.<physics>.`` ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``force_n``, ``contact_mm2``,
-``press_s``; and ``<scene>.contact_um``, ``ring_um``, ``image``: height of the simulated pad less that of the rigid one, root mean square
+``press_s``; and ``<scene>.contact_um``, ``ring_um``, ``image``: height of the soft pad less that of the rigid one, root mean square
 where both touch and within 2 mm of that, and mean absolute difference of the images (of 255).
 
 ``--against LEVEL`` draws nothing and compares heights of every level below with that one: ``<scene>.<level>.`` ``contact_um`` (where both
@@ -50,11 +50,11 @@ class Args(CommonOptions):
     scenes: str = ",".join(SCENES)
     """Names of shipped press scenes or paths of scene files, joined by commas."""
     pad: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "coarse"
-    """Level of the simulated pad."""
+    """Level of the soft pad."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     against: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS[1:]) + "}")] = ""
-    """Compare the levels of the simulated pad with this one instead of the two physics."""
+    """Compare the levels of the soft pad with this one instead of the two physics."""
     quick: bool = False
     """Small images of the first scene only: enough to see that all works."""
 
@@ -169,7 +169,7 @@ def widened(mask: np.ndarray, by: float, pitch: tuple[float, float]) -> np.ndarr
 
 
 def sheet_figure(rows: list[tuple[str, TactileFrame, TactileFrame]], sensor: TactileSensor, pad: str) -> Figure:
-    """One row for each scene: its name, and its frames under the rigid and the simulated pad."""
+    """One row for each scene: its name, and its frames under the rigid and the soft pad."""
     from matplotlib.figure import Figure
 
     from raytac.report import camera_extent_mm

@@ -1,4 +1,4 @@
-"""Does any press break a pad? Random presses on the rigid and on the simulated pad: exceptions, and unsound results that do not say so.
+"""Does any press break a pad? Random presses on the rigid and on the soft pad: exceptions, and unsound results that do not say so.
 
     python experiments/stress.py --out runs/stress                          # 300 rigid presses, 100 simulated ones on the coarse pad
     python experiments/stress.py --physics ipc --ipc 20 --seed 1 --out runs/stress_ipc
@@ -11,7 +11,7 @@ has its line of output and is recorded in ``rigid.json`` or ``ipc.json`` when it
 ``metrics.json``: ``stress.<physics>.`` ``presses``, ``exceptions`` (any error but a refusal), ``refused`` (an ``InputError`` or
 ``SpecError`` that says why the pad cannot hold the press), ``failed`` (marked as failed), ``shallow`` and ``failed_shallow`` (presses to
 at most 0.6 of the thickness, and how many of them failed). Of the rigid pad ``below_bond`` (surface below the gel's bonded face, not
-marked) and ``unbalanced`` (traction and force differ by more than 0.1 %, not marked). Of the simulated pad ``unmarked``: states that are
+marked) and ``unbalanced`` (traction and force differ by more than 0.1 %, not marked). Of the soft pad ``unmarked``: states that are
 not finite, in which surfaces cross, or whose last step of the solver did not converge, and that are not marked as failed; each cause by
 itself too, ``nonfinite``, ``penetrating``, ``unconverged``; and ``unconverged_steps`` of all presses.
 """
@@ -39,7 +39,7 @@ from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_press, lo
 
 SENSORS = ("gelsight_mini", "gelsight_dome")
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh", "soft_ball")
-"""Shipped scenes whose objects are pressed; a soft one on the simulated pad alone."""
+"""Shipped scenes whose objects are pressed; a soft one on the soft pad alone."""
 SHALLOW = 0.6
 """Share of the thickness that a pad should hold anywhere."""
 PHYSICS = ("rigid", "ipc")
@@ -58,9 +58,9 @@ class Args(CommonOptions):
     rigid: int = 300
     """Presses on the rigid pad."""
     ipc: int = 100
-    """Presses on the simulated pad."""
+    """Presses on the soft pad."""
     pad: str = PADS[0]
-    """How finely the simulated pad is cut."""
+    """How finely the soft pad is cut."""
     deepest: float = 0.999
     """Depth of the deepest press as a share of the pad's thickness; beyond 0.6 go one in two rigid presses and one in five others."""
 
@@ -180,7 +180,7 @@ def rigid_faults(sensor: TactileSensor, frame: TactileFrame) -> Row:
 
 
 def soft_faults(pad: SoftPad, frame: TactileFrame) -> Row:
-    """What is wrong with a press on the simulated pad."""
+    """What is wrong with a press on the soft pad."""
     assert pad.solver is not None
     row: Row = {"failed": bool(frame.failed[0]), "unconverged_steps": int(frame.unconverged[0])}
     if row["failed"]:

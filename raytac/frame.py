@@ -1,4 +1,4 @@
-"""What a sensor returns: one record of arrays, of which outputs are present only if they were asked for."""
+"""Result of a sensor: one record of arrays. An output is present only if it was asked for."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ _ASK = {
     "force_law_area": "is of the rigid pad's presses alone: physics='rigid'",
     "unconverged": "is of soft pads alone: physics='ipc'",
 }
-"""How to ask for what is not named in ``outputs=`` by its own name."""
+"""Advice on asking for an array that ``outputs=`` does not list by its own name."""
 
 
 @dataclass(frozen=True, repr=False, eq=False, init=False)
 class TactileFrame:
-    """What B sensors see and feel at one instant. All images are (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
+    """Images, forces and markers of B sensors at one instant.
+
+    All images are (B, H, W, …) at the rendered resolution, row 0 at the top (pad-frame −y).
 
     ``surface``, ``failed``, ``time_ms`` and ``label`` are always there, and ``force`` too unless the frame was made from a bare surface.
     What ``OUTPUTS`` names is there if the sensor was asked for it, so ``wrench``, which holds the same force with its torque; markers if
@@ -68,17 +70,17 @@ class TactileFrame:
     """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact;
     of the mode ``taxim`` alone, where the table tells its coverage."""
     markers: MarkerFrame
-    """Where the markers have gone, in metres and pixels; there if the sensor was given a marker model."""
+    """Positions of the markers, in metres and pixels; present if the sensor has a marker model."""
     wrench: np.ndarray
     """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
     traction: np.ndarray
     """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
-    Of a simulated pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
+    Of a soft pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
     over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is the wrench's force."""
     contact_area: np.ndarray
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
     contact_cells: np.ndarray
-    """Width of the narrowest patch of contact in cells of a simulated pad, shape (B,), NaN without contact (comes with ``wrench`` or
+    """Width of the narrowest patch of contact in cells of a soft pad, shape (B,), NaN without contact (comes with ``wrench`` or
     ``traction``): with fewer than 6 the force at a given depth is too large."""
     force: np.ndarray
     """Force of the object on the pad, pad frame [N], shape (B, 3); not of a bare surface."""
@@ -88,13 +90,13 @@ class TactileFrame:
     failed: np.ndarray
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use."""
     unconverged: np.ndarray
-    """Steps of a simulated pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
+    """Steps of a soft pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
     shape (B,), int. An environment whose last step is one of them has ``failed``."""
     time_ms: dict[str, float]
     """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
 
     label: str
-    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not told."""
+    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not known."""
 
     def __init__(self, surface: GelSurface, **values: Any) -> None:
         """``values``: further fields; None is as if it were not given."""

@@ -1,4 +1,4 @@
-"""``TactileSensor`` with the simulated pad: chosen by name or by scene, same outputs and units as the rigid one."""
+"""``TactileSensor`` with the soft pad: chosen by name or by scene, same outputs and units as the rigid one."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_a_fine_pad_has_cells_enough_for_the_shipped_ball():
 
 
 def test_without_images_the_device_is_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulated pad that was solved on CUDA is not said to have been on the CPU because nothing was rendered."""
+    """A soft pad that was solved on CUDA is not said to have been on the CPU because nothing was rendered."""
     monkeypatch.setattr(
         "raytac.sensor.tactile_sensor.resolve_device", lambda device, ray_tracing=True: "cpu" if ray_tracing else "cuda"
     )

@@ -50,7 +50,7 @@ class Models:
     modes: dict[str, OpticalMode]
     device: str
     tracing: RayTraced
-    """How rays are traced."""
+    """Configuration of the ray tracer."""
 
     def circles(self, shots: Photographs) -> np.ndarray:
         """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""

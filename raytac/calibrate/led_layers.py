@@ -30,7 +30,10 @@ class Light:
 
 @dataclass(frozen=True)
 class ExtraLight:
-    """What direct light lacks, to first order about LEDs ``at`` (L, 7), a row as those of ``LightParameters.leds``."""
+    """Light beyond the direct light, to first order about the LEDs ``at``.
+
+    ``at``: (L, 7), rows as those of ``LightParameters.leds``.
+    """
 
     light: Light
     at: np.ndarray
@@ -39,7 +42,7 @@ class ExtraLight:
 
     def of(self, leds: np.ndarray) -> Light:
         """The light of LEDs (L, 7)."""
-        found = self.light
+        light = self.light
         for k, slope in self.by_led.items():
-            found = found.plus(slope, (leds[:, k] - self.at[:, k])[:, None, None])
-        return found
+            light = light.plus(slope, (leds[:, k] - self.at[:, k])[:, None, None])
+        return light

@@ -40,13 +40,13 @@ class PressArgs(ShadowOptions, SolverOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
-    """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated, with contact and friction; needs raytac[ipc]); as the
-    scene says if not given, else rigid."""
+    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact and friction; needs raytac[ipc]). If not
+    given, as the scene says, else rigid."""
     level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
-    """How images are made: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or
-    mlp (a network, which weights must give). The options below that a mode has are fields of its configuration."""
+    """Optical mode: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or mlp (a
+    network, which weights must give). The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
     weights: Path | None = None
@@ -62,8 +62,7 @@ class PressArgs(ShadowOptions, SolverOptions):
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
     outputs: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = None
-    """What to compute: one or several of rgb, layers (raytrace only), normals, depth, height, wrench and traction, joined by commas; all
-    if not given."""
+    """Outputs to compute, joined by commas: rgb, layers (raytrace only), normals, depth, height, wrench, traction. All if not given."""
 
     def run(self) -> int:
         start = time.perf_counter()

@@ -45,16 +45,16 @@ class ViewArgs(ShadowOptions):
     sensor: str | None = None
     """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
     physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
-    """How the gel deforms: rigid (by geometry and Gaussians) or ipc (simulated; needs raytac[ipc]); as the scene says if not given, else
-    rigid."""
+    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements; needs raytac[ipc]). If not given, as the scene says,
+    else rigid."""
     level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
-    """How images are made: raytrace, taxim (a table, baked at first use: minutes) or phong."""
+    """Optical mode: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
     """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
     coupling: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(COUPLINGS) + "}")] = None
-    """Whether what simulated pads feel acts back on a task's robot; as the task says if not given."""
+    """Coupling of soft pads to a task's robot: two_way if their forces act back on it. As the task says if not given."""
     steps: int | None = None
     """Control steps of a task from one shown state to the next; 1 if not given, 4 with rigid pads without markers."""
     resolution: str | None = None
@@ -67,7 +67,7 @@ class ViewArgs(ShadowOptions):
     port: int = 8080
     """Port to serve at; 0 takes any that is free."""
     device: DeviceName = "auto"
-    """Where to compute; auto is CUDA if it works, else the CPU."""
+    """Device that computes; auto is CUDA if it works, else the CPU."""
     seed: int = 0
     """Seed of every random number. In [0, 2^32)."""
     verbose: bool = False

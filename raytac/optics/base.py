@@ -1,4 +1,7 @@
-"""What every optical mode shares: a configuration that builds it, a GelSurface that goes in, images that come out."""
+"""Interface of every optical mode.
+
+A configuration builds the mode, which takes a GelSurface and returns images.
+"""
 
 from __future__ import annotations
 
@@ -82,12 +85,15 @@ class OpticsConfig(Generic[Mode]):
 
     @property
     def sampled(self) -> bool:
-        """Whether images have noise and ``render`` takes ``spp`` and ``seed``; a comparison measures several numbers of samples."""
+        """True if images have noise, so that ``render`` takes ``spp`` and ``seed``.
+
+        A comparison then measures several numbers of samples.
+        """
         return False
 
     @property
     def unbiased(self) -> bool:
-        """Whether the error falls as 1/√spp, so that a comparison may extrapolate it."""
+        """True if the error falls as 1/√spp, so that a comparison may extrapolate it."""
         return self.sampled
 
     @property
@@ -153,7 +159,7 @@ class Variant:
     """Label of its point in a figure."""
     config: OpticsConfig[Any]
     note: str = ""
-    """What a reader of its figures must know."""
+    """Remark for readers of its figures."""
     slow: bool = False
     """Left out of a quick comparison, for its time."""
 

@@ -19,12 +19,14 @@ __all__ = ["DeviceImage", "ImageCut"]
 
 @dataclass(frozen=True)
 class ImageCut:
-    """What is kept of a rendered image, in pixels of the observed one."""
+    """Crop of a rendered image, in pixels of the observed one."""
 
     size: tuple[int, int]
     """(width, height) of the observed image."""
-    left: int
-    top: int
+    x: int
+    """First column [px]."""
+    y: int
+    """First row [px]."""
     downscale: int
     """Rendered pixels along both sides of an observed one, which is their mean, rounded half up."""
 
@@ -50,7 +52,7 @@ class DeviceImage:
             raise InputError("outputs", value=mode.outputs, rule="must hold 'rgb'")
         self._mode, self._cut, self.mi = mode, cut, mode.mi
         (width, height), (right, bottom) = cut.size, mode.camera.resolution
-        if (cut.left + width) * cut.downscale > right or (cut.top + height) * cut.downscale > bottom:
+        if (cut.x + width) * cut.downscale > right or (cut.y + height) * cut.downscale > bottom:
             raise InputError("cut", value=cut, rule=f"must lie within the rendered {right}x{bottom}")
         self._nodes = grid.rest.size
         self._is_whole = (width, height) == (right, bottom)
@@ -108,7 +110,7 @@ class DeviceImage:
         i = dr.arange(mi.UInt32, envs * width * height * 3)
         channel, pixel = i % 3, i // 3
         column, row, env = pixel % width, (pixel // width) % height, pixel // (width * height)
-        first = ((env * rows + (row + cut.top) * k) * columns + (column + cut.left) * k) * 3 + channel
+        first = ((env * rows + (row + cut.y) * k) * columns + (column + cut.x) * k) * 3 + channel
         total = mi.UInt32(k * k // 2)
         for dy in range(k):
             for dx in range(k):

@@ -63,7 +63,7 @@ class DeviceMode(ABC):
 
     label: str
     needs_contact = False
-    """Whether a frame reads where the object touches."""
+    """True if a frame needs the mask of contact."""
     _smallest_side = 1
     """Least width and height of an image [px]."""
     _longest_row = 3
@@ -154,7 +154,7 @@ class DeviceMode(ABC):
 
     @property
     def _lit(self) -> bool:
-        """Whether any output needs light."""
+        """True if any output needs light."""
         return bool({"rgb", "layers"} & set(self.outputs))
 
     def render(self, surface: GelSurface) -> OpticsImages:

@@ -29,7 +29,7 @@ LOOK_UP_Z = -1.0e-3
 
 @dataclass(frozen=True)
 class CoatLayout:
-    """What does not change from frame to frame: the grid, its rest surface and the tiling."""
+    """Constants of all frames: the grid, its rest surface and the tiling."""
 
     nx: int
     ny: int
@@ -62,7 +62,7 @@ class CoatLayout:
 
 
 class CoatField:
-    """B coat surfaces as device arrays, made anew each frame from heights.
+    """B coat surfaces as device arrays, computed each frame from heights.
 
     ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
     four corners of a cell, for the walks; the normal points to the
@@ -197,10 +197,12 @@ def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
     """(z, n_x, n_y, n_z) at every node of ``height`` (B·Ny·Nx); central differences, one-sided on the pad's rim."""
     i = dr.arange(mi.UInt32, dr.width(height))
     ix, iy = i % g.nx, (i // g.nx) % g.ny
-    left, right = dr.select(ix > 0, i - 1, i), dr.select(ix < g.nx - 1, i + 1, i)
-    up, down = dr.select(iy > 0, i - g.nx, i), dr.select(iy < g.ny - 1, i + g.nx, i)
-    zx = (dr.gather(mi.Float, height, right) - dr.gather(mi.Float, height, left)) / (mi.Float(right - left) * g.dx)
-    zy = (dr.gather(mi.Float, height, down) - dr.gather(mi.Float, height, up)) / (mi.Float((down - up) // g.nx) * g.dy)
+    x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < g.nx - 1, i + 1, i)
+    y_minus, y_plus = dr.select(iy > 0, i - g.nx, i), dr.select(iy < g.ny - 1, i + g.nx, i)
+    zx = (dr.gather(mi.Float, height, x_plus) - dr.gather(mi.Float, height, x_minus)) / (mi.Float(x_plus - x_minus) * g.dx)
+    zy = (dr.gather(mi.Float, height, y_plus) - dr.gather(mi.Float, height, y_minus)) / (
+        mi.Float((y_plus - y_minus) // g.nx) * g.dy
+    )
     inv = dr.rsqrt(zx * zx + zy * zy + 1)
     return mi.Vector4f(height, zx * inv, zy * inv, -inv)
 
@@ -250,7 +252,10 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
 
 @dataclass(frozen=True)
 class PixelSample:
-    """What one camera ray of every pixel meets: environment index, point, normal and direction to the camera (pad frame)."""
+    """Hit of one camera ray per pixel, in the pad frame.
+
+    Environment index, point, normal and direction to the camera.
+    """
 
     env: Any
     p: Any

@@ -61,18 +61,18 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     s = coat.specular
 
     def inked(*levels: Any) -> tuple[Any, ...]:
-        found = []
+        result = []
         for c, dotted in enumerate(inked_albedo(sensor, ink)):
             level, albedo, black = levels[c], coat.reflectance[c], response.black_level[c]
             share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
             power: Any = dr.power  # typed as an object in Dr.Jit's stubs
             level = dr.maximum(level, 0)
             if black == 0:  # the two powers of the level are one another's inverse
-                found.append(power(share, 1 / response.gamma) * level)
+                result.append(power(share, 1 / response.gamma) * level)
                 continue
             linear = power(level / 255, response.gamma) - black
-            found.append(power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255)
-        return tuple(found)
+            result.append(power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255)
+        return tuple(result)
 
     # A branch, since powers are dear and dots are few.
     return list(dr.if_stmt(tuple(levels), ink > 0, inked, lambda *levels: levels, label="ink"))

@@ -40,7 +40,7 @@ class Link:
     via: Any
     """Point of the interface that the light crosses or is mirrored at."""
     bent: Any
-    """Whether the path has two legs, x to ``via`` and ``via`` to y; it is one straight line otherwise."""
+    """True if the path has two legs, x to ``via`` and ``via`` to y; else it is one straight line."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Slab:
         return cls(-unit * (sensor.gelpad.thickness + sensor.refraction.plate_thickness), sensor.refraction.ior)
 
     def inside(self, p: Any) -> Any:
-        """Whether point ``p`` is in the gel or plate."""
+        """True if point ``p`` is in the gel or plate."""
         return p.z > self.z
 
     # ---------------------------------------------------------------- angles

@@ -122,8 +122,8 @@ def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int, *, ridge: fl
     basis = _basis((width, height), degree).reshape(gain.size, -1)
     pull = np.sqrt(ridge * weight.sum()) * np.eye(basis.shape[1])
     target = np.concatenate([np.log(gain).ravel() * root, np.zeros(len(pull))])
-    found, *_ = np.linalg.lstsq(np.concatenate([basis * root[:, None], pull]), target, rcond=None)
-    return tuple(map(float, found))
+    coefficients, *_ = np.linalg.lstsq(np.concatenate([basis * root[:, None], pull]), target, rcond=None)
+    return tuple(map(float, coefficients))
 
 
 def _basis(resolution: tuple[int, int], degree: int) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""What every physics of the gel offers: a configuration, the pad of a press that it builds, and the reading of a pad at one instant."""
+"""Interface of every physics of the gel.
+
+A configuration builds the pad of a press; a reading is the state of a pad at one instant.
+"""
 
 from __future__ import annotations
 
@@ -169,7 +172,10 @@ class PhysicsConfig(Protocol):
     """
 
     is_simulated: ClassVar[bool]
-    """Whether a solver has the gel as a mesh: surfaces have a coat, the device that is asked for is used, worlds hand over bodies."""
+    """True if a solver has the gel as a mesh.
+
+    Then surfaces have a coat, the device that is asked for is used, and worlds hand over bodies.
+    """
 
     @property
     def label(self) -> str:

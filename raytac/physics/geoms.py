@@ -85,11 +85,11 @@ def load_mjcf(path: str | Path) -> mujoco.MjModel:
 def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int, what: str, given: int | str) -> int:
     """Index of a body or geom by name or number."""
     if isinstance(given, str):
-        found = mujoco.mj_name2id(model, kind, given)
-        if found < 0:
+        index = mujoco.mj_name2id(model, kind, given)
+        if index < 0:
             names = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
             raise InputError(what, value=given, rule="is not in the model", choices=[name for name in names if name])
-        return found
+        return index
     if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 0 <= given < count:
         raise InputError(what, value=given, rule=f"must be a name, or a number in [0, {count - 1}]")
     return int(given)

@@ -1,4 +1,7 @@
-"""How much a MuJoCo model asks for, read from its XML before it is compiled: compiling takes whatever time and memory that is."""
+"""Size of a MuJoCo model, read from its XML before it is compiled.
+
+Compiling takes as much time and memory as the XML asks for.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,7 @@ def _check_file(path: Path, root: Path, above: tuple[Path, ...]) -> None:
 
 
 def _tags(text: str) -> Iterator[tuple[bool, bool, str, dict[str, str]]]:
-    """Whether each tag opens and closes an element, its name, and its attributes."""
+    """Tags of ``text``: (opens an element, closes one, name, attributes)."""
     for match in _TOKEN.finditer(text):
         slash, name, rest = match["slash"], match["name"], match["rest"]
         if name is None:  # a comment, or text that holds no tags
@@ -90,7 +93,11 @@ def _unescaped(text: str) -> str:
 
 
 def _is_file(path: Path) -> bool:
-    """Whether there is such a file; raises ``InputError`` for what is there and no file, since opening it may wait for ever."""
+    """True if ``path`` is a file, False if nothing is there.
+
+    Raises:
+        InputError: something else is there; opening it may wait for ever.
+    """
     try:
         if path.is_file() or not path.exists():
             return path.is_file()

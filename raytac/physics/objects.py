@@ -19,7 +19,7 @@ __all__ = ["Shape", "object_parts"]
 
 
 class Shape(Protocol):
-    """What names a shape: the object of a press scene, or a body of a task scene."""
+    """Named shape: the object of a press scene, or a body of a task scene."""
 
     @property
     def kind(self) -> str: ...

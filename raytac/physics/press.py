@@ -99,15 +99,15 @@ class PressTargets:
         return stage
 
     def depth(self, stage: StageSpec) -> np.ndarray:
-        """Where an indent to a depth ends [m], (B,); 0 in an environment that is lost."""
+        """Final depth of an indent [m], (B,); 0 in a failed environment."""
         return self._sound(np.full(len(self.lost), stage.depth) if self.depths is None else self.depths)
 
     def shear(self, stage: StageSpec) -> np.ndarray:
-        """Where a shear ends [m], (B, 2)."""
+        """Final displacement of a shear [m], (B, 2); 0 in a failed environment."""
         return self._sound(np.tile(stage.shear, (len(self.lost), 1)) if self._shears is None else self._shears)
 
     def twist(self, stage: StageSpec) -> np.ndarray:
-        """Where a twist ends [rad], (B,)."""
+        """Final angle of a twist [rad], (B,); 0 in a failed environment."""
         return self._sound(np.full(len(self.lost), stage.twist) if self._twists is None else self._twists)
 
     def start_error(self, b: int, error: InputError) -> InputError | SpecError:

@@ -36,7 +36,7 @@ def checked_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None
 
 
 class _Scene(Protocol):
-    """What a press, a task and a sweep say of physics."""
+    """Physics named by a press, a task or a sweep."""
 
     @property
     def physics(self) -> str | None: ...
@@ -49,7 +49,7 @@ class _Scene(Protocol):
 
 
 def scene_physics(physics: PhysicsConfig | None, scene: _Scene) -> PhysicsConfig:
-    """What a scene is pressed with: what is asked for, else what the scene names, else ``rigid``.
+    """Physics of a scene: the one that is asked for, else the one that the scene names, else ``rigid``.
 
     A ``level`` that is not given is the scene's, else the coarsest.
 

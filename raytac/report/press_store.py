@@ -1,4 +1,4 @@
-"""Finished presses of the simulated pad, kept on disk so that an interrupted calibration goes on where it stopped."""
+"""Finished presses of the soft pad, kept on disk so that an interrupted calibration goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def press_code() -> str:
 
 def _modules() -> list[str]:
     """Names of all modules of the packages ``_CODE``; none is run but their ``__init__``."""
-    found = []
+    names = []
     for package in _CODE:
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
             for path in sorted(Path(folder).rglob("*.py")):
                 parts = path.relative_to(folder).with_suffix("").parts
-                found.append(".".join((package, *(part for part in parts if part != "__init__"))))
-    return found
+                names.append(".".join((package, *(part for part in parts if part != "__init__"))))
+    return names

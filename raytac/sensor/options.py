@@ -1,4 +1,7 @@
-"""What may be asked of a sensor: every option is checked before anything is computed, and the message names value, rule and choices."""
+"""Checks of a sensor's options, made before anything is computed.
+
+A message names the value, the rule and the choices.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ __all__ = [
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02
-"""How far an image may be from the sensor's own shape without a warning: rounding to whole pixels is no squeeze."""
+"""Largest deviation from the sensor's own aspect ratio without a warning; it allows rounding to whole pixels."""
 
 
 def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) -> tuple[str, ...]:

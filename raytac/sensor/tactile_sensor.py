@@ -62,13 +62,13 @@ class TactileSensor:
     grid: PadGrid
     """Nodes of the pad's surface."""
     optics: OpticsConfig[Any]
-    """How images are made."""
+    """Configuration of the optical mode."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
     markers: MarkersConfig | None
     """Configuration of the marker model; None without markers."""
     physics: PhysicsConfig | None
-    """How the gel deforms, as asked for; None is as each scene says, else ``rigid``."""
+    """Configuration of the physics, as asked for; None is as each scene says, else ``rigid``."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class TactileSensor:
         self._mode: OpticalMode | None = None
         self._pad: Pad | None = None
         self._is_narrow = False
-        """Whether this press was warned of already."""
+        """True if this press was warned of already."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
@@ -166,7 +166,7 @@ class TactileSensor:
 
     @property
     def device_used(self) -> str:
-        """``cpu`` or ``cuda``: where the images are made; without images where a simulated pad is solved, and ``cpu`` for a rigid one."""
+        """``cpu`` or ``cuda``: where the images are made; without images where a soft pad is solved, and ``cpu`` for a rigid one."""
         if self._optical_outputs:
             return self.optical_mode.device
         return resolve_device(self.device, ray_tracing=False) if self._used.is_simulated else "cpu"
@@ -190,7 +190,7 @@ class TactileSensor:
         A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
         ``raytac.specs.press_of``.
 
-        ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a simulated pad, which takes seconds to
+        ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a soft pad, which takes seconds to
         minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
 
         Raises:
@@ -232,8 +232,8 @@ class TactileSensor:
         Raises:
             InputError: an argument of the wrong shape or out of range.
             SpecError: the scene breaks a rule.
-            BackendError: a simulated pad is asked for, and its solver cannot run here.
-            RaytacError: the object overlaps a simulated pad where it starts.
+            BackendError: a soft pad is asked for, and its solver cannot run here.
+            RaytacError: the object overlaps a soft pad where it starts.
         """
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
@@ -294,26 +294,26 @@ class TactileSensor:
         return self._frame(surface, markers, done, time_ms, **forces)
 
     def _forces(self, reading: PadReading) -> dict[str, Any]:
-        """Fields of a frame that tell of forces, as far as they are asked for; none of a bare surface.
+        """Fields of a frame about forces, as far as they are asked for; none of a bare surface.
 
         With ``wrench`` or ``traction`` come ``contact_area`` and, of a surface with a mesh, ``contact_cells``.
         """
         if not reading.has_forces:
             return {}
         surface, failed = reading.surface, reading.failed
-        found: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
-        found["unconverged"] = reading.unconverged
+        outputs: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
+        outputs["unconverged"] = reading.unconverged
         if "wrench" in self.outputs:
-            found["wrench"] = reading.wrench
+            outputs["wrench"] = reading.wrench
         if "traction" in self.outputs:
-            found["traction"] = reading.traction()
+            outputs["traction"] = reading.traction()
         if {"wrench", "traction"} & set(self.outputs):
             area = cell_areas(surface.grid)
-            found["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
+            outputs["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
             if surface.coat is not None:
-                found["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
-                self._check_width(reading, found["contact_cells"])
-        return found
+                outputs["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
+                self._check_width(reading, outputs["contact_cells"])
+        return outputs
 
     def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
         """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.
@@ -377,7 +377,7 @@ class TactileSensor:
         return self._tracker
 
     def reset_markers(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Forget what the markers of environments (a mask (B,), a list, or None for all) went through; draws their placement anew.
+        """Forget what the markers of environments (a mask (B,), a list, or None for all) went through; draws their placement again.
 
         ``load`` and ``press`` do it for all.
 

@@ -35,7 +35,7 @@ from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Soli
 __all__ = ["PressSession"]
 
 _STRIDE_MM, _TURN_DEG, _PUSH = 0.1, 2.0, 0.25
-"""How far the object goes from one state to the next on its way to where a slider asks: [mm], [degrees], [N]."""
+"""Largest change from one state to the next towards a slider's value: [mm], [degrees], [N]."""
 _NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twist": 0.1}
 """A control is there when it is this close, in its unit."""
 _DEEPEST = 0.4
@@ -43,9 +43,9 @@ _DEEPEST = 0.4
 _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
 """Ends of the sliders for force [N], shear [mm] and twist [degrees], until the object goes beyond them."""
 _STATES, _SIMULATED_STATES = 20, 10
-"""States a stage of the scene's own trajectory is shown in; of a simulated pad each costs at least one step of the solver."""
+"""States a stage of the scene's own trajectory is shown in; of a soft pad each costs at least one step of the solver."""
 _SAG = 1e-5
-"""How far the drawn facets of a curved object lie inside it [m]."""
+"""Largest depth of the drawn facets below a curved object's true surface [m]."""
 _OBJECT_COLOUR = (150, 156, 166)
 
 
@@ -69,7 +69,7 @@ class PressSession:
         self._sensor, self._stages = sensor, len(scene.trajectory)
         self._is_drivable = scene.object.kind != "none" and scene.object.dynamics != "affine"
         if self._is_drivable:
-            # One more stage, never played: it makes a simulated pad keep as much of the object as the sliders can bring near the gel.
+            # One more stage, never played: it makes a soft pad keep as much of the object as the sliders can bring near the gel.
             scene = replace(scene, trajectory=(*scene.trajectory, StageSpec("indent", force=_STRONGEST)))
         self._pad = sensor.load(scene)
         self.title = f"{scene.name} · {sensor.spec.name} · {sensor.label}"
@@ -81,7 +81,7 @@ class PressSession:
         self.pads = (Pad(sensor.spec.name, grid_faces(self._grid), quantities),)
         self.solids = (*sensor_solids(sensor.spec), *self._object_solids())
         self.lines = (*sensor_lines(sensor.spec), *self._coat_lines())
-        self._held: dict[str, float] = {}
+        self._targets: dict[str, float] = {}
         """Controls that were moved and hold the object, in their own unit."""
         self._states: Iterator[PadReading] = iter(())
         self.reset()
@@ -89,7 +89,7 @@ class PressSession:
     # --- what a player asks ----------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        self._held = {}
+        self._targets = {}
         self.controls: tuple[Control, ...] = self._own_controls
         self._has_ended = False
         if self._sensor.markers is not None:
@@ -100,23 +100,23 @@ class PressSession:
         self._shot: Snapshot | None = None
 
     def resume(self) -> None:
-        if self._held or self._has_ended:
+        if self._targets or self._has_ended:
             self.reset()
 
     def drive(self, targets: Mapping[str, float]) -> None:
         check_targets(self.controls, targets)
         for name, value in targets.items():
             control = next(c for c in self.controls if c.name == name)
-            self._held.pop(control.instead_of, None)
-            self._held[name] = value
+            self._targets.pop(control.instead_of, None)
+            self._targets[name] = value
         # In the order of a press, whatever the order of the hands: an object that is sheared before it is pressed feels nothing.
-        ways = [self._way(control.name) for control in self.controls if control.name in self._held]
-        self._states = chain.from_iterable(self._pad.follow(stage, steps) for stage, steps in ways if stage is not None)
+        stages = [self._stage_to(control.name) for control in self.controls if control.name in self._targets]
+        self._states = chain.from_iterable(self._pad.follow(stage, steps) for stage, steps in stages if stage is not None)
 
     def advance(self) -> bool:
         state = next(self._states, None)
         if state is None or state.stage >= self._stages:
-            self._has_ended = not self._held
+            self._has_ended = not self._targets
             return False
         if state.failed[0]:
             self._states, self._has_ended = iter(()), True
@@ -157,17 +157,17 @@ class PressSession:
             Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),
         )
 
-    def _way(self, name: str) -> tuple[StageSpec | None, int]:
+    def _stage_to(self, name: str) -> tuple[StageSpec | None, int]:
         """The stage that takes the object to where the control ``name`` is held, in how many states; None if it is there."""
-        now, wanted = self._places(), self._held[name]
+        now, wanted = self._places(), self._targets[name]
         off = wanted - now[name]
         if abs(off) <= _NEAR[name]:
             return None, 0
         if name in ("shear_x", "shear_y"):
             # Both are one stage; a side that nobody holds stays where it is.
-            ends = tuple(self._held.get(side, now[side]) for side in ("shear_x", "shear_y"))
-            way = np.hypot(ends[0] - now["shear_x"], ends[1] - now["shear_y"])
-            return StageSpec("shear", shear=(1e-3 * ends[0], 1e-3 * ends[1])), _steps(way / _STRIDE_MM)
+            ends = tuple(self._targets.get(side, now[side]) for side in ("shear_x", "shear_y"))
+            distance = np.hypot(ends[0] - now["shear_x"], ends[1] - now["shear_y"])
+            return StageSpec("shear", shear=(1e-3 * ends[0], 1e-3 * ends[1])), _steps(distance / _STRIDE_MM)
         if name == "twist":
             return StageSpec("twist", twist=float(np.radians(wanted))), _steps(off / _TURN_DEG)
         steps = _steps(off / (_STRIDE_MM if name == "depth" else _PUSH))
@@ -176,7 +176,7 @@ class PressSession:
         return (StageSpec("indent", depth=1e-3 * wanted) if name == "depth" else StageSpec("indent", force=wanted)), steps
 
     def _places(self) -> dict[str, float]:
-        """Where the object is now, by control and in its unit."""
+        """Present value of each control, in its unit."""
         pose = self._state.pad_from_object[0]
         turned = pose[:3, :3] @ self._start[:3, :3].T
         x, y = 1e3 * (pose[:2, 3] - self._start[:2, 3])
@@ -216,7 +216,7 @@ class PressSession:
         return vertices[0], faces
 
     def _coat_lines(self) -> tuple[Lines, ...]:
-        """Edges of the simulated pad's own mesh over the smooth coat."""
+        """Edges of the soft pad's own mesh over the smooth coat."""
         if not isinstance(self._pad, SoftPad):
             return ()
         return (Lines("coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH),)  # laid on the first state's surface
@@ -231,7 +231,7 @@ class PressSession:
             soft = self._soft_object()
             if soft is not None:
                 reshaped["object"], poses["object"] = soft[0], np.eye(4)
-        controls = {name: self._held.get(name, value) for name, value in self._places().items()} if self._is_drivable else {}
+        controls = {name: self._targets.get(name, value) for name, value in self._places().items()} if self._is_drivable else {}
         return Snapshot(
             pads={name: pad_view(frame, self._grid, np.eye(4))},
             poses=poses,
@@ -244,7 +244,7 @@ class PressSession:
 
     def _facts(self, frame: TactileFrame) -> dict[str, str]:
         state, surface = self._state, frame.surface
-        where = "held by the sliders" if self._held else f"{state.kind} {100.0 * state.fraction:.0f} %"
+        where = "held by the sliders" if self._targets else f"{state.kind} {100.0 * state.fraction:.0f} %"
         facts = {"stage": where}
         if self._is_drivable:
             facts["depth"] = f"{1e3 * float(state.depth[0]):.3f} mm"

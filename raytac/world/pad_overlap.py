@@ -63,7 +63,7 @@ class PadOverlap:
 
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
         """Overlaps of a body at poses (B, 4, 4) with the pad; ``radius`` [m]: bounding ball about the body's origin."""
-        found: list[Touches] = []
+        by_grid: list[Touches] = []
         ball, last = _Ball(pad_from_body, radius), len(self._grids) - 1
         following = self._first_grid(ball)
         for k, nodes in enumerate(self._grids):
@@ -82,8 +82,8 @@ class PadOverlap:
                     on = np.where(count < _ENOUGH // 8, last, k + 1)
                     following[rows_of] = np.where(done | (gaps.least >= nodes.near), -1, on)
                 if done.any():
-                    found.append(nodes.measure(gaps, rows_of, done))
-        return _joined(found)
+                    by_grid.append(nodes.measure(gaps, rows_of, done))
+        return _joined(by_grid)
 
     def _first_grid(self, ball: _Ball) -> np.ndarray:
         """The first grid that may hold enough nodes of each ball below the highest gel, (B,), the last if none may."""
@@ -219,24 +219,25 @@ def _refined(gap: np.ndarray) -> np.ndarray:
     lowest += (ny * nx) * np.arange(n)
     inside = np.stack([(i > 0) & (i < nx - 1), (j > 0) & (j < ny - 1)])
     step = np.where(inside, [[1], [nx]], 0)
-    middle, before, after = (gap.take(lowest + way * step) for way in (0, -1, 1))
+    middle, before, after = (gap.take(lowest + offset * step) for offset in (0, -1, 1))
     curve = before + after - 2.0 * middle
     bent = inside & np.isfinite(curve) & (curve > 0.0)
     rise = np.where(bent, after, 0.0) - np.where(bent, before, 0.0)
     return middle[0] - 0.125 * (rise * rise / np.where(bent, curve, 1.0)).sum(axis=0)
 
 
-def _joined(found: Sequence[Touches]) -> Touches:
+def _joined(touches: Sequence[Touches]) -> Touches:
     """Touches of several grids in the order of the environments."""
-    if len(found) == 1:
-        return found[0]
-    if not found:
+    if len(touches) == 1:
+        return touches[0]
+    if not touches:
         nothing = np.zeros(0)
         return Touches(np.zeros(0, int), nothing, np.zeros((0, 3)), np.zeros((0, 3)), (), nothing, nothing)
     env, depth, centre, normal, cell, clear = (
-        np.concatenate([getattr(some, name) for some in found]) for name in ("env", "depth", "centre", "normal", "cell", "clear")
+        np.concatenate([getattr(some, name) for some in touches])
+        for name in ("env", "depth", "centre", "normal", "cell", "clear")
     )
-    gap = [one for some in found for one in some.gap]
+    gap = [one for some in touches for one in some.gap]
     order = np.argsort(env)
     return Touches(
         env[order], depth[order], centre[order], normal[order], tuple(gap[k] for k in order), cell[order], clear[order]

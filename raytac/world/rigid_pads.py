@@ -170,16 +170,16 @@ class RigidPads:
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
-        found = []
+        overlaps = []
         for name, pad, _, pad_from_body in self._poses([data]):
             near = self._near(pad, pad_from_body)
             for i in np.flatnonzero(near[0]).tolist():
                 if pad.face.pierced(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))[0]:
-                    found.append((name, self.bodies[i].spec.name, np.inf))
+                    overlaps.append((name, self.bodies[i].spec.name, np.inf))
                     continue
                 touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
-                found += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
-        return found
+                overlaps += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
+        return overlaps
 
     def reading(
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
@@ -268,7 +268,7 @@ class RigidPads:
         self, poses: Sequence[_PadPoses], datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray
     ) -> list[_Contact]:
         """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
-        found, models = [], self._models
+        contacts, models = [], self._models
         weight = models.inverse_weight[envs]
         for sensor, (name, pad, world_from_pad, pad_from_body) in enumerate(poses):
             compliance = weight[:, pad.body, None] + weight[:, self._body_index]
@@ -295,8 +295,8 @@ class RigidPads:
                     if mujoco.mj_addContact(models[b], datas[b], contact) != 0:
                         failed[b] = True
                     else:
-                        found.append(_Contact(b, name, int(datas[b].ncon) - 1))
-        return found
+                        contacts.append(_Contact(b, name, int(datas[b].ncon) - 1))
+        return contacts
 
     def _law(self, env: int, name: str, i: int, touches: Touches, k: int) -> LoadLaw:
         """Load law of a pad and a body, the k-th in contact; reused within a control step while it covers the depth."""

@@ -221,8 +221,8 @@ class SoftPads:
                 self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
             return self._traction[name](reading.forces)
 
-        found = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
-        return found if envs is None else found.of(envs)
+        result = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
+        return result if envs is None else result.of(envs)
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Overlaps at the start: an empty list, since the solver raises an error for them."""

@@ -341,7 +341,7 @@ def test_an_environment_that_fails_is_truncated_and_the_others_go_on() -> None:
 
 
 @pytest.mark.slow
-def test_a_simulated_pad_is_a_setting_that_changes_no_shape() -> None:
+def test_a_soft_pad_is_a_setting_that_changes_no_shape() -> None:
     rigid, soft = (RollBallVectorEnv(2, physics=p, tactile=("markers", "wrench")) for p in ("rigid", "ipc"))
     assert rigid.observation_space == soft.observation_space
     soft.reset(seed=0)
@@ -373,5 +373,5 @@ def test_an_action_that_is_ignored_may_hold_anything() -> None:
     ignored = np.array([[0.1, 0, 0], [np.nan, np.inf, 7.0]], np.float32)
     seen, reward, *_ = many.step(ignored)
     assert reward[1] == 0.0 and np.isfinite(seen["state"]).all() and np.isnan(ignored[1, 0])
-    with pytest.raises(InputError, match="environment 1"):  # it has begun anew: now it counts
+    with pytest.raises(InputError, match="environment 1"):  # it has begun again: now it counts
         many.step(ignored)

@@ -179,7 +179,7 @@ def test_variations_that_cannot_be_are_told_and_change_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_simulated_pads_are_mounted_askew_too_and_bodies_are_drawn_once() -> None:
+def test_soft_pads_are_mounted_off_their_drawing_too_and_bodies_are_drawn_once() -> None:
     options = {"physics": "ipc", "tactile": ("wrench",), "randomization": Randomization(pad_shift=3e-4, body_mass=0.3)}
     many = RollBallVectorEnv(2, **options)
     many.reset(seed=3)

@@ -28,7 +28,7 @@ def test_a_short_stroke_with_the_rigid_pad(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_short_stroke_with_the_simulated_pad(tmp_path: Path) -> None:
+def test_a_short_stroke_with_the_soft_pad(tmp_path: Path) -> None:
     main(Args(physics=("ipc",), quick=True, out=tmp_path / "run"))
     found = read_metrics(tmp_path / "run" / "metrics.json")
     assert found["ball_rolling.ipc.goals_reached"] == 1

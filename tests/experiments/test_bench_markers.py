@@ -27,7 +27,7 @@ def test_a_small_run_times_every_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steady_clock(monkeypatch, bench)
-    pytest.importorskip("warp")  # the surface model is timed on the coat of a simulated pad
+    pytest.importorskip("warp")  # the surface model is timed on the coat of a soft pad
     bench.main(bench.Args(out=tmp_path, device="cpu", envs="1,3", frames=6))
     metrics = read_metrics(tmp_path / "metrics.json")
     assert metrics["markers"] == 99

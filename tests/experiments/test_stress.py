@@ -102,7 +102,7 @@ def test_what_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
         assert ("IndexError" if key == "exception" else key) in stress.line(row)
 
 
-def test_states_of_the_simulated_pad_that_are_not_sound_are_seen() -> None:
+def test_states_of_the_soft_pad_that_are_not_sound_are_seen() -> None:
     args = stress.Args(device="cpu")
     sensor = stress.make_sensor("gelsight_mini", "ipc", args, "cpu")
     _, _, scene = small_press("ipc", 0, 0, 0.6)
@@ -141,7 +141,7 @@ def test_bad_options_are_told(options: dict[str, Any], message: str, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_sixty_presses_anywhere_on_the_simulated_pad_are_sound_or_say_that_they_are_not(tmp_path: Path) -> None:
+def test_sixty_presses_anywhere_on_the_soft_pad_are_sound_or_say_that_they_are_not(tmp_path: Path) -> None:
     found = stress.main(stress.Args(out=tmp_path, physics="ipc", ipc=60, deepest=0.6, seed=7, device="cpu"))
     assert found["stress.ipc.presses"] == 60
     for key in ("exceptions", "refused", "unmarked"):

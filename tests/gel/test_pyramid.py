@@ -83,7 +83,7 @@ def test_wide_gaussian_agrees_with_scipy() -> None:
 @pytest.mark.parametrize("final", [True, False])
 @pytest.mark.parametrize("corner", [(0, 0), (31, 40), (45, 70)])
 def test_a_field_followed_locally_is_that_of_the_whole_grid(corner: tuple[int, int], final: bool) -> None:
-    """Also where Gaussians are mirrored at the borders, and for any rule by which the field is set anew."""
+    """Also where Gaussians are mirrored at the borders, and for any rule by which the field is set again."""
     shape, pitch, sigmas = (60, 84), (1e-4, 0.9e-4), (8e-4, 3e-4, 1e-4, 0.4e-4)
     touched = slice(corner[0], corner[0] + 13), slice(corner[1], corner[1] + 9)
     window = slice(0, 60), slice(0, 84)

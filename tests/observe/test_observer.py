@@ -181,7 +181,7 @@ def test_cameras_differ_between_environments_and_repeat_by_seed() -> None:
     np.testing.assert_array_equal(CameraDrift(SENSOR, Randomization(), B, 0).apply(images), images)
     noisy = CameraDrift(SENSOR, Randomization(noise=3.0), B, 0).apply(np.full((B, 64, 64, 3), 100, np.uint8))
     assert noisy.std() == pytest.approx(3.0, rel=0.03) and noisy.mean() == pytest.approx(100.0, abs=0.1)
-    # What an environment draws does not depend on how many there are, and reseeding starts its stream anew.
+    # What an environment draws does not depend on how many there are, and reseeding restarts its stream.
     alone = CameraDrift(SENSOR, settings, 1, 8)
     np.testing.assert_array_equal(alone.apply(images[:1])[0], one[1])
     alone.reseed([0], [7])

@@ -36,24 +36,24 @@ def example() -> Iterator[ModuleType]:
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     yield module
-    del OPTICS._classes["depth"], sys.modules[spec.name]
+    del OPTICS._classes["grey"], sys.modules[spec.name]
 
 
 def test_it_is_pressed_by_name_and_has_its_options(example: ModuleType) -> None:
     by_name, deep = (
-        TactileSensor("gelsight_mini", optics=optics, resolution=(80, 60)) for optics in ("depth", example.Depth(deepest=2e-3))
+        TactileSensor("gelsight_mini", optics=optics, resolution=(80, 60)) for optics in ("grey", example.Grey(deepest=2e-3))
     )
     frame = by_name.press("sphere")
     deepest = float((frame.surface.grid.rest - frame.surface.height).max())
     assert frame.rgb is not None and frame.rgb.max() == pytest.approx(255 * min(deepest / 1e-3, 1), abs=6)
     np.testing.assert_allclose(deep.press("sphere").rgb, 0.5 * frame.rgb, atol=1)
-    assert by_name.label == "rigid+depth" and by_name.sampling == {}
+    assert by_name.label == "rigid+grey" and by_name.sampling == {}
     assert pickle.loads(pickle.dumps(by_name)).optics == by_name.optics
-    with pytest.raises(InputError, match=r"outputs = 'normals': must be an output of optics='depth'.*choose from: rgb, height"):
-        TactileSensor("gelsight_mini", optics="depth", outputs=("normals",))
-    with pytest.raises(InputError, match="deepst = 1: is no option of optics='depth'; choose from: deepest"):
-        OPTICS.config("depth", deepst=1)
-    assert ObservationSettings(("rgb",), optics="depth").optics == "depth"
+    with pytest.raises(InputError, match=r"outputs = 'normals': must be an output of optics='grey'.*choose from: rgb, height"):
+        TactileSensor("gelsight_mini", optics="grey", outputs=("normals",))
+    with pytest.raises(InputError, match="deepst = 1: is no option of optics='grey'; choose from: deepest"):
+        OPTICS.config("grey", deepst=1)
+    assert ObservationSettings(("rgb",), optics="grey").optics == "grey"
 
 
 def test_the_example_compares_it(example: ModuleType) -> None:
@@ -62,28 +62,28 @@ def test_the_example_compares_it(example: ModuleType) -> None:
 
 def test_the_command_line_knows_it(example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "press"
-    assert main(["press", "sphere", "--optics", "depth", "--resolution", "80x60", "--outputs", "rgb", "--out", str(out)]) == 0
-    assert json.loads((out / "metrics.json").read_text("utf-8"))["mode"] == "rigid+depth" and (out / "rgb.png").is_file()
-    assert main(["press", "sphere", "--optics", "depth", "--spp", "4", "--out", str(tmp_path / "no")]) == 2
-    assert "spp = 4: is no option of optics='depth'; choose from: deepest" in capsys.readouterr().err
+    assert main(["press", "sphere", "--optics", "grey", "--resolution", "80x60", "--outputs", "rgb", "--out", str(out)]) == 0
+    assert json.loads((out / "metrics.json").read_text("utf-8"))["mode"] == "rigid+grey" and (out / "rgb.png").is_file()
+    assert main(["press", "sphere", "--optics", "grey", "--spp", "4", "--out", str(tmp_path / "no")]) == 2
+    assert "spp = 4: is no option of optics='grey'; choose from: deepest" in capsys.readouterr().err
 
 
 def test_a_comparison_measures_and_draws_it(example: ModuleType, tmp_path: Path) -> None:
     modes = {mode.name: mode for mode in comparison_modes((1,))}
-    assert {"depth", "fast", "fast_4_rays", "reference.spp1", "path.spp1", "taxim", "taxim_shadow", "phong", "peer"} <= set(modes)
-    assert modes["depth"].code() == ("own_optical_mode",)
+    assert {"grey", "fast", "fast_4_rays", "reference.spp1", "path.spp1", "taxim", "taxim_shadow", "phong", "peer"} <= set(modes)
+    assert modes["grey"].code() == ("own_optical_mode",)
     settings = CompareSettings(
         device="cpu", reference_spp=2, resolutions=((32, 24),), scenes=("sphere",), frames=3, budget_s=0.1, batch=2
     )
-    comparison = run_comparison(settings, tmp_path, [modes["depth"]])
+    comparison = run_comparison(settings, tmp_path, [modes["grey"]])
     (row,) = comparison.rows
-    assert row.figures["mode"] == row.figures["label"] == "depth" and 0 < float(row.figures["frame_mae"] or 0) < 255
+    assert row.figures["mode"] == row.figures["label"] == "grey" and 0 < float(row.figures["frame_mae"] or 0) < 255
     assert {"pareto.png", "report.html"} <= {path.name for path in write_comparison(comparison, tmp_path, 1.0)}
-    assert "depth" in (tmp_path / "report.html").read_text("utf-8")
+    assert "grey" in (tmp_path / "report.html").read_text("utf-8")
 
 
 def test_the_viewer_shows_it(example: ModuleType) -> None:
-    sensor = TactileSensor("gelsight_mini", optics="depth", outputs=("rgb", "wrench", "traction"), resolution=(80, 60))
+    sensor = TactileSensor("gelsight_mini", optics="grey", outputs=("rgb", "wrench", "traction"), resolution=(80, 60))
     shot = PressSession(sensor, load_press("sphere")).snapshot()
     (pad,) = shot.pads.values()
     assert pad.rgb is not None and pad.rgb.shape == (60, 80, 3)
@@ -91,7 +91,7 @@ def test_the_viewer_shows_it(example: ModuleType) -> None:
 
 def test_a_name_is_taken_once(example: ModuleType) -> None:
     with pytest.raises(InputError, match="optics = 'taxim': is the name of another implementation"):
-        register("taxim")(example.Depth)
+        register("taxim")(example.Grey)
 
 
 def test_configurations_travel_and_compare() -> None:

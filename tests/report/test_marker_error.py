@@ -86,7 +86,7 @@ def test_without_the_solver_the_comparison_says_so_at_once(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_the_command_reports_models_on_the_simulated_pad(tmp_path: Path) -> None:
+def test_the_command_reports_models_on_the_soft_pad(tmp_path: Path) -> None:
     assert main(["compare", "--quick", "--markers", "--device", "cpu", "--out", str(tmp_path)]) == 0
     metrics = read_metrics(tmp_path / "metrics.json")
     for load in LOADS:

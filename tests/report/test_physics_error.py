@@ -22,7 +22,7 @@ depth_mm = 0.4
 
 
 @pytest.mark.slow
-def test_rigid_and_simulated_pad_differ_around_the_contact_not_in_it(tmp_path: Path) -> None:
+def test_rigid_and_soft_pad_differ_around_the_contact_not_in_it(tmp_path: Path) -> None:
     path = tmp_path / "ball.toml"
     path.write_text(SCENE)
     spec, surfaces = press_peaks("gelsight_mini", (path,), (80, 60))

@@ -1,4 +1,4 @@
-"""Keys of press scenes and sensors that only the simulated pad knows."""
+"""Keys of press scenes and sensors that only the soft pad knows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write(tmp_path, top="", object="", indent="depth_mm = 0.5"):
     return path
 
 
-def test_a_scene_can_ask_for_the_simulated_pad(tmp_path):
+def test_a_scene_can_ask_for_the_soft_pad(tmp_path):
     scene = load_press(write(tmp_path, 'physics = "ipc"\npad = "medium"', 'dynamics = "soft"\nyoungs_modulus_kpa = 200'))
     assert (scene.physics, scene.pad) == ("ipc", "medium")
     assert (scene.object.dynamics, scene.object.youngs_modulus, scene.object.poisson_ratio) == ("soft", 2e5, 0.4)

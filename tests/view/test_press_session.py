@@ -171,7 +171,7 @@ def test_markers_follow_the_object_and_start_anew_on_reset():
 
 
 @pytest.mark.solver
-def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
+def test_a_soft_pad_is_driven_too_and_shows_its_mesh():
     press = session(physics="ipc")
     rest = press.snapshot().reshaped["coat_mesh"]
     shot = driven(press, depth=0.3)
@@ -184,12 +184,12 @@ def test_a_simulated_pad_is_driven_too_and_shows_its_mesh():
     assert wrench(shot)[0] > 0.01
     shot = driven(press, force=0.5)
     assert wrench(shot)[2] == pytest.approx(-0.5, rel=1e-3) and shot.controls["force"] == 0.5
-    assert wrench(shot)[0] > 0.01  # eased, not lifted off and pressed anew
+    assert wrench(shot)[0] > 0.01  # eased, not lifted off and pressed again
 
 
 @pytest.mark.parametrize("kind", ["torus", "pins"])
 @pytest.mark.solver
-def test_the_mesh_of_a_simulated_pad_lies_on_the_coat_that_is_drawn(kind):
+def test_the_mesh_of_a_soft_pad_lies_on_the_coat_that_is_drawn(kind):
     """Above it everywhere, so that no line is broken, by no more than is needed for that."""
     from matplotlib.tri import LinearTriInterpolator, Triangulation
 

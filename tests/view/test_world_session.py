@@ -137,7 +137,7 @@ def test_targets_out_of_reach_and_a_world_that_breaks_are_told(tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_simulated_pads_and_soft_bodies_are_drawn_as_they_deform():
+def test_soft_pads_and_soft_bodies_are_drawn_as_they_deform():
     twist = load_task("twist")
     beam = replace(twist.body("beam"), cell=12e-3)
     scene = replace(twist, bodies=(twist.body("plate"), beam), robot=replace(twist.robot, opening=0.0125))

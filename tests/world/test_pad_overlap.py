@@ -99,4 +99,4 @@ def test_the_law_holds_to_the_depth_that_is_known(depth: float) -> None:
     assert known >= 1.9 * depth
     for share in (0.1, 0.5, 1.0):
         assert law.force(share * known) == pytest.approx(whole.force(share * known), rel=1e-12)
-    assert law.greatest < 0.9 * whole.greatest  # far beyond, it is too soft: RigidPads takes it anew
+    assert law.greatest < 0.9 * whole.greatest  # far beyond, it is too soft: RigidPads recomputes it

@@ -42,7 +42,7 @@ def test_a_ball_of_the_solver_weighs_what_it_weighs_and_mujoco_sees_it(resting: 
     assert state.report["min_gap"][0] > 0.0 and 0.9 < state.report["min_det"][0] <= 1.0
 
 
-def test_the_sensor_reads_the_simulated_pad(resting: TactileWorld) -> None:
+def test_the_sensor_reads_the_soft_pad(resting: TactileWorld) -> None:
     from raytac.gel.traction import cell_areas
 
     frame = resting.observe()["sensor"]

@@ -27,7 +27,10 @@ __all__ = ["ImageHeights", "ImageMode", "see_heights"]
 
 @dataclass(frozen=True)
 class ImageHeights:
-    """What the pixels of B images see, as device arrays of B·H·W; lengths in image pixels (of the pitch along x)."""
+    """Surface seen by the pixels of B images, as device arrays of B·H·W.
+
+    Lengths are in image pixels (of the pitch along x).
+    """
 
     height: Any
     """−z of the coat [px]: grows towards the camera."""
@@ -181,7 +184,7 @@ class ImageMode(DeviceMode):
         return seen
 
     def _seen_now(self, surface: GelSurface, *, dotted: bool) -> tuple[ImageHeights, FrameInputs, np.ndarray]:
-        """What the pixels see of a surface, without a recording; and which environments failed."""
+        """Surface seen by the pixels, without a recording; its inputs; and a mask of the failed environments."""
         heights, failed = self._checked(surface)
         inputs = replace(self._inputs, ink=self._upload_ink(surface) if dotted else None)
         return self._see(self._upload(heights), self._upload_contact(surface, failed), inputs), inputs, failed

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 FORMAT, VERSION = "raytac mlp", 1
-"""What a file says that it is. The version goes up whenever inputs, arithmetic or arrays change what they mean."""
+"""Format and version in a file. The version goes up whenever inputs, arithmetic or arrays change their meaning."""
 INPUTS = 16
 LEVELS = 100.0
 """Levels that an output of 1 stands for."""
@@ -135,30 +135,32 @@ def load_mlp(path: str | Path) -> MlpWeights:
 
 def _check_version(path: Path) -> None:
     names = npz_names(path)
-    told = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
-    found = {name: str(array.reshape(())) if array.size == 1 else f"{array.dtype} {array.shape}" for name, array in told.items()}
-    if not found and "matrix_0" in names:
-        found = {"format": FORMAT, "version": "0, of before files said it"}
+    arrays = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
+    header = {
+        name: str(array.reshape(())) if array.size == 1 else f"{array.dtype} {array.shape}" for name, array in arrays.items()
+    }
+    if not header and "matrix_0" in names:
+        header = {"format": FORMAT, "version": "0, of before files said it"}
     for key, expected in (("format", FORMAT), ("version", str(VERSION))):
-        if found.get(key) != expected:
+        if header.get(key) != expected:
             rule = (
-                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it anew"
+                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it again"
             )
-            raise CalibrationError(rule, file=path, key=key, value=found.get(key, "missing"))
+            raise CalibrationError(rule, file=path, key=key, value=header.get(key, "missing"))
 
 
 def _provenance(path: Path) -> dict[str, str]:
-    """What the file says of itself; it may say nothing."""
+    """Provenance that the file states; empty if it states none."""
     if "provenance" not in npz_names(path):
         return {}
     text = npz_arrays(path, ("provenance",))["provenance"]
     try:
-        found = json.loads(str(text)) if text.dtype.kind == "U" and text.shape == () else None
+        provenance = json.loads(str(text)) if text.dtype.kind == "U" and text.shape == () else None
     except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or not all(isinstance(value, str) for value in found.values()):
+        provenance = None
+    if not isinstance(provenance, dict) or not all(isinstance(value, str) for value in provenance.values()):
         raise CalibrationError("must be a JSON object of texts", file=path, key="provenance", value=str(text)[:80])
-    return found
+    return provenance
 
 
 def _view(path: Path) -> tuple[float, float] | None:

@@ -102,11 +102,11 @@ class PhongMode(ImageMode):
         mi = self.mi
         width, height = seen.resolution
         i, _, column, row = seen.pixel(mi)
-        left, right = dr.select(column > 0, i - 1, i + 1), dr.select(column < width - 1, i + 1, i - 1)
-        up, down = dr.select(row > 0, i - width, i + width), dr.select(row < height - 1, i + width, i - width)
+        x_minus, x_plus = dr.select(column > 0, i - 1, i + 1), dr.select(column < width - 1, i + 1, i - 1)
+        y_minus, y_plus = dr.select(row > 0, i - width, i + width), dr.select(row < height - 1, i + width, i - width)
         side, middle = _BLUR
         blurred = mi.Vector4f(*channels, 0)
-        for before, after in ((left, right), (up, down)):
+        for before, after in ((x_minus, x_plus), (y_minus, y_plus)):
             packed = dr.ravel(blurred)
             a, b, c = (dr.gather(mi.Vector4f, packed, at) for at in (before, i, after))
             blurred = side * (a + c) + middle * b

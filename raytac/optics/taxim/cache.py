@@ -41,7 +41,7 @@ def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution:
 
 
 def table_folder(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> Path | None:
-    """Where the table of ``table_key`` is kept; None for a user without a home folder."""
+    """Folder of the table of ``table_key``; None for a user without a home folder."""
     folder = cache_folder("tables")
     return None if folder is None else folder / table_key(sensor, settings, seed, resolution)
 

@@ -128,7 +128,7 @@ class _Plain:
     """Replaces stand-ins by their arrays, up to ``_MOST_ITEMS`` items."""
 
     def __init__(self) -> None:
-        self._left = _MOST_ITEMS
+        self._budget = _MOST_ITEMS
 
     def of(self, item: Any) -> Any:
         """``item`` with every stand-in in it replaced."""
@@ -160,8 +160,8 @@ class _Plain:
         return out.reshape(shape, order=order)
 
     def _spend(self, items: int) -> None:
-        self._left -= items
-        if self._left < 0:
+        self._budget -= items
+        if self._budget < 0:
             raise pickle.UnpicklingError(f"it holds more than {_MOST_ITEMS} items")
 
 
@@ -273,10 +273,10 @@ def npy_array(path: Path, key: str, data: bytes) -> np.ndarray:
         shape, fortran, dtype = read(stream)
         rest = data[stream.tell() :]
         if dtype.hasobject:
-            found = load_restricted(rest)
-            if dtype != np.dtype("O") or not isinstance(found, np.ndarray) or found.shape != shape:
+            array = load_restricted(rest)
+            if dtype != np.dtype("O") or not isinstance(array, np.ndarray) or array.shape != shape:
                 raise CalibrationError(f"must be an array of shape {shape}, as its header says", file=path, key=key)
-            return found
+            return array
         if len(rest) != math.prod(shape) * dtype.itemsize:
             rule = f"is cut short or too long: {len(rest)} bytes for {dtype} of shape {shape}"
             raise CalibrationError(rule, file=path, key=key)

@@ -81,12 +81,12 @@ class ShadowCaster:
         )
         at = np.broadcast_to(np.arange(length)[None, :, None], x.shape)
         places = np.stack([at, x, y], axis=-1).astype(np.int32)
-        found = [np.unique(one[1:].reshape(-1, 3), axis=0) for one in places]
-        ways = np.zeros((len(found), max(1, max(len(one) for one in found)), 4), dtype=np.int32)
-        for row, one in zip(ways, found, strict=True):
+        pixels = [np.unique(one[1:].reshape(-1, 3), axis=0) for one in places]
+        packed = np.zeros((len(pixels), max(1, max(len(one) for one in pixels)), 4), dtype=np.int32)
+        for row, one in zip(packed, pixels, strict=True):
             row[: len(one), :3] = one[:, [1, 2, 0]]
-        counts = [np.searchsorted(one[:, 0], np.arange(length + 1)) for one in found]
-        return ways, np.stack(counts)
+        counts = [np.searchsorted(one[:, 0], np.arange(length + 1)) for one in pixels]
+        return packed, np.stack(counts)
 
     def cast(self, seen: ImageHeights, of: Any, direction: Any, change: list[Any], arrays: ShadowArrays) -> list[Any]:
         """``change`` (three channels of B·H·W levels) with shadows, blurred for the shadow and for the image.

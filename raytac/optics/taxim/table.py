@@ -1,4 +1,4 @@
-"""What a Taxim table is: polynomials by slope, shadows by direction and depth, the rest image, and where they came from.
+"""A Taxim table: polynomials by slope, shadows by direction and depth, the rest image, provenance.
 
 Si and Yuan, Taxim: an example-based simulation model for GelSight tactile sensors (RA-L 2022), section III. Conventions of every array
 here: colours in the order R, G, B (upstream's files are B, G, R), values in 8-bit levels (0-255, not clipped), row 0 at the image's
@@ -23,10 +23,10 @@ from raytac.errors import InputError
 __all__ = ["DEPTHS_OF", "SLOPES_OF", "PolyTable", "ShadowTable", "TaximConstants", "polynomial_basis", "slope_bins"]
 
 SLOPES_OF = ("height", "displacement")
-"""What a table's slopes are taken of: the surface itself (upstream) or how far it has moved from rest (tables baked by raytac)."""
+"""Fields whose slopes index a table: the surface itself (upstream) or its displacement from rest (tables baked by raytac)."""
 
 DEPTHS_OF = ("origin", "drop")
-"""Which depth a shadow table is indexed by: that of the pixel that casts (upstream), or by how much the shaded one lies below it."""
+"""Depths that index a shadow table: that of the pixel that casts (upstream), or its height above the shaded one."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TaximConstants:
     background_share: float = 0.15
     """Share of the blurred rest image in the background, in [0, 1]."""
     background_threshold: float = 5.0
-    """Where blurred − sharp, averaged over the channels, is at least this many levels, the blurred image fills in (dark markers)."""
+    """Least mean of blurred − sharp over the channels [levels] at which the blurred image fills in (dark markers)."""
     ring_dilations: int = 2
     """Dilations of the contact by a 5 × 5 square whose new pixels cast shadows."""
     shadow_sigma: float = 2.0
@@ -128,7 +128,7 @@ class PolyTable:
     """Bins of ``gradients`` that a calibration sample reached, shape (n_bins, n_bins), bool; the others hold a fill
     (``provenance["fill"]`` says which). None if that is not known, as of upstream's folders."""
     background: np.ndarray
-    """What the differences are added to [levels], shape (H, W, 3), float32: already processed."""
+    """Processed rest image to which the differences are added [levels], shape (H, W, 3), float32."""
     pixel_pitch: tuple[float, float]
     """Size of a pixel of the calibration image on the plane z = 0 along x and y [m]."""
     shadow: ShadowTable | None = None
@@ -147,7 +147,7 @@ class PolyTable:
     sheet (``calib_folder``). None: such readers get ``gradients``."""
     constants: TaximConstants = TaximConstants()
     provenance: dict[str, str] = field(default_factory=dict)
-    """Where the table came from, text by name: ``source``, ``sensor``, ``fill``, …"""
+    """Origin of the table, text by name: ``source``, ``sensor``, ``fill``, …"""
 
     def __post_init__(self) -> None:
         shape = self.gradients.shape

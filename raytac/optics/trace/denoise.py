@@ -56,5 +56,5 @@ def _optix_failure() -> str:
     if done.returncode == 0:
         return ""
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    told = [line for line in lines if "[DENOISER]" in line]
-    return (told or lines[-1:] or [f"it ended with code {done.returncode}"])[0]
+    messages = [line for line in lines if "[DENOISER]" in line]
+    return (messages or lines[-1:] or [f"it ended with code {done.returncode}"])[0]

@@ -43,7 +43,7 @@ class FastTracer(Tracer):
 
     @property
     def shadows(self) -> bool:
-        """Whether shadows are cast."""
+        """True if shadows are cast."""
         return casts_shadows(self.sensor, self.config.shadows)
 
     def _build(self, grid: PadGrid) -> FastArrays:

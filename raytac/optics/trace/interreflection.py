@@ -100,7 +100,7 @@ def patch_counts(layout: CoatLayout) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class BounceField:
-    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, made anew each frame.
+    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, computed each frame.
 
     (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal.
     """
@@ -158,10 +158,12 @@ class BounceField:
             for b in (-1, 0, 1):
                 z += field.z(env, x + a * self.dx / 3, y + b * self.dy / 3) / 9
         dr.eval(z)
-        left, right = dr.select(ix > 0, i - 1, i), dr.select(ix < self.nx - 1, i + 1, i)
-        up, down = dr.select(iy > 0, i - self.nx, i), dr.select(iy < self.ny - 1, i + self.nx, i)
-        zx = (dr.gather(mi.Float, z, right) - dr.gather(mi.Float, z, left)) / (mi.Float(right - left) * self.dx)
-        zy = (dr.gather(mi.Float, z, down) - dr.gather(mi.Float, z, up)) / (mi.Float((down - up) // self.nx) * self.dy)
+        x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < self.nx - 1, i + 1, i)
+        y_minus, y_plus = dr.select(iy > 0, i - self.nx, i), dr.select(iy < self.ny - 1, i + self.nx, i)
+        zx = (dr.gather(mi.Float, z, x_plus) - dr.gather(mi.Float, z, x_minus)) / (mi.Float(x_plus - x_minus) * self.dx)
+        zy = (dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)) / (
+            mi.Float((y_plus - y_minus) // self.nx) * self.dy
+        )
         n = dr.normalize(mi.Normal3f(zx, zy, -1))
         p = mi.Point3f(x, y, z)
         to_camera = mi.Vector3f(0, 0, -1)

@@ -233,10 +233,11 @@ def enter(mi: Any, slab: Slab, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:
 
 
 def advance(mi: Any, scene: SensorScene, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, Any]:
-    """What ``ray`` meets, over the slab's face if that comes first: (interaction, factor on radiance, whether it was mirrored).
+    """Follow ``ray`` to its next interaction, over the slab's face if that comes first.
 
-    The factor is n² for a path that leaves the gel and 1 / n² for one that enters; light carried from an LED needs none. Both last values
-    are None without a slab. The face is flat, so that a stretch meets it once at most.
+    Returns the interaction, the factor on radiance, and a mask of the rays that the face mirrored. The last two are None without a
+    slab. The factor is n² for a path that leaves the gel and 1 / n² for one that enters; light carried from an LED needs none. The
+    face is flat, so that a stretch meets it once at most.
     """
     si = scene.scene.ray_intersect(ray, active)
     slab = scene.slab
@@ -256,7 +257,7 @@ def advance(mi: Any, scene: SensorScene, sampler: Any, ray: Any, active: Any) ->
 
 
 def hidden(mi: Any, scene: SensorScene, start: Any, end: Any, link: Link, active: Any) -> Any:
-    """Whether something stands on either leg of ``link`` between the interaction ``start`` and the point ``end``."""
+    """True if something blocks a leg of ``link`` between the interaction ``start`` and the point ``end``."""
     active = mi.Bool(active)
     blocked = scene.scene.ray_test(start.spawn_ray_to(dr.select(link.bent, link.via, end)), active)
     leg = end - link.via

@@ -80,7 +80,7 @@ class SensorScene:
         self._coat = mi.ShapePtr(shapes["coat"])
         self._coat_bsdf = shapes["coat"].bsdf()
         self._leds = [mi.ShapePtr(shapes[f"led_{k}"]) for k in range(len(sensor.lights.leds))]
-        # Opaque, or their addresses become constants of the kernels, which then compile anew for every scene.
+        # Opaque, or their addresses become constants of the kernels, which then compile again for every scene.
         drjit.make_opaque(self._coat, *self._leds)
         self._context = mi.BSDFContext()
         self.set_surface(grid.rest)
@@ -217,7 +217,7 @@ class SensorScene:
         return si.shape == self._coat
 
     def on_case(self, si: Any) -> Any:
-        """Whether ``si`` lies on a wall or the floor, its inner side."""
+        """True if ``si`` lies on the inner side of a wall or the floor."""
         case = si.is_valid() & (si.wi.z > 0)
         for other in (self._coat, *self._leds):
             case &= si.shape != other

@@ -27,7 +27,7 @@ def reduced_modulus(gelpad: GelpadSpec) -> float:
 
 
 def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """How many times stiffer the bonded layer is than a half-space under a contact of ``radius`` [m].
+    """Stiffness of the bonded layer relative to a half-space, under a contact of ``radius`` [m].
 
     From the sphere on a bonded layer, F = F_Hertz Σ c_n χⁿ with χ = √(Rδ) / h (Dimitriadis et al., Biophysical Journal 82, 2002,
     2798): c₁ = −2α/π, c₂ = 4α²/π², c₃ = −(8/π³)(α³ + 4π²β/15), c₄ = (16α/π⁴)(α³ + 3π²β/5), α and β as below. Its incremental
@@ -129,12 +129,12 @@ _ZOOMS, _FINE = 4, 17
 
 
 class FirstTouch(NamedTuple):
-    """Where an object first touches the pad."""
+    """First contact of an object with the pad."""
 
     z: float
     """Height of the object's origin [m], pad frame."""
     gap: np.ndarray
-    """What ``gap_at_touch`` gives there, (Ny, Nx) [m]."""
+    """Gap of ``gap_at_touch`` at that height, (Ny, Nx) [m]."""
     deepest: float
     """Travel from there [m] that takes the object's lowest point over the pad to the bonded face: the thickness at the centre of the pad,
     less on the flanks of the dome."""

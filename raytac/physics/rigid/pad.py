@@ -26,7 +26,7 @@ __all__ = ["RigidPad"]
 
 @dataclass
 class _Environment:
-    """What one environment remembers between stages."""
+    """State of one environment between stages."""
 
     origin: np.ndarray
     """Pad-frame position of the object's origin at first touch, zero shear and twist (3,) [m]."""
@@ -57,14 +57,14 @@ class RigidPad(PressPad):
     def __init__(self, sensor: SensorSpec, scene: PressScene, **settings: Any) -> None:
         """Build the grid, the object and the elastic surround; ``settings`` and errors as of ``PressPad``."""
         if scene.object.dynamics == "soft":
-            rule = "is for the simulated pad, physics='ipc': the rigid pad's object does not give way"
+            rule = "is for the soft pad, physics='ipc': the rigid pad's object does not give way"
             choices = tuple(name for name in DYNAMICS if name != "soft")
             raise SpecError(rule, file=scene.source, key="object.dynamics", value="soft", choices=choices)
         super().__init__(sensor, scene, **settings)
         self._surround = ElasticSurround(self.grid)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
         self._environments: list[_Environment] = []
-        """Where the last reading left the object; empty before the first, and without an object."""
+        """State of every environment at the last reading; empty before the first, and without an object."""
         self._begun: tuple[int, int, list[_Environment]] = -1, 1, []
         """Index and readings of the stage that was begun last, and the environments as they were before it."""
 

@@ -125,7 +125,7 @@ class PressRig:
 
     @property
     def depth(self) -> float:
-        """How far the foot is below the plane [m]; negative when clear of it."""
+        """Depth of the foot below the plane [m]; negative when clear of it."""
         return -(self._below + float(self.data.qpos[self._z]))
 
     @property
@@ -157,14 +157,14 @@ class PressRig:
         """
         if not np.isfinite([start, end]).all():
             return False
-        data, z, held = self.data, self._z, self.joints
+        data, z, joints = self.data, self._z, self.joints
         data.qvel[:] = 0.0
         steps = max(round(duration / _TIME_STEP), 1)
         for step in range(1, steps + _PATIENCE):
             data.qfrc_applied[z] = -(start + (end - start) * min(step / steps, 1.0))
             self._stiffen(secant)
             mujoco.mj_step(self.model, data)
-            data.qpos[self._joints[[0, 1, 3]]] = held[[0, 1, 3]]
+            data.qpos[self._joints[[0, 1, 3]]] = joints[[0, 1, 3]]
             if not abs(self.depth) < _RUNAWAY:
                 break
             carried = secant(self.depth) * max(self.depth, 0.0)

@@ -27,7 +27,7 @@ from raytac.specs.sensor import SensorSpec
 __all__ = ["SoftPad"]
 
 _SAG = 0.1
-"""How far the object's facets may lie inside it, in units of d̂."""
+"""Largest depth of the object's facets below its true surface, in units of d̂."""
 
 
 class SoftPad(PressPad):

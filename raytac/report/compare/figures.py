@@ -42,7 +42,7 @@ PANELS = (("frame_mae", "whole frame"), ("contact_mae", "contact"), ("ring_mae",
 
 @dataclass(frozen=True)
 class Look:
-    """How a family of modes is drawn."""
+    """Style in which a family of modes is drawn."""
 
     colour: str
     marker: str
@@ -83,7 +83,7 @@ def write_pareto(comparison: Comparison, path: Path) -> None:
 
 
 def _looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """How every family is drawn, in the order of the rows."""
+    """Style of every family, in the order of the rows."""
     looks: dict[str, Look] = {}
     for s in summaries(rows):
         if s.family not in looks:

@@ -1,4 +1,4 @@
-"""Which optical modes a comparison measures, with which settings: all that are registered, and the package ``taxim``."""
+"""Optical modes of a comparison and their settings: all registered modes, and the package ``taxim``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Mode", "Setting", "comparison_modes"]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a mode is built for."""
+    """Circumstances for which a mode is built."""
 
     tracers: Tracers
     size: tuple[int, int]
@@ -45,15 +45,15 @@ class Mode:
     spp: int | None = None
     """Samples a pixel, None for a mode without noise."""
     unbiased: bool = False
-    """Whether the error of a sampled family falls as 1/√spp, so that it may be extrapolated."""
+    """True if the error of a sampled family falls as 1/√spp, so that it may be extrapolated."""
     options: str = ""
     """Settings as they go into the key of a row."""
     prepare: Callable[[Setting], object] | None = None
     """Work before the first image whose result stays on disk for later processes, such as baking a table; it is not timed."""
     has_reference: bool = True
-    """Whether the image shows our sensor, so that its error against our reference means something."""
+    """True if the image shows our sensor, so that its error against our reference means something."""
     note: str = ""
-    """What a reader of its rows must know."""
+    """Remark for readers of its rows."""
 
     @property
     def name(self) -> str:

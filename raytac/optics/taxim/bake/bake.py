@@ -171,7 +171,7 @@ def bake_shadow(
     seed: int = 0,
     tick: Callable[[int], object] = lambda count: None,
 ) -> ShadowTable:
-    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is told how many images were rendered, six a pin in all."""
+    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is called with the number of rendered images, six a pin in all."""
     settings = BakeSettings() if settings is None else settings
     _, deepest = settings.depth_range(at.sensor.gelpad.thickness)
     shades = ShadowSums(2 * PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)

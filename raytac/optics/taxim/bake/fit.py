@@ -135,9 +135,10 @@ class BinSums:
 
 
 def _spread(gram: np.ndarray, terms: list[int], uniform: np.ndarray) -> np.ndarray:
-    """How widely samples lie, (N,): smallest eigenvalue of the covariance of their monomials, relative to samples all over the image.
+    """Spread of the samples, (N,).
 
-    1: as widely as the whole image in every direction of the model; 0: some combination of the terms cannot be told from the constant.
+    Smallest eigenvalue of the covariance of their monomials, relative to samples all over the image.
+    1: as wide as the whole image in every direction of the model; 0: some combination of the terms is as good as constant.
     """
     varying = terms[:-1]
 

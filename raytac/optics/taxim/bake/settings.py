@@ -1,4 +1,4 @@
-"""How a table is baked: numbers of presses and their ranges. They are part of what a cached table is kept under."""
+"""Settings of a bake: numbers of presses and their ranges. They are part of a cached table's key."""
 
 from __future__ import annotations
 

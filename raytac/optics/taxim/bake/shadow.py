@@ -64,9 +64,9 @@ class ShadowSums:
         row, column = np.nonzero(dilated(contact, self._ring) & ~contact)
         a = np.floor((np.arctan2(slope_y[row, column], slope_x[row, column]) + np.pi) / DIRECTION_PRECISION).astype(int)
         a = np.minimum(a, n_dir - 1)
-        way = STEP * np.arange(steps)
-        x = np.floor(column[:, None] + way * np.cos(self.directions[a])[:, None]).astype(int)
-        y = np.floor(row[:, None] + way * np.sin(self.directions[a])[:, None]).astype(int)
+        distance = STEP * np.arange(steps)
+        x = np.floor(column[:, None] + distance * np.cos(self.directions[a])[:, None]).astype(int)
+        y = np.floor(row[:, None] + distance * np.sin(self.directions[a])[:, None]).astype(int)
         n, s = np.nonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
         x, y = x[n, s], y[n, s]
         drop = moved[row, column][n] - moved[y, x]

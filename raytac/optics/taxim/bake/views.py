@@ -22,7 +22,7 @@ _BATCH = {"cpu": 8, "cuda": 32}
 
 @dataclass(frozen=True)
 class Views:
-    """What the camera sees of a batch of presses, and where; all NumPy, first axis B."""
+    """Images of a batch of presses and the geometry behind them; all NumPy, first axis B."""
 
     rgb: np.ndarray
     """(B, H, W, 3) uint8."""
