@@ -13,7 +13,7 @@ import pytest
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.traction import cell_areas
-from raytac.physics import PHYSICS, Ipc
+from raytac.physics import PHYSICS, Correction, Ipc
 from raytac.physics.soft.contact_width import NarrowContactWarning
 from raytac.report.press import press_metrics
 from raytac.sensor import TactileSensor
@@ -165,3 +165,15 @@ def test_without_images_the_device_is_the_solvers(monkeypatch: pytest.MonkeyPatc
     )
     assert TactileSensor("gelsight_mini", physics="ipc", outputs=("height",)).device_used == "cuda"
     assert TactileSensor("gelsight_mini", outputs=("height",)).device_used == "cpu"
+
+
+def test_the_correction_of_the_surface_is_a_choice() -> None:
+    heights = []
+    for correction in (Correction(), None):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NarrowContactWarning)
+            sensor = TactileSensor(outputs=("height",), physics=Ipc(correction=correction), pitch=0.3e-3, device="cpu")
+            heights.append(sensor.press(SCENE).height)
+    assert 5e-6 < np.abs(heights[0] - heights[1]).max() < 0.1e-3
+    with pytest.raises(InputError, match=r"correction = 3: must be a Correction"):
+        Ipc(correction=3)  # type: ignore[arg-type]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from raytac.checks import check_known, check_methods
+from raytac.checks import check_kind, check_known, check_methods
 from raytac.device import resolve_device
+from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
 from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 
@@ -40,12 +41,15 @@ class Ipc:
     """Soft pad: the gel solved with contact, friction and large deformation by ``ipc``.
 
     Raises:
-        InputError: an unknown level.
+        InputError: an unknown level, or settings of another type.
     """
 
     level: str | PadMesh | None = None
     """Resolution of the mesh, one of ``PADS``, or a mesh of one's own; None is the scene's, else ``coarse``."""
-    # A field ``correction`` (None: the plain finite-element surface) belongs here.
+    correction: Correction | None = DEFAULT_CORRECTION
+    """Correction of the surface below the size of the mesh's cells; None is the plain finite-element surface."""
+    control: PressControl = DEFAULT_CONTROL
+    """Tolerances and search of a press; worlds have their own."""
     is_simulated: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -53,6 +57,9 @@ class Ipc:
             check_known("level", self.level, PADS)
         elif self.level is not None:
             check_methods("level", self.level, (), ("tets", "coat"), f"one of {', '.join(PADS)}, or a PadMesh")
+        if self.correction is not None:
+            check_kind("correction", self.correction, Correction)
+        check_kind("control", self.control, PressControl)
 
     @property
     def label(self) -> str:
@@ -67,4 +74,5 @@ class Ipc:
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)
-        return SoftPad(spec, press, level=self.level or PADS[0], device=device, **settings)
+        own = {"level": self.level or PADS[0], "correction": self.correction, "control": self.control}
+        return SoftPad(spec, press, device=device, **own, **settings)

@@ -90,7 +90,12 @@ class SoftPads:
         self.composed, self.model, self._models = composed, composed.model, models
         scene, level = composed.scene, physics.level or PADS[0]
         pads = [
-            ScenePad(mounted.name, spec, level if isinstance(level, PadMesh) else pad_mesh(spec.gelpad, level))
+            ScenePad(
+                mounted.name,
+                spec,
+                level if isinstance(level, PadMesh) else pad_mesh(spec.gelpad, level),
+                correction=physics.correction,
+            )
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
