@@ -96,7 +96,7 @@ def draw(coin, photograph: np.ndarray, ray_traced: np.ndarray, circle: np.ndarra
         shown = axes[0].imshow(indentation, cmap="viridis", extent=extent)
         view = [1e3 * pitch * side / 2 for side in coin.rgb.shape[2:0:-1]]
         axes[0].set(xlim=(-view[0], view[0]), ylim=(view[1], -view[1]))
-        scale = axes[0].inset_axes((0.87, 0.1, 0.03, 0.76))
+        scale = axes[0].inset_axes((0.03, 0.1, 0.03, 0.76))
         figure.colorbar(shown, cax=scale, ticks=(0.0, 0.2, 0.4, 0.6))
         scale.tick_params(colors="white", labelsize=8)
         scale.set_title("mm", color="white", fontsize=8, pad=2)
@@ -106,7 +106,7 @@ def draw(coin, photograph: np.ndarray, ray_traced: np.ndarray, circle: np.ndarra
             rows, bar = image[box].shape[0], 2e-3 / pitch
             axis.plot([0.06 * rows, 0.06 * rows + bar], [0.94 * rows] * 2, color="white", linewidth=2)
             axis.text(0.06 * rows + bar / 2, 0.915 * rows, "2 mm", color="white", ha="center", va="bottom", fontsize=8)
-        titles = ("coin: indentation", "coin: ray-traced", "ball: photograph", "ball: ray-traced", "difference × 4, grey = 0")
+        titles = ("coin: indentation", "coin: ray-traced", "ball: photograph", "ball: ray-traced", "difference × 4")
         for axis, title in zip(axes, titles, strict=True):
             axis.set_title(title)
             axis.set(xticks=[], yticks=[])
