@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -127,6 +127,14 @@ class GelSurface:
     @property
     def batch(self) -> int:
         return self.height.shape[0]
+
+    def rows(self, envs: Sequence[int] | np.ndarray) -> GelSurface:
+        """The surfaces of some environments, one row each."""
+        some = {name: getattr(self, name)[envs] for name in ("height", "contact", "contact_centre")}
+        some |= {name: None if (v := getattr(self, name)) is None else v[envs] for name in ("pad_from_object", "ink")}
+        return GelSurface(
+            self.grid, **some, coat=None if self.coat is None else replace(self.coat, positions=self.coat.positions[envs])
+        )
 
     @property
     def indentation(self) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from raytac.checks import check_names
 from raytac.device import total_memory
 from raytac.errors import InputError
-from raytac.gel.surface import GelSurface, PadGrid
+from raytac.gel.surface import GelSurface, PadGrid, rounded_envs
 from raytac.optics.base import OpticsConfig, OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
@@ -94,6 +94,8 @@ class DeviceMode(ABC):
         self._grid: PadGrid | None = None
         # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
+        self._at_rest: OpticsImages | None = None
+        """Images of one untouched pad, which every environment at rest shows."""
 
     # ---------------------------------------------------------------- what a mode gives
 
@@ -160,12 +162,37 @@ class DeviceMode(ABC):
     def render(self, surface: GelSurface) -> OpticsImages:
         """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
 
+        Untouched pads are not rendered again: they show the image at rest, which is rendered once.
+
         An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
 
         Raises:
             InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
         """
         heights, failed = self._checked(surface)
+        pressed = self._pressed(surface, heights, failed)
+        if len(pressed) == surface.batch:
+            return self._rendered(surface, heights, failed)
+        if self._at_rest is None:
+            rest = GelSurface.at_rest(surface.grid)
+            self._at_rest = self._rendered(rest, rest.height, np.zeros(1, bool))
+        images = self._rendered(surface.rows(pressed), heights[pressed], failed[pressed]) if pressed else None
+        return _spread(self._at_rest, images, pressed, surface.batch)
+
+    def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
+        """Environments that have to be rendered, as many as some power of two; the others show the image at rest.
+
+        Marker dots may lie differently in every environment, so with dots it is all of them.
+        """
+        if surface.ink is not None:
+            return list(range(surface.batch))
+        rest = surface.grid.rest.astype(np.float32)
+        differ = failed | surface.contact.any(axis=(1, 2)) | (heights != rest).any(axis=(1, 2))
+        pressed = np.flatnonzero(differ).tolist()
+        rounded = rounded_envs(pressed, surface.batch) if pressed else []
+        return rounded if len(rounded) < surface.batch else list(range(surface.batch))
+
+    def _rendered(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> OpticsImages:
         return self._images(surface, heights, failed, self._lit_images(surface, heights, failed) if self._lit else {})
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
@@ -253,6 +280,25 @@ class DeviceMode(ABC):
     def _upload_ink(self, surface: GelSurface) -> Float | None:
         ink = checked_ink(surface)
         return None if ink is None else self._upload(ink)
+
+
+def _spread(rest: OpticsImages, images: OpticsImages | None, envs: list[int], batch: int) -> OpticsImages:
+    """``rest`` (B = 1) in every environment of a batch, but ``images`` in those of ``envs``."""
+
+    def spread(rest: np.ndarray, some: np.ndarray | None) -> np.ndarray:
+        whole = np.repeat(rest, batch, axis=0)
+        if some is not None:
+            whole[envs] = some
+        return whole
+
+    merged: dict[str, Any] = {}
+    for name, value in vars(rest).items():
+        some = None if images is None else getattr(images, name)
+        if isinstance(value, dict):
+            merged[name] = {key: spread(one, None if some is None else some[key]) for key, one in value.items()}
+        else:
+            merged[name] = None if value is None else spread(value, some)
+    return OpticsImages(**merged)
 
 
 def device_envs(nodes: int, heights: Float, **others: Any) -> int:

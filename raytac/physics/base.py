@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
@@ -116,15 +115,10 @@ class PadReading:
 
     def of(self, envs: Sequence[int] | np.ndarray) -> PadReading:
         """The same of the environments named, one row each."""
-        rows, whole, wrench = np.asarray(envs), self.surface, self.wrench
-        part, coat = copy(self), whole.coat
+        rows, surface, wrench = np.asarray(envs), self.surface.rows(envs), self.wrench
+        part = copy(self)
         del part.surface, part.wrench  # cached of all environments
-        part._surface = replace(
-            whole,
-            **{name: getattr(whole, name)[rows] for name in ("height", "contact", "contact_centre")},
-            **{name: None if (v := getattr(whole, name)) is None else v[rows] for name in ("pad_from_object", "ink")},
-            coat=None if coat is None else replace(coat, positions=coat.positions[rows]),
-        )
+        part._surface = surface
         part._wrench, part._traction = wrench[rows], lambda _: self.traction()[rows]
         for name in ("failed", "unconverged", "pad_from_object", "world_from_pad", "depth", "force_law_area"):
             values = getattr(self, name)

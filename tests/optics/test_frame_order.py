@@ -21,6 +21,7 @@ from raytac.markers.contacts import ContactCells, ContactTracker
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerTracker
 from raytac.optics import Mlp, Phong, RayTraced, Taxim
+from raytac.optics.base import OpticsImages
 from raytac.optics.device_image import DeviceImage, ImageCut
 from raytac.optics.image.phong import PhongMode
 from raytac.optics.taxim.mode import TaximMode
@@ -97,7 +98,13 @@ OTHER = ball(GRID, depth=0.4e-3, centre=(-2e-3, 1e-3))
 
 
 def arrays(mode: Any, surface: GelSurface) -> dict[str, np.ndarray]:
-    images = mode.render(surface)
+    """Images of ``render``, which shows untouched pads as they were once; those of a frame that renders every pad must be the same."""
+    lazy, every = (by_name(images) for images in (mode.render(surface), mode._rendered(surface, *mode._checked(surface))))
+    assert_same(lazy, every, "render against a frame of all pads")
+    return every
+
+
+def by_name(images: OpticsImages) -> dict[str, np.ndarray]:
     found = {name: getattr(images, name) for name in ("rgb", "normals", "position", "depth")} | (images.layers or {})
     return {name: array for name, array in found.items() if array is not None}
 
@@ -316,3 +323,20 @@ def test_other_numbers_of_markers_are_other_recordings(device: str) -> None:
     one = make()
     for count in (7, 300, 1, 7):
         np.testing.assert_array_equal(moved(one, count), moved(make(), count))
+
+
+@EACH_MODE
+def test_only_pressed_pads_are_rendered(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, rendered = MODES[mode]("cpu"), []
+    whole = type(one)._rendered
+
+    def counted(self: Any, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> OpticsImages:
+        rendered.append(len(heights))
+        return whole(self, surface, heights, failed)
+
+    monkeypatch.setattr(type(one), "_rendered", counted)
+    for batch in ((REST, REST, REST, REST), (REST, PRESS, REST, REST), (REST, REST, REST, REST)):
+        one.render(stacked(*batch))
+    assert rendered == [1, 1]  # the pad at rest once, and the one that is pressed
+    one.render(stacked(PRESS, REST, PRESS, PRESS))
+    assert rendered == [1, 1, 4]  # three are rounded up, so that few sizes are recorded
