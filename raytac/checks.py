@@ -141,6 +141,8 @@ def check_numbers(name: str, values: object, shape: tuple[int | None, ...], *, f
     if array.dtype.kind not in "iuf":
         raise InputError(name, value=str(array.dtype), rule=f"must be real numbers of shape {wanted}")
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        if array.ndim == 0:
+            raise InputError(name, value=array.item(), rule=f"must have shape {wanted}, and is one number")
         raise InputError(name, value=array.shape, rule=f"must have shape {wanted}")
     if np.ma.is_masked(values):
         raise InputError(name, value=array.shape, rule="must have no masked entries")

@@ -55,15 +55,17 @@ class InputError(RaytacError, ValueError):
     """A public function was given a value that it cannot use.
 
     ``InputError("optics", value="raytrce", rule="must be a known optical mode", choices=("raytrace",))`` reads
-    ``optics = 'raytrce': must be a known optical mode; did you mean 'raytrace'? choose from: raytrace``.
+    ``optics = 'raytrce': must be a known optical mode; did you mean 'raytrace'? choose from: raytrace``. Without ``value`` it reads
+    ``NAME: RULE``: an argument that is missing.
     """
 
-    def __init__(self, name: str, *, value: object, rule: str, choices: Iterable[object] = ()) -> None:
+    def __init__(self, name: str, *, value: object = ..., rule: str, choices: Iterable[object] = ()) -> None:
         self.name = name
         self.value = value
         self.rule = rule
         self.choices = tuple(choices)
-        super().__init__(f"{name} = {short_repr(value)}: {rule}{_choices_text(value, self.choices)}")
+        what = name if value is ... else f"{name} = {short_repr(value)}"
+        super().__init__(f"{what}: {rule}{_choices_text(value, self.choices)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild it from its parts, so that it is complete when it comes from another process."""

@@ -122,7 +122,7 @@ class TactileFrame:
         def __getattr__(self, name: str) -> Any:
             if name not in type(self).__dataclass_fields__:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            raise MissingOutputError(name, value=None, rule=_ASK.get(name, f'was not asked for: outputs=("{name}", …)'))
+            raise MissingOutputError(f"frame.{name}", rule=_ASK.get(name, f'was not asked for: outputs=("{name}", …)'))
 
     def __repr__(self) -> str:
         return summary(self, self.outputs)

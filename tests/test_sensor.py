@@ -28,7 +28,8 @@ from tests.conftest import Shader, make_surface
         ({"outputs": "rgb,depth"}, "outputs = 'rgb,depth'.*layers"),
         ({"device": "gpu"}, "auto, cpu, cuda"),
         ({"num_envs": 0}, "num_envs = 0"),
-        ({"optics": "mlp"}, "weights = None: must name a network"),
+        ({"outputs": ("rgb", "markers")}, "markers are asked for by the argument markers"),
+        ({"optics": "mlp"}, "weights: must name a network"),
         ({"resolution": (0, 240)}, "resolution = 0"),
         ({"resolution": (320, 9000)}, "resolution = 9000.*8192"),
         ({"resolution": (320,)}, r"\(width, height\)"),
@@ -122,7 +123,7 @@ def test_what_was_not_asked_for_says_how_to_ask(sensor_spec: SensorSpec) -> None
         ("markers", "markers='fots'"),
         ("unconverged", "ipc"),
     ):
-        with pytest.raises(MissingOutputError, match=rf"{name} = None: .*{how}"):
+        with pytest.raises(MissingOutputError, match=rf"frame.{name}: .*{how}"):
             getattr(frame, name)
         assert not hasattr(frame, name)
     with pytest.raises(AttributeError, match="no attribute 'hight'"):

@@ -99,7 +99,7 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
         data = data / matching[0]
     if data.name.endswith(".npz"):
         if ball_diameter is None:
-            raise InputError("ball_diameter", value=None, rule=f"must be given: {data.name} does not say how large the ball is")
+            raise InputError("ball_diameter", rule=f"must be given: {data.name} does not say how large the ball is")
         presses = _read_pack(data, ball_diameter / 2)
     elif ball_diameter is not None:
         raise InputError("ball_diameter", value=ball_diameter, rule=f"must not be given: {data.name} says it for every press")

@@ -230,7 +230,7 @@ class TactileObserver:
         if not len(stale):
             return
         if sensor is None:
-            raise InputError("sensor", value=None, rule="must be given for a difference: it renders the image at rest")
+            raise InputError("sensor", rule="must be given for a difference: it renders the image at rest")
         if self._moves_dots:
             envs = rounded_envs(stale.tolist(), self.num_envs)
             images = self._cut(sensor.rest(envs).rgb)[: len(stale)]

@@ -49,6 +49,8 @@ def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) ->
 
 def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> tuple[str, ...]:
     """The names in the order of ``OUTPUTS``. Raises ``InputError`` for one that is unknown or that ``optics`` does not make."""
+    if outputs == "markers" or (isinstance(outputs, (list, tuple)) and "markers" in outputs):
+        raise InputError("outputs", value=outputs, rule="markers are asked for by the argument markers, as in markers='fots'")
     outputs, offered = check_names("outputs", outputs, OUTPUTS), sensor_outputs(optics)
     for name in outputs:
         if name not in offered:

@@ -363,7 +363,7 @@ class TactileSensor:
             BackendError: the model's backend does not work here.
         """
         if self.markers is None:
-            raise InputError("markers", value=None, rule="was not asked for", choices=MARKERS.names)
+            raise InputError("markers", rule="was not asked for", choices=MARKERS.names)
         if self._tracker is None:
             self._tracker = MarkerTracker(
                 self.spec,

@@ -95,7 +95,7 @@ def press_of(
             raise InputError(name, value=value, rule=f"belongs to {owner}: leave it out with a {'mesh' if is_mesh else 'scene'}")
         if value is None and belongs and name != "scale":
             units = ", in metres (on the command line in millimetres)" if name == "depth" else ", in metres"
-            raise InputError(name, value=None, rule=f"must be given with {owner}{units}")
+            raise InputError(name, rule=f"must be given with {owner}{units}")
     if isinstance(source, PressScene):
         return source
     if isinstance(source, np.ndarray):

@@ -92,9 +92,9 @@ def test_height_maps_differ_by_their_heights() -> None:
     [
         ("coin", {"depth": DEPTH}, "depth = 0.0008: belongs to a mesh or a height map"),
         ("coin", {"scale": 0.001}, "scale = 0.001: belongs to a mesh: leave it out with a scene"),
-        ("part.stl", {}, "depth = None: must be given with a mesh or a height map"),
+        ("part.stl", {}, "depth: must be given with a mesh or a height map"),
         ("part.stl", {"depth": DEPTH, "pitch": 1e-4}, "pitch = 0.0001: belongs to a height map"),
-        (block_map(), {"depth": DEPTH}, "pitch = None: must be given with a height map, in metres"),
+        (block_map(), {"depth": DEPTH}, "pitch: must be given with a height map, in metres"),
         (block_map(), {"depth": DEPTH, "pitch": 1.0}, r"pitch = 1.0: must be a number in \(0, 0.01\] m"),
         (-block_map(), {"depth": DEPTH, "pitch": 1e-4}, "must be >= 0 everywhere"),
         (0.0 * block_map(), {"depth": DEPTH, "pitch": 1e-4}, "> 0 somewhere"),
@@ -140,6 +140,6 @@ def test_the_command_takes_a_mesh_and_a_depth_in_millimetres(
     assert metrics["scene"] == "part" and metrics["contact.max_indentation_mm"] == pytest.approx(0.8, rel=0.01)
     capsys.readouterr()
     assert main([*command, "--out", str(tmp_path / "none")]) == 2
-    assert "depth = None: must be given with a mesh" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "depth: must be given with a mesh" in capsys.readouterr().err and not (tmp_path / "none").exists()
     assert main(["press", "coin", "--depth", "0.8", "--out", str(tmp_path / "none")]) == 2
     assert "depth = 0.0008: belongs to a mesh or a height map: leave it out with a scene" in capsys.readouterr().err

@@ -96,7 +96,7 @@ class Mlp(OpticsConfig[Any]):
     def __post_init__(self) -> None:
         if self.weights is None:
             rule = "must name a network, as `raytac calibrate DATASET --model mlp` writes it: optics=Mlp(weights=…)"
-            raise InputError("weights", value=None, rule=rule)
+            raise InputError("weights", rule=rule)
 
     def maker(self) -> Any:
         return import_module("raytac.optics.image.mlp").MlpMode
