@@ -7,6 +7,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,9 +37,21 @@ def local_ray():
     ray.shutdown()
 
 
+# A worker that renders no images needs no renderer and starts in a moment.
+WITHOUT_IMAGES: dict[str, Any] = {
+    "outputs": ("height", "wrench"),
+    "markers": None,
+    "marker_perturbation": {},
+    "randomization": {},
+}
+
+
 @pytest.mark.usefixtures("local_ray")
-def test_a_killed_worker_loses_and_doubles_no_press(sweep: SweepSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = DatasetPlan(replace(sweep, count=24))
+@pytest.mark.parametrize("changes", [WITHOUT_IMAGES, pytest.param({}, marks=pytest.mark.slow)], ids=["heights", "images"])
+def test_a_killed_worker_loses_and_doubles_no_press(
+    sweep: SweepSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
+) -> None:
+    plan = DatasetPlan(replace(sweep, count=24, **changes))
     render_dataset(plan, tmp_path / "local", device="cpu", batch=4)
     workers: list[str] = []
     write = ShardStore.write
