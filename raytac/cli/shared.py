@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -27,6 +28,18 @@ FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
 lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
+
+
+def named(names: Iterable[str]) -> object:
+    """Names as the help shows the values of an option: ``{rigid,ipc}``."""
+    return tyro.conf.arg(metavar="{" + ",".join(names) + "}")
+
+
+def print_paths(paths: Iterable[Path]) -> int:
+    """Print the files written, one a line; returns the exit code of success."""
+    for path in paths:
+        print(path)
+    return 0
 
 
 def read_data(

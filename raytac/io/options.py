@@ -25,6 +25,10 @@ class CommonOptions:
     seed: int = 0
     """Seed of every random number; the same seed gives the same result. In [0, 2^32)."""
 
+    def folder(self, *parts: str) -> Path:
+        """``out``, else the folder of these ``parts`` under runs/."""
+        return self.out if self.out is not None else Path("runs", *parts)
+
 
 def parse_resolution(text: str) -> tuple[int, int]:
     """``"320x240"`` to (width, height) [px].

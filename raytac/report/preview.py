@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from raytac.gel.surface import PadGrid
 from raytac.markers import MarkerFrame
 from raytac.report.markers import draw_arrows
+from raytac.report.style import STYLE
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
 __all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
@@ -26,18 +27,11 @@ DIFFERENCE_RANGE = 64
 """Grey levels (of 255) that the difference panel shows to full scale, in either direction; the same in every preview."""
 
 _STYLE = {
+    **STYLE,
     "font.family": "sans-serif",
-    "font.size": 8,
-    "axes.titlesize": 8,
     "axes.titlepad": 4,
-    "axes.titlelocation": "left",
     "axes.labelsize": 7.5,
     "axes.labelpad": 1.5,
-    "axes.linewidth": 0.6,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
     "xtick.major.pad": 2,
@@ -122,7 +116,7 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
     panels = [(draw, 1) for draw in maps]
     # Its long label has no room beside a colour bar: at the left edge, or beside the object, which has none.
     panels.insert(max(1, 3 * (rows - 1)), (lambda axes: _section_panel(axes, data, sensor), 3 * rows - len(maps)))
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
+    with matplotlib.rc_context(_STYLE):
         return _lay_out(panels, rows, data)
 
 

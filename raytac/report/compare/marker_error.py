@@ -1,7 +1,4 @@
-"""Error and time of the cheap marker models against surface tracking.
-
-They are measured on presses of the soft pad that no fit has seen.
-"""
+"""Error and time of the cheap marker models against surface tracking, on presses that no fit has seen."""
 
 from __future__ import annotations
 

@@ -245,9 +245,8 @@ def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
     """Time of the package over ours at the largest resolution that both ran at, medians over scenes, batch 1."""
     metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
-        ours, peers = (
-            known(select(rows, resolution=resolution, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer")
-        )
+        here = select(rows, resolution=resolution)
+        ours, peers = (known(select(here, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer"))
         if ours and peers:
             metrics[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
             metrics[f"taxim{shadow}.vs_peer_resolution"] = resolution

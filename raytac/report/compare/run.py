@@ -114,17 +114,8 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
             markers = _marker_errors(settings, device)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
-    return Comparison(
-        settings,
-        device,
-        tuple(run.rows),
-        run.images,
-        tuple(run.left_out),
-        run.measured,
-        facts | known,
-        tuple(run.physics),
-        markers,
-    )
+    rows, left_out, physics = tuple(run.rows), tuple(run.left_out), tuple(run.physics)
+    return Comparison(settings, device, rows, run.images, left_out, run.measured, facts | known, physics, markers)
 
 
 def _marker_errors(settings: CompareSettings, device: str) -> MarkerErrors:
@@ -304,10 +295,7 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region.
-
-        The halves are independent, so half their difference has the variance of their mean.
-        """
+        """Noise of the reference by region: half the difference of independent halves varies as their mean."""
         one, two = self._halves
         figures = {}
         for region, mask in self.masks.items():

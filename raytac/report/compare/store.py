@@ -114,11 +114,8 @@ class References:
         kept = self._read(path)
         if kept is not None:
             return kept
-        tracer, seed, half = (
-            self.tracers.get(self.size, RayTraced("reference", progress=True)),
-            2 * self.tracers.seed,
-            self.spp // 2,
-        )
+        tracer = self.tracers.get(self.size, RayTraced("reference", progress=True))
+        seed, half = 2 * self.tracers.seed, self.spp // 2
         self.say(f"reference of {scene}, {self.size[0]}x{self.size[1]}: 2 x {half} spp")
         halves = np.stack([path_trace(tracer, surface, half, seed + k) for k in (0, 1)])
         write_sealed(path, npz_bytes({"halves": halves}))
