@@ -136,10 +136,7 @@ class ShardRenderer:
     # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, of which the first are the presses, and why each failed.
-
-        The reason is empty for a press that succeeded.
-        """
+        """Frame of B environments, the first of which are the presses, and why each failed (or "")."""
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():
@@ -195,12 +192,10 @@ class ShardRenderer:
         return ""
 
     def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
-        arrays: dict[str, Any] = {
-            name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")
-        }
-        surface = frame.surface
+        outputs, surface = self.plan.sweep.outputs, frame.surface
+        arrays: dict[str, Any] = {name: getattr(frame, name) for name in outputs if name not in ("rgb", "contact")}
         arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
-        if "contact" in self.plan.sweep.outputs:
+        if "contact" in outputs:
             arrays["contact"] = surface.contact
         if "rgb" in frame.outputs:
             arrays["rgb"] = self._drifted(built, frame.rgb, presses)

@@ -139,15 +139,13 @@ class FolderLock:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not self._is_there(handle):  # the run that had the lock has just removed the folder that it made
                 raise BlockingIOError
-        except BlockingIOError as error:
+        except (OSError, InputError) as error:
             os.close(handle)
-            raise InputError("out", value=folder, rule="is in use by another run") from error
-        except OSError as error:
-            os.close(handle)
-            raise InputError("out", value=folder, rule=f"cannot be locked ({error.strerror})") from error
-        except InputError:
-            os.close(handle)
-            raise
+            if isinstance(error, InputError):
+                raise
+            in_use = isinstance(error, BlockingIOError)
+            rule = "is in use by another run" if in_use else f"cannot be locked ({error.strerror})"
+            raise InputError("out", value=folder, rule=rule) from error
         self._handle = handle
 
     def release(self) -> None:

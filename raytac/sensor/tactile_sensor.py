@@ -331,14 +331,12 @@ class TactileSensor:
         self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
     ) -> TactileFrame:
         """The frame with the images that are asked for; ``done``: when the surface was there."""
-        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers, "label": self.label}
+        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers}
         if self._optical_outputs:
             images = self.optical_mode.render(surface)
-            fields |= {name: getattr(images, name, None) for name in IMAGES} | {
-                "label": self.label
-            }  # a mode is named once it is built
+            fields |= {name: getattr(images, name, None) for name in IMAGES}
             time_ms["optics"] = 1e3 * (time.perf_counter() - done)
-        return TactileFrame(surface, time_ms=time_ms, **fields)
+        return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
         """Frame of untouched pads, what every difference image is taken from; markers keep their history.

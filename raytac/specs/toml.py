@@ -29,6 +29,7 @@ __all__ = [
     "Text",
     "Unit",
     "check_fields",
+    "in_mm",
     "read_toml",
     "split_unit",
 ]
@@ -84,6 +85,10 @@ class Unit:
             return float(f"{float(value) * self.denominator / self.numerator:.6g}")
         except OverflowError:  # an integer beyond all floats
             return value
+
+
+in_mm = Unit(*_UNITS["mm"]).shown
+"""A length or several [m] as a file writes them [mm]."""
 
 
 def split_unit(key: str) -> tuple[str, Unit]:

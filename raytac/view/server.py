@@ -1,7 +1,4 @@
-"""viser's server behind a guard: addresses of the page, and checked messages.
-
-Requests of other pages are refused, and messages are checked before viser sees them.
-"""
+"""viser's server behind a guard: other pages are refused, and messages checked before viser sees them."""
 
 from __future__ import annotations
 
