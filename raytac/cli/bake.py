@@ -13,8 +13,6 @@ from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.bake import run_bake
 from raytac.specs import load_sensor
 
-__all__ = ["BakeArgs"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class BakeArgs(ShadowOptions, CommonOptions):

@@ -16,8 +16,6 @@ from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
 from raytac.specs.press import PADS
 
-__all__ = ["CalibrateArgs"]
-
 _OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
 _OF_MARKERS = ("level", "quick", "verbose")
 

@@ -14,8 +14,6 @@ from raytac.report.compare.run import run_comparison
 from raytac.report.compare.settings import CompareSettings
 from raytac.specs import PADS
 
-__all__ = ["CompareArgs"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CompareArgs(SolverOptions):

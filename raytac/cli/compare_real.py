@@ -11,8 +11,6 @@ import tyro
 
 from raytac.cli.shared import FitOptions, print_paths
 
-__all__ = ["CompareRealArgs"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRealArgs(FitOptions):

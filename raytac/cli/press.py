@@ -19,8 +19,6 @@ from raytac.report.press import run_press
 from raytac.sensor import TactileSensor, sensor_outputs
 from raytac.specs import PADS, press_of
 
-__all__ = ["PressArgs"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PressArgs(ShadowOptions, SolverOptions):

@@ -22,8 +22,6 @@ from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
-__all__ = ["FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "chosen_physics", "read_data"]
-
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
 lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from raytac.specs.sensor import SensorSpec
     from raytac.view.session import Session
 
-__all__ = ["ViewArgs"]
-
 _OUTPUTS = ("rgb", "wrench", "traction")
 _LONGEST = 320
 """Side of a tactile image [px] that is drawn quickly and large enough to be seen."""

@@ -13,8 +13,6 @@ from raytac.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["contact_figure", "contact_sheet"]
-
 _WIDE, _HIGH, _DPI = 1.75, 1.4, 100
 """Size of a panel [inch], and pixels to an inch."""
 _BAR = 5e-3

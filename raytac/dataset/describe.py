@@ -13,8 +13,6 @@ from raytac.dataset.shard import ShardRecord, sha256_of
 from raytac.errors import InputError
 from raytac.io.atomic import read_regular, write_atomic
 
-__all__ = ["FILE", "FORMAT_VERSION", "describe", "read_description", "write_description"]
-
 FILE = "dataset.json"
 FORMAT_VERSION = 1
 _KEYS = {

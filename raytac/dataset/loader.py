@@ -16,8 +16,6 @@ from raytac.dataset.manifest import read_manifest
 from raytac.dataset.shard import FOLDER, is_shard_file, open_shard
 from raytac.errors import InputError
 
-__all__ = ["PressDataset", "open_shard"]
-
 
 class PressDataset:
     """Sound presses of a data set; what ``torch.utils.data.DataLoader`` takes as a map-style data set, without PyTorch.

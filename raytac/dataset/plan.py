@@ -24,8 +24,6 @@ from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
 from raytac.specs.toml import in_mm
 
-__all__ = ["DatasetPlan", "Presses", "press_scene_of"]
-
 _DRAWS = 10
 """Uniform numbers that every press draws, used or not: a range that changes changes no other value."""
 

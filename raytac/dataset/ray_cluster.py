@@ -17,8 +17,6 @@ from raytac.checks import check_whole
 from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.errors import BackendError, RaytacError
 
-__all__ = ["render_on_ray"]
-
 _ATTEMPTS = 3
 """Times that a shard is begun before it is given up: what kills its worker each time is the shard."""
 

@@ -20,8 +20,6 @@ from raytac.physics import NarrowContactWarning
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec
 
-__all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
-
 _KEPT = 4
 """Sensors that a worker keeps built; each holds a renderer's scene."""
 _UNSETTLED = "the press did not settle, or its state is not finite"

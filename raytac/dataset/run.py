@@ -23,8 +23,6 @@ from raytac.errors import InputError
 from raytac.io.folder import FolderLock
 from raytac.io.progress import Progress
 
-__all__ = ["ENGINES", "Check", "RunReport", "render_dataset", "render_here", "verify_dataset"]
-
 _SPARE = 1.05
 """The estimated size must fit this many times on the disk."""
 

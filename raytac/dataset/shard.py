@@ -20,8 +20,6 @@ from raytac.errors import InputError
 from raytac.io.arrays import npz_bytes
 from raytac.io.atomic import PARTIAL, open_regular, read_regular, write_atomic
 
-__all__ = ["FOLDER", "KINDS", "ShardRecord", "ShardStore", "is_shard_file", "open_shard", "sha256_of"]
-
 FOLDER = "shards"
 """Folder of the shards in a data set."""
 _FILE = re.compile(rf"{FOLDER}/[0-9]{{6,12}}\.npz")

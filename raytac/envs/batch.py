@@ -24,8 +24,6 @@ from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
 
-__all__ = ["StepResult", "TaskBatch", "VariationSampler"]
-
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s] in observations."""
 

@@ -20,8 +20,6 @@ from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
 
-__all__ = ["EnvironmentPicture", "TactileEnv", "TactileVectorEnv", "serve_vector"]
-
 _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
 """Length of a drawn arrow over the marker's displacement."""

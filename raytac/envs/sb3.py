@@ -19,8 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from raytac.envs.environments import TactileVectorEnv, serve_vector
 from raytac.errors import InputError
 
-__all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
-
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Observations = dict[str, np.ndarray]

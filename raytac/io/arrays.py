@@ -8,8 +8,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["npy_bytes", "npz_bytes"]
-
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of every member of an archive, so that equal arrays are equal files."""
 

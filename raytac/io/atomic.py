@@ -12,8 +12,6 @@ import secrets
 import stat
 from pathlib import Path
 
-__all__ = ["PARTIAL", "open_regular", "read_regular", "sync_folder", "write_atomic"]
-
 PARTIAL = ".partial"
 """End of the names of files that are being written; they begin with a dot."""
 

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from raytac.io.seal import SealError, read_sealed, write_sealed
 
-__all__ = ["cache_folder", "cache_root", "keep_cached", "read_cached", "warn_not_kept", "warn_unusable"]
-
 
 def cache_root() -> Path | None:
     """Folder of the cache; None for a user without a home folder.

@@ -14,8 +14,6 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
-__all__ = ["code_digest", "git_state", "module_sources"]
-
 WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
 """Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
 

@@ -15,8 +15,6 @@ from types import TracebackType
 
 from raytac.errors import InputError, RaytacError
 
-__all__ = ["DISK_ERRORS", "LOCK", "FolderLock", "result_folder"]
-
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """Numbers of the errors of a disk, or of what standard output goes to."""
 

@@ -12,8 +12,6 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["HEADER_PREFIX", "png_bytes", "read_exr", "read_png", "vector_channels", "write_exr", "write_png", "write_sheet"]
-
 
 def png_bytes(rgb_u8: np.ndarray) -> bytes:
     """``rgb_u8``, shape (H, W, 3), uint8, as the contents of a PNG file.

@@ -18,8 +18,6 @@ from pathlib import Path
 from raytac.errors import InputError
 from raytac.io.atomic import write_atomic
 
-__all__ = ["REQUIRED", "VERSIONED", "Metric", "check_metrics", "read_metrics", "versions", "write_metrics"]
-
 Metric = int | float | str
 
 REQUIRED = ("device", "wall_s")

@@ -9,8 +9,6 @@ from typing import Literal
 
 from raytac.errors import InputError
 
-__all__ = ["CommonOptions", "DeviceName", "parse_names", "parse_outputs", "parse_resolution"]
-
 DeviceName = Literal["auto", "cpu", "cuda"]
 
 

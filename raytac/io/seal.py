@@ -11,8 +11,6 @@ from pathlib import Path
 
 from raytac.io.atomic import read_regular, write_atomic
 
-__all__ = ["SealError", "read_sealed", "write_sealed"]
-
 _SIZE = hashlib.sha256().digest_size
 
 

@@ -13,8 +13,6 @@ from raytac.markers import MarkerPerturbation
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 
-__all__ = ["CameraDrift", "Randomization", "randomised_bodies", "randomised_sensor"]
-
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
 """Widths that are not relative to 1, and their upper bounds: a larger one is no mounting error."""
 

@@ -17,8 +17,6 @@ from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
-
 MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
 """Names that ``modalities`` accepts:
 

@@ -15,8 +15,6 @@ from raytac.specs.sensor import SensorSpec
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["ArraySpec", "array_specs", "gymnasium_space"]
-
 
 @dataclass(frozen=True)
 class ArraySpec:

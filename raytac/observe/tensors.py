@@ -7,8 +7,6 @@ from typing import Any
 
 from raytac.errors import BackendError
 
-__all__ = ["as_tensors"]
-
 
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
     """``torch.Tensor`` by name, through DLPack, without a copy; nested dictionaries stay nested.

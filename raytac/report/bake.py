@@ -28,18 +28,6 @@ if TYPE_CHECKING:
     from raytac.optics.taxim.table import PolyTable
     from raytac.optics.trace.tracer import Tracer
 
-__all__ = [
-    "BOX_MARGIN",
-    "ERROR_RANGE",
-    "SceneError",
-    "bake_metrics",
-    "error_metrics",
-    "run_bake",
-    "table_errors",
-    "write_coverage",
-    "write_table_sheet",
-]
-
 
 def run_bake(
     sensor: SensorSpec,

@@ -13,23 +13,6 @@ import numpy as np
 
 from raytac.errors import BackendError, InputError
 
-__all__ = [
-    "FLIP_PPD",
-    "METRICS",
-    "RING_WIDTH",
-    "SSIM_SIGMA",
-    "contact_box",
-    "error_maps",
-    "flip_map",
-    "has_flip",
-    "image_errors",
-    "mae",
-    "psnr",
-    "regions",
-    "rmse",
-    "ssim_map",
-]
-
 METRICS = ("mae", "rmse", "psnr", "ssim", "flip")
 """MAE and RMSE [levels of 255], PSNR [dB], SSIM and FLIP [1]."""
 RING_WIDTH = 2e-3

@@ -42,17 +42,6 @@ from raytac.specs.sensor import SensorSpec
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "FILES",
-    "MotionReport",
-    "calibrate_markers",
-    "draw_arrows",
-    "error_metrics",
-    "error_table",
-    "press_all",
-    "run_calibrate_markers",
-]
-
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Files that a calibration writes."""
 

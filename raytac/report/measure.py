@@ -20,8 +20,6 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
 
-__all__ = ["machine", "moving", "once", "timed", "timed_within", "wilson_interval"]
-
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
     """``count`` batches from ``surfaces`` (B = 1, one grid) in turn.

@@ -21,8 +21,6 @@ from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "press_peaks", "run_press"]
-
 FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "preview.png", "metrics.json")
 """Every file that a press may write; those of an earlier press that a new one does not write are removed."""
 

@@ -22,8 +22,6 @@ from raytac.report.markers import draw_arrows
 from raytac.report.style import STYLE
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
-__all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
-
 DIFFERENCE_RANGE = 64
 """Grey levels (of 255) that the difference panel shows to full scale, in either direction; the same in every preview."""
 

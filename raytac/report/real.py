@@ -24,20 +24,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
-__all__ = [
-    "ABLATIONS",
-    "BOX_MARGIN",
-    "Ablation",
-    "RealSettings",
-    "compare_real",
-    "draw",
-    "noise_floor",
-    "press_scores",
-    "summary",
-    "table_text",
-]
-
-
 SHOWN = 3
 """Presses on the image sheet: in true colour, with their noise, more make a large file."""
 

@@ -29,8 +29,6 @@ from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
 from raytac.specs.sensor_file import lights_text, sensor_files
 
-__all__ = ["OUTLIER", "run_calibrate_optics"]
-
 FITTED = ("raytrace", "taxim", "mlp")
 """Models that photographs are fitted by; Phong's has nothing to fit."""
 OUTLIER = 2.0

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.optics.trace.tracer import Tracer
 
-__all__ = ["Tracers", "path_trace"]
-
 
 @dataclass(frozen=True)
 class Tracers:

@@ -24,17 +24,6 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticsConfig
     from raytac.physics.base import PhysicsConfig
 
-__all__ = [
-    "LARGEST_SIDE",
-    "checked_markers",
-    "checked_outputs",
-    "checked_resolution",
-    "press_scene",
-    "sensor_outputs",
-    "sensor_spec",
-    "warn_of_other_shape",
-]
-
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02

@@ -39,8 +39,6 @@ from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig
 
-__all__ = ["TactileSensor"]
-
 
 class TactileSensor:
     """A simulated GelSight sensor.

@@ -9,8 +9,6 @@ from typing import Final
 from raytac.specs.files import find_file
 from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml, split_unit
 
-__all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "PunchSpec", "load_marker_motion", "marker_motion_text"]
-
 
 @dataclass(frozen=True)
 class PunchSpec:

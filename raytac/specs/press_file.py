@@ -15,8 +15,6 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion, warn_of_crossings
 from raytac.specs.toml import Table, Text, in_mm, read_toml
 
-__all__ = ["load_press", "press_of", "validate_press"]
-
 _KIND = "kind"
 
 

@@ -8,8 +8,6 @@ from raytac.errors import SpecError
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
 
-__all__ = ["check_slab", "led_corners", "validate_sensor"]
-
 _COEFFICIENT = 5.0
 """Most that a coefficient of a colour shading may be, as in the file."""
 _LOG_GAIN = 20.0

@@ -17,16 +17,6 @@ from raytac.specs.mesh import load_mesh
 from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, in_mm, split_unit
 
-__all__ = [
-    "OBJECT_SCHEMA",
-    "check_params",
-    "check_quaternion",
-    "check_shape",
-    "resolved",
-    "unit_quaternion",
-    "warn_of_crossings",
-]
-
 _LENGTH = Number("(0, 100]")
 
 OBJECT_SCHEMA: Final[dict[str, Schema]] = {

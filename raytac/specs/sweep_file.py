@@ -11,8 +11,6 @@ from raytac.specs.sensor_file import load_sensor
 from raytac.specs.sweep import MARKER_NOISE_SCHEMA, RANDOMIZATION_SCHEMA, RANGE_SCHEMA, SWEEP_SCHEMA, PressRanges, SweepSpec
 from raytac.specs.toml import Table, read_toml
 
-__all__ = ["load_sweep"]
-
 
 def load_sweep(name_or_path: str | Path) -> SweepSpec:
     """Read and check a sweep, with the sensors and press scenes that it names.

@@ -24,8 +24,6 @@ from raytac.specs.task import (
 )
 from raytac.specs.toml import Schema, Table, Text, read_toml, split_unit
 
-__all__ = ["load_scene", "load_task"]
-
 _OWN: Final = {
     "panda_one_sensor": ("joints_deg",),
     "panda_two_fingers": ("joints_deg", "opening_mm"),

@@ -18,22 +18,6 @@ from typing import Any, Final
 from raytac.checks import Interval, is_number, is_whole
 from raytac.errors import SpecError
 
-__all__ = [
-    "ANY",
-    "REQUIRED",
-    "Flag",
-    "Integer",
-    "Number",
-    "Schema",
-    "Table",
-    "Text",
-    "Unit",
-    "check_fields",
-    "in_mm",
-    "read_toml",
-    "split_unit",
-]
-
 REQUIRED: Final = object()
 """Default of a field that a file must give."""
 ANY: Final = -1

@@ -16,8 +16,6 @@ from raytac.view.session import QUANTITIES, Control, PadView, Session, Snapshot
 if TYPE_CHECKING:
     from viser import GuiEvent, GuiSliderHandle, ViserServer
 
-__all__ = ["ARROW_SCALE", "Page", "picture"]
-
 _MODES = {
     "starting": "computing the first image …",
     "paused": "paused",

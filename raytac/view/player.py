@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from raytac.errors import InputError, RaytacError
 from raytac.view.session import Session, Snapshot
 
-__all__ = ["Player", "Status"]
-
 _FASTEST = 1.0 / 30.0
 """Least time between two states while playing [s]: no browser shows more, and a slow line is not flooded."""
 _SMOOTH = 0.8

@@ -31,8 +31,6 @@ from raytac.view.sensor_view import (
 )
 from raytac.view.session import CameraPlace, Control, Snapshot, Solid, check_targets, reaching
 
-__all__ = ["PressSession"]
-
 _STRIDE_MM, _TURN_DEG, _PUSH = 0.1, 2.0, 0.25
 """Largest change from one state to the next towards a slider's value: [mm], [degrees], [N]."""
 _NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twist": 0.1}

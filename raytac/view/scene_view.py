@@ -14,8 +14,6 @@ from raytac.view.session import PadView, Quantity, Session, Snapshot, round_up
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
 
-__all__ = ["ColourScale", "SceneView", "coloured_glb", "legend_html", "split_creases", "vertex_normals"]
-
 _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 

@@ -11,20 +11,6 @@ from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
 from raytac.view.session import Lines, Pad, PadView, Solid
 
-__all__ = [
-    "coat_edges",
-    "coat_lines",
-    "coat_pad",
-    "gel_solid",
-    "grid_faces",
-    "narrow_warning",
-    "pad_view",
-    "sensor_lines",
-    "sensor_solids",
-    "square",
-    "strided",
-]
-
 _MOST_VERTICES = 12_000
 """Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
 _CLEAR = 2e-5

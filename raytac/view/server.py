@@ -23,8 +23,6 @@ from raytac.errors import BackendError, InputError
 if TYPE_CHECKING:
     from viser import ViserServer
 
-__all__ = ["LARGEST", "BadMessage", "PageAddresses", "checked_message", "guarded_server", "one_line"]
-
 _LOG = logging.getLogger("raytac.view")
 _FAULTS = (CloseCode.PROTOCOL_ERROR, CloseCode.INVALID_DATA, CloseCode.MESSAGE_TOO_BIG)
 """Why websockets itself ends a connection whose other end breaks the protocol."""

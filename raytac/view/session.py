@@ -15,22 +15,6 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = [
-    "QUANTITIES",
-    "CameraPlace",
-    "Control",
-    "Lines",
-    "Pad",
-    "PadView",
-    "Quantity",
-    "Session",
-    "Snapshot",
-    "Solid",
-    "check_targets",
-    "reaching",
-    "round_up",
-]
-
 Colour = tuple[int, int, int]
 """8-bit sRGB."""
 

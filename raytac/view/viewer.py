@@ -13,8 +13,6 @@ from raytac.view.player import Player
 from raytac.view.server import PageAddresses
 from raytac.view.session import Session
 
-__all__ = ["Viewer", "check_address", "check_viewer"]
-
 _PATIENCE = 10.0
 """Longest wait at the end for the state that is being computed [s]; the thread is a daemon and ends with the program."""
 

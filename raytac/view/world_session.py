@@ -20,8 +20,6 @@ from raytac.view.session import CameraPlace, Colour, Control, Snapshot, Solid, c
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import WorldState
 
-__all__ = ["Steering", "WorldSession"]
-
 _SHOWN_GROUPS = 3
 """Geoms of MuJoCo's first groups are shown, as its own viewer does."""
 _PLANE = 1.5

@@ -20,8 +20,6 @@ from raytac.report.compare.metrics import known, resolutions, select, summaries
 from raytac.report.compare.run import Comparison
 from raytac.report.compare.store import Row
 
-__all__ = ["error_range", "signed_error", "write_pareto", "write_sheet_of_scene"]
-
 WIDTH_IN = 7.16
 """Width of two columns of an IEEE paper [in]."""
 STYLE: dict[Any, Any] = {

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from raytac.markers.calibration import ModelError
     from raytac.markers.calibration_presses import PressFrame
 
-__all__ = ["PAD", "MarkerErrors", "held_out_frames", "marker_error_metrics", "marker_errors"]
-
 PAD = "medium"
 """Level of the soft pad where none is asked for: the one that shipped marker motion was fitted to."""
 

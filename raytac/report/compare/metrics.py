@@ -15,19 +15,6 @@ from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
 
-__all__ = [
-    "EqualError",
-    "Summary",
-    "compare_metrics",
-    "cost_at",
-    "equal_errors",
-    "resolutions",
-    "select",
-    "spp_for_error",
-    "summaries",
-]
-
-
 KEYS = {"mae": "mae_levels", "rmse": "rmse_levels", "psnr": "psnr_db", "ssim": "ssim", "flip": "flip"}
 
 

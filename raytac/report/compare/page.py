@@ -12,8 +12,6 @@ from raytac.report.compare.metrics import compare_metrics, equal_errors, resolut
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
 
-__all__ = ["FILES", "report_html", "write_comparison", "write_parquet"]
-
 FILES = ("report.html", "pareto.png", "results.parquet", "metrics.json")
 """Files of every comparison, besides ``sheet_<scene>_<resolution>.png``, ``rows/`` and ``references/``."""
 TEMPLATE = "compare_report.html.j2"

@@ -13,8 +13,6 @@ from raytac.errors import BackendError
 from raytac.gel.surface import GelSurface
 from raytac.optics.base import OpticsImages
 
-__all__ = ["AWAY_MM", "PeerTaxim", "contact_height_map"]
-
 AWAY_MM = 5.0
 """Height above the gel that stands for no object [mm]."""
 

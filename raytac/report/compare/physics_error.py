@@ -18,8 +18,6 @@ from raytac.report.tracers import Tracers
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 
-__all__ = ["PhysicsError", "physics_errors", "physics_metrics"]
-
 
 @dataclass(frozen=True)
 class PhysicsError:

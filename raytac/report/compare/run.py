@@ -39,8 +39,6 @@ from raytac.specs import load_sensor
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
 
-__all__ = ["BATCH", "REGIONS", "Comparison", "run_comparison"]
-
 REGIONS = ("frame", "contact", "ring", "box")
 """Parts of an image over which errors are taken, as ``raytac.report.image_error.regions`` makes them."""
 BATCH = {"cpu": 8, "cuda": 64}

@@ -21,8 +21,6 @@ from raytac.io.seal import read_sealed, write_sealed
 from raytac.optics.trace.config import RayTraced
 from raytac.report.tracers import Tracers, path_trace
 
-__all__ = ["References", "Row", "RowStore", "row_key"]
-
 Value = str | int | float | bool | None
 
 
