@@ -75,11 +75,7 @@ class ShardRenderer:
         self._built: dict[tuple[int, int], _Built] = {}
 
     def prepare(self, shard: int = 0) -> None:
-        """Build what a shard needs, so that a machine that cannot render says so at once.
-
-        Raises:
-            BackendError: a renderer, solver or device does not work here.
-        """
+        """Build what a shard needs; ``BackendError`` if a renderer, solver or device does not work."""
         self._for(shard)
 
     def render(self, shard: int) -> ShardResult:

@@ -27,10 +27,7 @@ Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Give processes that start within one thread of BLAS each: small matrices gain nothing from more.
-
-    Many processes share the cores.
-    """
+    """Give processes that start within one thread of BLAS each; many processes share the cores."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
     try:

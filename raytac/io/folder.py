@@ -79,10 +79,7 @@ def _check_no_folders(out: Path, names: Iterable[str]) -> None:
 
 
 def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
-    """Move the files of ``work`` into ``out``.
-
-    If one cannot be moved, all that was there before goes back from ``old``.
-    """
+    """Move the files of ``work`` into ``out``; on an error all goes back as it was, from ``old``."""
     written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
     try:
         for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):

@@ -29,11 +29,7 @@ class CommonOptions:
 
 
 def parse_resolution(text: str) -> tuple[int, int]:
-    """``"320x240"`` to (width, height) [px].
-
-    Raises:
-        InputError: not two positive whole numbers joined by ``x``.
-    """
+    """``"320x240"`` to (width, height) [px]. Raises ``InputError`` for anything else."""
     sides = re.fullmatch(r"\s*0*([1-9]\d{0,8})\s*x\s*0*([1-9]\d{0,8})\s*", text, re.ASCII | re.IGNORECASE)
     if sides is None:
         raise InputError("resolution", value=text, rule="must be WIDTHxHEIGHT in pixels, as in 320x240")
@@ -56,10 +52,6 @@ def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) 
 
 
 def parse_outputs(text: str, choices: tuple[str, ...]) -> tuple[str, ...]:
-    """``"rgb,depth"`` to names in the order of ``choices``, each once.
-
-    Raises:
-        InputError: an unknown name, or none.
-    """
+    """Names joined by commas, in the order of ``choices``. Raises as ``parse_names``."""
     names = parse_names(text, "outputs", choices)
     return tuple(name for name in choices if name in names)

@@ -19,11 +19,7 @@ class SealError(ValueError):
 
 
 def write_sealed(path: Path, data: bytes) -> None:
-    """Write ``data`` and its digest as a whole; the folder is made if need be.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write ``data`` and its digest as a whole, and make the folder. Raises ``OSError``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, data + _digest(path, data))
 

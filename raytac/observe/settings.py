@@ -134,11 +134,7 @@ class Layout:
 
 
 def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
-    """Sizes of rendered and observed image.
-
-    Raises:
-        InputError: the rendered image would be larger than can be rendered.
-    """
+    """Sizes of rendered and observed image. Raises ``InputError`` if they are too large."""
     resolution = settings.resolution
     assert not isinstance(resolution, str)
     observed = sensor.camera.resolution if resolution is None else resolution

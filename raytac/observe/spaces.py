@@ -56,11 +56,7 @@ def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
 
 
 def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
-    """Arrays as a ``gymnasium.spaces.Dict`` of boxes.
-
-    Raises:
-        BackendError: Gymnasium is not installed.
-    """
+    """A ``Dict`` of boxes. Raises ``BackendError`` if Gymnasium is not installed."""
     try:
         from gymnasium import spaces
     except ImportError as error:

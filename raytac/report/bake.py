@@ -232,10 +232,7 @@ def table_errors(
 
 
 def error_metrics(errors: Mapping[str, Mapping[str, SceneError]]) -> dict[str, Metric]:
-    """Keys ``<family>.<scene>.psnr_box_db``, ``.contact_mae_levels``, ``.psnr_frame_db`` and ``.uncovered_share``.
-
-    A PSNR of equal images, which is infinite, and a share without contact are left out.
-    """
+    """``<family>.<scene>.<figure>`` of finite figures: not the PSNR of equal images, for one."""
     metrics: dict[str, Metric] = {}
     for family, by_scene in errors.items():
         for scene, error in by_scene.items():

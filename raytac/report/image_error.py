@@ -93,10 +93,7 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def contact_box(contact: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the contact's bounding box with ``margin`` [px] on each side.
-
-    It stays within the image, and is all of it without contact.
-    """
+    """Rows and columns of the contact and a ``margin`` [px] in the image; all without contact."""
     height, width = contact.shape
     if not contact.any():
         return slice(0, height), slice(0, width)

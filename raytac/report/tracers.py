@@ -27,10 +27,7 @@ class Tracers:
     built: dict[str, Any] = field(default_factory=dict)
 
     def get(self, size: tuple[int, int], config: RayTraced | None = None, outputs: tuple[str, ...] = ("rgb",)) -> Tracer:
-        """Ray tracer for images of ``size`` (width, height) [px].
-
-        Path tracers light all LEDs in one pass of three channels, which is all that a plain image needs.
-        """
+        """Ray tracer of images of ``size`` (width, height) [px]; path tracers have one layer."""
         return self.mode(size, RayTraced() if config is None else config, outputs)  # type: ignore[return-value]
 
     def mode(self, size: tuple[int, int], config: OpticsConfig[Any], outputs: tuple[str, ...] = ("rgb",)) -> OpticalMode:

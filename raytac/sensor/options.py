@@ -1,7 +1,4 @@
-"""Checks of a sensor's options, made before anything is computed.
-
-A message names the value, the rule and the choices.
-"""
+"""Checks of a sensor's options, made before anything is computed."""
 
 from __future__ import annotations
 

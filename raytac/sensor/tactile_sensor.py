@@ -396,19 +396,12 @@ class TactileSensor:
         return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where it is not.
-
-        None if the surface has no object.
-        """
+        """Underside of the loaded object [m], (B, Ny, Nx), inf beside it; None without an object."""
         return None if self._pad is None else self._pad.object_height(surface)
 
     @property
     def optical_mode(self) -> OpticalMode:
-        """The renderer, built on first use.
-
-        Raises:
-            RaytacError: as ``OpticsConfig.build``.
-        """
+        """The renderer, built on first use. Raises as ``OpticsConfig.build``."""
         mode = self._mode
         if mode is None:
             mode = self._mode = self.optics.build(

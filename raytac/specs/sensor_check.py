@@ -37,11 +37,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
 
 def check_slab(sensor: SensorSpec) -> None:
-    """Check that camera and LEDs lie in the air below the slab of ``refraction.model = "slab"``.
-
-    Raises:
-        SpecError: as ``validate_sensor``.
-    """
+    """Check that camera and LEDs lie below a slab that refracts. Raises as ``validate_sensor``."""
     if sensor.refraction.model != "slab":
         return
     _check_camera_behind(sensor)

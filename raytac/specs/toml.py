@@ -288,11 +288,7 @@ class Table:
         return SpecError(rule, file=self.file, key=self._dotted(key), value=value, choices=choices)
 
     def read_one(self, key: str, spec: Number | Integer | Text | Flag) -> Any:
-        """One field in SI, checked; the other keys of the table are left alone.
-
-        Raises:
-            SpecError: missing key, wrong type, or a value out of its range.
-        """
+        """One field in SI. Raises ``SpecError``: missing key, wrong type, value out of range."""
         _, unit = split_unit(key)
         if key not in self.data:
             if spec.default is REQUIRED:
@@ -337,11 +333,7 @@ class Table:
 
 
 def read_toml(path: Path) -> Table:
-    """The top table of a TOML file.
-
-    Raises:
-        SpecError: the file is missing, cannot be read, is longer than ``_LARGEST``, or is not TOML.
-    """
+    """The top table of a file. Raises ``SpecError``: missing, unreadable, too long, or no TOML."""
     try:
         with path.open("rb") as stream:
             text = stream.read(_LARGEST + 1)

@@ -67,10 +67,7 @@ class Player:
         self._thread.start()
 
     def close(self, patience: float | None = None) -> bool:
-        """End the thread after the state it is computing; True if it ended within ``patience`` seconds.
-
-        None waits however long it takes.
-        """
+        """End after the state that is computed; True if within ``patience`` [s] (None: any time)."""
         with self._wakeup:
             self._is_closing = True
             self._wakeup.notify()
@@ -93,11 +90,7 @@ class Player:
         self._order("reset")
 
     def drive(self, name: str, value: float) -> None:
-        """Take a control to ``value``.
-
-        Raises:
-            InputError: no control of that name.
-        """
+        """Take a control to ``value``. Raises ``InputError`` for an unknown control."""
         if name not in self._names:
             raise InputError("name", value=name, rule="must be a control of the session", choices=self._names)
         with self._wakeup:

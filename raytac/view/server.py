@@ -135,10 +135,7 @@ def _who(connection: ServerConnection) -> str:
 
 
 class _OneLine(logging.Filter):
-    """Logs faults of a connection in one line, without a traceback; a request that is no HTTP, or never comes, not at all.
-
-    Browsers open connections ahead that they then do not use.
-    """
+    """Logs faults of a connection in one line. Connections that browsers open ahead are none."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if record.msg == "opening handshake failed":

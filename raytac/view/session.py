@@ -195,11 +195,7 @@ class Session(Protocol):
         ...
 
     def drive(self, targets: Mapping[str, float]) -> None:
-        """Set where controls shall take the scene; ``advance`` goes there.
-
-        Raises:
-            RaytacError: a target that cannot be.
-        """
+        """Set where ``advance`` takes the controls. Raises ``RaytacError`` for what cannot be."""
         ...
 
     def advance(self) -> bool:

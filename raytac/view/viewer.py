@@ -18,11 +18,7 @@ _PATIENCE = 10.0
 
 
 def check_viewer() -> None:
-    """Say now, in one line, that the web server is missing.
-
-    Raises:
-        BackendError: viser is not installed.
-    """
+    """Raise ``BackendError`` if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
         raise BackendError('the viewer needs viser, and it is not installed: `pip install "raytac[view]"`')
 

@@ -32,10 +32,7 @@ _NEAREST, _FARTHEST = 0.12, 0.6
 
 
 class WorldSession:
-    """One environment of a world (see ``Session``).
-
-    A state that is shown is ``steps`` control steps after the last one: images cost more than steps.
-    """
+    """One environment of a world, shown every ``steps`` control steps: images cost most."""
 
     units_per_metre = 10.0
     is_driven_at_rest = False

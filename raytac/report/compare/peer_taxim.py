@@ -43,10 +43,7 @@ def contact_height_map(surface: GelSurface, size: tuple[int, int], width_mm: flo
 
 
 class PeerTaxim:
-    """``taxim`` with its own calibration of a domed GelSight; fulfils ``raytac.optics.base.OpticalMode``.
-
-    Its image shows another sensor than ours, so only its time compares.
-    """
+    """The package ``taxim`` with its own sensor, as an ``OpticalMode``: only its time compares."""
 
     def __init__(self, size: tuple[int, int], *, shadow: bool, device: str) -> None:
         """``size`` (width, height) [px]; ``device`` ``cpu`` or ``cuda``; on CUDA it needs a JAX that was built for it.

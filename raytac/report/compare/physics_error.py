@@ -21,10 +21,7 @@ from raytac.specs import load_press
 
 @dataclass(frozen=True)
 class PhysicsError:
-    """Differences of one press on both pads.
-
-    Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255].
-    """
+    """Differences of one press on both pads: RMS of height [µm], MAE of ``fast`` [levels of 255]."""
 
     scene: str
     resolution: str

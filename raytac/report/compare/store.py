@@ -104,10 +104,7 @@ class References:
         return hashlib.sha256(self._basis + surface.height.astype(np.float32).tobytes()).hexdigest()[:20]
 
     def halves(self, scene: str, surface: GelSurface) -> np.ndarray:
-        """Two linear images of ``spp`` / 2 samples a pixel with independent seeds, (2, H, W, 3) float32.
-
-        Read if they were computed before; a file that cannot be read is computed again.
-        """
+        """Two linear images of ``spp`` / 2 samples and independent seeds, (2, H, W, 3); read if kept."""
         path = self.folder / f"{scene}-{self.key(surface)}.npz"
         kept = self._read(path)
         if kept is not None:
