@@ -334,9 +334,10 @@ class EnvironmentPicture:
 
 
 def _enlarged(image: np.ndarray, height: int) -> np.ndarray:
+    """The image scaled to ``height`` [px]."""
     from PIL import Image
 
-    width = max(1, round(height * image.shape[1] / image.shape[0]))
+    width = max(1, round(image.shape[1] * height / len(image)))
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
 
 
@@ -346,9 +347,7 @@ def _column(panels: list[np.ndarray], height: int) -> np.ndarray:
 
     width = max(panel.shape[1] for panel in panels)
     sized = [Image.fromarray(p).resize((width, max(1, round(p.shape[0] * width / p.shape[1])))) for p in panels]
-    stacked = np.concatenate([np.asarray(image) for image in sized])
-    width = max(1, round(width * height / len(stacked)))
-    return np.asarray(Image.fromarray(stacked).resize((width, height), Image.Resampling.BILINEAR))
+    return _enlarged(np.concatenate([np.asarray(image) for image in sized]), height)
 
 
 def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -48,12 +48,9 @@ class _DictVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Attribute of the vector, repeated for every environment of ``indices``."""
-        return [self._attribute(attr_name)] * len(list(self._get_indices(indices)))
-
-    def _attribute(self, name: str) -> Any:
-        if name == "render_mode":
-            return None
-        raise AttributeError(name)
+        if attr_name != "render_mode":
+            raise AttributeError(attr_name)
+        return [None] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Raise ``InputError``: environments of one world share everything."""

@@ -170,18 +170,18 @@ def _check_markers(sensor: SensorSpec) -> None:
 def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     pad, back = sensor.gelpad, _back_face(sensor)
     half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
-    file, key, value = sensor.lights.source, f"led[{index}].position_mm", in_mm(led.position)
     for x, y, z in (led.position, *led_corners(led)):
-        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
-            rule = f"LED {led.name!r} lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
-            raise SpecError(rule, file=file, key=key, value=value)
         rest = -pad.sag(min(abs(x), half_x), min(abs(y), half_y))
-        if z > rest + _SLACK:
-            rule = f"LED {led.name!r} lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
-            raise SpecError(rule, file=file, key=key, value=value)
-        if not _in_case(sensor, (x, y, z)):
-            rule = f"LED {led.name!r}, {in_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
-            raise SpecError(rule, file=file, key=key, value=value)
+        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
+            rule = f" lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
+        elif z > rest + _SLACK:
+            rule = f" lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
+        elif not _in_case(sensor, (x, y, z)):
+            rule = f", {in_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
+        else:
+            continue
+        key = f"led[{index}].position_mm"
+        raise SpecError(f"LED {led.name!r}{rule}", file=sensor.lights.source, key=key, value=in_mm(led.position))
 
 
 def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:

@@ -68,15 +68,15 @@ def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> 
 
 def reaching(controls: Sequence[Control], places: Mapping[str, float]) -> tuple[Control, ...]:
     """The controls with ends moved out to a round number wherever something is beyond them, so that a slider can show it."""
-    return tuple(_reaching(control, places.get(control.name, control.low)) for control in controls)
-
-
-def _reaching(control: Control, place: float) -> Control:
-    if place > control.high + 0.5 * control.step:
-        return replace(control, high=round_up(place))
-    if place < control.low - 0.5 * control.step:
-        return replace(control, low=-round_up(-place))
-    return control
+    moved = []
+    for control in controls:
+        place = places.get(control.name, control.low)
+        if place > control.high + 0.5 * control.step:
+            control = replace(control, high=round_up(place))
+        elif place < control.low - 0.5 * control.step:
+            control = replace(control, low=-round_up(-place))
+        moved.append(control)
+    return tuple(moved)
 
 
 def round_up(value: float) -> float:

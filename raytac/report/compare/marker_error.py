@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from raytac.io.metrics import Metric
-from raytac.report.markers import error_metrics, press_all
+from raytac.report.markers import error_metrics
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -47,18 +47,6 @@ class MarkerErrors:
         """(model, its errors in the order of ``loads``, its time [ms]) of every model."""
         models = dict.fromkeys(row.model for row in self.errors)
         return [(name, [row for row in self.errors if row.model == name], self.times_ms[name]) for name in models]
-
-
-def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = False) -> list[PressFrame]:
-    """States of the presses that no fit sees, on the soft pad of level ``pad``; ``quick``: few of them.
-
-    Raises:
-        RaytacError: a press did not settle, or fits nowhere on this sensor.
-        BackendError: the solver cannot run here.
-    """
-    from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
-
-    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=True)
 
 
 def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, device: str) -> MarkerErrors:

@@ -24,7 +24,7 @@ from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
 from raytac.io.progress import Progress
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
-from raytac.report.compare.marker_error import MarkerErrors, held_out_frames, marker_errors
+from raytac.report.compare.marker_error import MarkerErrors, marker_errors
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
 from raytac.report.compare.settings import CompareSettings
@@ -117,8 +117,12 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
 
 
 def _marker_errors(settings: CompareSettings, device: str) -> MarkerErrors:
+    """Errors on presses that no fit sees; with ``quick`` on few of them."""
+    from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
+    from raytac.report.markers import press_all
+
     spec, pad = load_sensor(settings.sensor), settings.pad or ("coarse" if settings.quick else MARKER_PAD)
-    frames = held_out_frames(spec, pad=pad, device=device, quick=settings.quick)
+    frames = press_all(spec, QUICK_HELD_OUT if settings.quick else HELD_OUT, pad, device, progress=True)
     return marker_errors(spec, frames, pad=pad, device=device)
 
 
