@@ -190,10 +190,6 @@ def _no_denoiser() -> str:
     return "not installed: only denoise=True needs it" if absent else ""
 
 
-def _no_llvm() -> str:
-    return "" if llvm_library() else "no libLLVM found"
-
-
 PROBES = (
     Probe(
         "mitsuba-cuda", _TRACE.format(device="cuda"), False,
@@ -203,7 +199,7 @@ PROBES = (
     Probe(
         "mitsuba-llvm", _TRACE.format(device="cpu"), False,
         "pip install karellen-llvm-core, or set DRJIT_LIBLLVM_PATH to libLLVM 16 or newer (14 is refused, 15 may abort)",
-        _no_llvm,
+        lambda: "" if llvm_library() else "no libLLVM found",
     ),
     Probe(
         "denoiser", _DENOISER, False,

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from raytac.cli.shared import ShadowOptions
+from raytac.cli.shared import ShadowOptions, print_paths
 from raytac.io.options import CommonOptions, parse_names, parse_resolution
 from raytac.report.bake import run_bake
 from raytac.specs import load_sensor
-
-__all__ = ["BakeArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +43,7 @@ class BakeArgs(ShadowOptions, CommonOptions):
         sensor = replace(sensor, optics=replace(sensor.optics, **chosen))
         paths = run_bake(
             sensor,
-            self.out if self.out is not None else Path("runs") / "bake" / (sensor.name + ("-quick" if self.quick else "")),
+            self.folder("bake", sensor.name + ("-quick" if self.quick else "")),
             settings=BakeSettings.quick() if self.quick else BakeSettings(),
             scenes=parse_names(self.scenes, "scenes"),
             device=self.device,
@@ -54,6 +51,4 @@ class BakeArgs(ShadowOptions, CommonOptions):
             resolution=resolution,
             start=start,
         )
-        for path in paths:
-            print(path)
-        return 0
+        return print_paths(paths)

@@ -10,13 +10,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.shared import FitOptions, SolverOptions
+from raytac.cli.shared import FitOptions, SolverOptions, named, print_paths
 from raytac.errors import InputError
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
 from raytac.specs.press import PADS
-
-__all__ = ["CalibrateArgs"]
 
 _OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
 _OF_MARKERS = ("level", "quick", "verbose")
@@ -48,7 +46,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
-    level: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "medium"
+    level: Annotated[str, named(PADS)] = "medium"
     """Resolution of the soft pad's mesh."""
     quick: bool = False
     """Few presses: shows that all runs; a poor fit."""
@@ -60,20 +58,16 @@ class CalibrateArgs(FitOptions, SolverOptions):
             return self._optics(start)
         sensor = load_sensor(self.sensor)
         self.prepare_solver("calibrate markers")
-        name = sensor.name + ("-quick" if self.quick else "")
-        out = self.out if self.out is not None else Path("runs") / "calibrate" / "markers" / name
+        out = self.folder("calibrate", "markers", sensor.name + ("-quick" if self.quick else ""))
         try:
             written = run_calibrate_markers(
                 sensor, out, level=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )
         except KeyboardInterrupt:
-            print(
-                f"raytac: interrupted; finished presses are kept in {out}, the same command continues from there", file=sys.stderr
-            )
+            text = f"raytac: interrupted; finished presses are kept in {out}, the same command continues from there"
+            print(text, file=sys.stderr)
             return 130
-        for path in written:
-            print(path)
-        return 0
+        return print_paths(written)
 
     def _refuse_options_of_the_other(self) -> None:
         """An option that says nothing to what is fitted would else be passed over in silence."""
@@ -88,12 +82,11 @@ class CalibrateArgs(FitOptions, SolverOptions):
         from raytac.report.real_calibration import run_calibrate_optics
 
         sensor, presses, shots = self.read(Path(self.what), self.sensor)
-        out = self.out if self.out is not None else Path("runs") / "calibrate" / self.model / sensor.name
-        for path in run_calibrate_optics(
+        written = run_calibrate_optics(
             sensor,
             shots,
             presses.names,
-            out,
+            self.folder("calibrate", self.model, sensor.name),
             model=self.model,
             data=Path(self.what).name,
             holdout=self.holdout,
@@ -105,6 +98,5 @@ class CalibrateArgs(FitOptions, SolverOptions):
             device=self.device,
             seed=self.seed,
             start=start,
-        ):
-            print(path)
-        return 0
+        )
+        return print_paths(written)

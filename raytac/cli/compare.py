@@ -5,19 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from raytac.cli.shared import SolverOptions
+from raytac.cli.shared import SolverOptions, named, print_paths
 from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare.page import write_comparison
 from raytac.report.compare.run import run_comparison
 from raytac.report.compare.settings import CompareSettings
 from raytac.specs import PADS
-
-__all__ = ["CompareArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +35,7 @@ class CompareArgs(SolverOptions):
     """Timed frames a figure; fewer, at least three, for modes slower than 10 s together."""
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
-    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    level: Annotated[str | None, named(PADS)] = None
     """Also press into the soft pad of this level, and report what the rigid pad misses; needs raytac[ipc]. Left out if not given."""
     markers: bool = False
     """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the soft pad of the level
@@ -50,7 +45,7 @@ class CompareArgs(SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
-        out = self.out if self.out is not None else Path("runs") / "compare"
+        out = self.folder("compare")
         settings = self.settings()
         settings.check()
         if settings.uses_solver:
@@ -61,17 +56,14 @@ class CompareArgs(SolverOptions):
         except KeyboardInterrupt:
             print(f"raytac: interrupted; finished rows are kept in {out}, the same command continues from there", file=sys.stderr)
             return 130
-        for path in written:
-            print(path)
-        return 0
+        return print_paths(written)
 
     def settings(self) -> CompareSettings:
         """Settings that the options mean. Raises InputError for names or numbers that cannot be read."""
-        scenes = parse_names(self.scenes, "scenes")
         sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
         chosen = CompareSettings(
             sensor=self.sensor,
-            scenes=scenes,
+            scenes=parse_names(self.scenes, "scenes"),
             resolutions=sizes,
             device=self.device,
             seed=self.seed,

@@ -9,9 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shared import FitOptions
-
-__all__ = ["CompareRealArgs"]
+from raytac.cli.shared import FitOptions, print_paths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +53,5 @@ class CompareRealArgs(FitOptions):
             device=self.device,
             seed=self.seed,
         )
-        out = self.out if self.out is not None else Path("runs") / "compare-real" / sensor.name
-        for path in compare_real(sensor, presses, shots, out, settings, began=began):
-            print(path)
-        return 0
+        out = self.folder("compare-real", sensor.name)
+        return print_paths(compare_real(sensor, presses, shots, out, settings, began=began))

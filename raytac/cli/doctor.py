@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from raytac.doctor import diagnose
 
-__all__ = ["DoctorArgs"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorArgs:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics
+from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics, named, print_paths
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKERS
@@ -18,8 +18,6 @@ from raytac.physics import PHYSICS
 from raytac.report.press import run_press
 from raytac.sensor import TactileSensor, sensor_outputs
 from raytac.specs import PADS, press_of
-
-__all__ = ["PressArgs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,29 +37,29 @@ class PressArgs(ShadowOptions, SolverOptions):
     """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
+    physics: Annotated[str | None, named(PHYSICS.names)] = None
     """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact and friction; needs raytac[ipc]). If not
     given, as the scene says, else rigid."""
-    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
+    optics: Annotated[str, named(OPTICS.names)] = "raytrace"
     """Optical mode: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or mlp (a
     network, which weights must give). The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None
     """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
     weights: Path | None = None
     """mlp: folder of raytac calibrate DATASET --model mlp."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    markers: Annotated[str | None, named(MARKERS.names)] = None
     """Model that moves the sensor's markers; surface needs physics ipc. The sensor must have markers, as gelsight_mini_7x9 has. Writes
     markers.npz, and images show the dots. None if not given."""
-    integrator: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(INTEGRATORS) + "}")] = None
+    integrator: Annotated[str | None, named(INTEGRATORS)] = None
     """raytrace: fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare);
     fast if not given."""
     spp: int | None = None
     """raytrace. fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
-    outputs: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(OUTPUTS) + "}")] = None
+    outputs: Annotated[str | None, named(OUTPUTS)] = None
     """Outputs to compute, joined by commas: rgb, layers (raytrace only), normals, depth, height, wrench, traction. All if not given."""
 
     def run(self) -> int:
@@ -85,16 +83,10 @@ class PressArgs(ShadowOptions, SolverOptions):
             seed=self.seed,
             markers=self.markers,
         )
-        out = self.out if self.out is not None else Path("runs") / "press" / self._folder(scene.name, PHYSICS.name_of(physics))
-        for path in run_press(sensor, scene, out, outputs=outputs, start=start, progress=True):
-            print(path)
-        return 0
-
-    def _folder(self, scene: str, physics: str) -> str:
-        """Name of the folder: presses that differ in physics or optics do not replace each other."""
-        return "-".join(
-            [scene, *([physics] if physics != "rigid" else []), *([self.optics] if self.optics != "raytrace" else [])]
-        )
+        # Presses that differ in physics or optics do not replace each other.
+        others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]
+        out = self.folder("press", "-".join([scene.name, *others]))
+        return print_paths(run_press(sensor, scene, out, outputs=outputs, start=start, progress=True))
 
     def _optics(self) -> OpticsConfig[Any]:
         """Configuration of the optical mode, with every option that was given as its field."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -21,12 +22,22 @@ from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
-__all__ = ["FROM_SCRATCH", "OWN_LEDS", "FitOptions", "ShadowOptions", "SolverOptions", "chosen_physics", "read_data"]
-
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
 lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
 OWN_LEDS = "own"
+
+
+def named(names: Iterable[str]) -> object:
+    """Names as the help shows the values of an option: ``{rigid,ipc}``."""
+    return tyro.conf.arg(metavar="{" + ",".join(names) + "}")
+
+
+def print_paths(paths: Iterable[Path]) -> int:
+    """Print the files written, one a line; returns the exit code of success."""
+    for path in paths:
+        print(path)
+    return 0
 
 
 def read_data(
@@ -81,11 +92,7 @@ class FitOptions(CommonOptions):
 
     @property
     def chosen_prior(self) -> str | None:
-        """``--prior``: None is ``INNER``.
-
-        Raises:
-            InputError: neither that nor a name of ``STRENGTHS``.
-        """
+        """``--prior``; None is ``INNER``. Raises ``InputError`` for no name of ``STRENGTHS``."""
         if self.prior not in (INNER, *STRENGTHS):
             raise InputError("prior", value=self.prior, rule="must be a known strength", choices=(INNER, *STRENGTHS))
         return None if self.prior == INNER else self.prior
@@ -117,11 +124,7 @@ class SolverOptions(CommonOptions):
     """Let Warp, on which the contact solver runs, list devices and the kernels that it loads; warnings and errors only if not given."""
 
     def prepare_solver(self, user: str) -> None:
-        """Call before the solver is first used; ``user`` is what needs it.
-
-        Raises:
-            BackendError: the solver is not installed.
-        """
+        """Call before ``user`` first uses the solver. Raises ``BackendError`` if it is missing."""
         check_solver(user)
         if not self.verbose:
             quiet_solver()
@@ -137,11 +140,7 @@ class ShadowOptions:
     """Cast none; as the sensor file says ([optics] shadows) if neither is given."""
 
     def chosen_shadows(self) -> dict[str, bool]:
-        """``{"shadows": …}`` for the optical mode; empty if the sensor decides.
-
-        Raises:
-            InputError: both flags.
-        """
+        """``{"shadows": …}``; empty if the sensor decides. Raises ``InputError`` for both flags."""
         if self.shadows and self.no_shadows:
             raise InputError("shadows, no_shadows", value=(True, True), rule="contradict each other: give one")
         return {"shadows": self.shadows} if self.shadows or self.no_shadows else {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from raytac.checks import check_whole
-from raytac.cli.shared import ShadowOptions, chosen_physics
+from raytac.cli.shared import ShadowOptions, chosen_physics, named
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
@@ -24,8 +24,6 @@ from raytac.specs.task import COUPLINGS
 if TYPE_CHECKING:
     from raytac.specs.sensor import SensorSpec
     from raytac.view.session import Session
-
-__all__ = ["ViewArgs"]
 
 _OUTPUTS = ("rgb", "wrench", "traction")
 _LONGEST = 320
@@ -44,16 +42,16 @@ class ViewArgs(ShadowOptions):
     """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
     sensor: str | None = None
     """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
-    physics: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PHYSICS.names) + "}")] = None
+    physics: Annotated[str | None, named(PHYSICS.names)] = None
     """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements; needs raytac[ipc]). If not given, as the scene says,
     else rigid."""
-    level: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = None
+    level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
-    optics: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(OPTICS.names) + "}")] = "raytrace"
+    optics: Annotated[str, named(OPTICS.names)] = "raytrace"
     """Optical mode: raytrace, taxim (a table, baked at first use: minutes) or phong."""
-    markers: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(MARKERS.names) + "}")] = None
+    markers: Annotated[str | None, named(MARKERS.names)] = None
     """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
-    coupling: Annotated[str | None, tyro.conf.arg(metavar="{" + ",".join(COUPLINGS) + "}")] = None
+    coupling: Annotated[str | None, named(COUPLINGS)] = None
     """Coupling of soft pads to a task's robot: two_way if their forces act back on it. As the task says if not given."""
     steps: int | None = None
     """Control steps of a task from one shown state to the next; 1 if not given, 4 with rigid pads without markers."""
@@ -89,10 +87,8 @@ class ViewArgs(ShadowOptions):
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")
-            print(
-                f"raytac: open {viewer.url} (elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST); Ctrl-C ends",
-                flush=True,
-            )
+            elsewhere = f"elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST"
+            print(f"raytac: open {viewer.url} ({elsewhere}); Ctrl-C ends", flush=True)
             try:
                 while True:
                     time.sleep(3600.0)
@@ -107,14 +103,7 @@ class ViewArgs(ShadowOptions):
             if value is not None:
                 raise InputError(name, value=value, rule=f"is a setting of tasks; {scene.name!r} is a press")
         spec = sensor_spec(self.sensor or "gelsight_mini")
-        sensor = TactileSensor(
-            spec,
-            physics=physics,
-            outputs=_OUTPUTS,
-            seed=self.seed,
-            **self._settings(spec),
-        )
-        return PressSession(sensor, scene)
+        return PressSession(TactileSensor(spec, physics=physics, **self._settings(spec)), scene)
 
     def _task(self, scene: TaskScene, physics: PhysicsConfig) -> Session:
         from raytac.view.world_session import WorldSession
@@ -124,14 +113,8 @@ class ViewArgs(ShadowOptions):
             check_whole("steps", self.steps)
         if self.sensor is not None:
             scene = replace(scene, robot=replace(scene.robot, sensor=self.sensor))
-        world = TactileWorld(
-            scene,
-            physics=physics,
-            coupling=self.coupling,
-            outputs=_OUTPUTS,
-            seed=self.seed,
-            **self._settings(sensor_spec(scene.robot.sensor)),
-        )
+        settings = self._settings(sensor_spec(scene.robot.sensor))
+        world = TactileWorld(scene, physics=physics, coupling=self.coupling, **settings)
         return WorldSession(world, steps=self.steps or (4 if not physics.is_simulated and self.markers is None else 1))
 
     def _settings(self, sensor: SensorSpec) -> dict[str, Any]:
@@ -140,6 +123,8 @@ class ViewArgs(ShadowOptions):
             "markers": self.markers,
             "resolution": _fitting(sensor.camera.resolution) if self.resolution is None else parse_resolution(self.resolution),
             "device": self.device,
+            "outputs": _OUTPUTS,
+            "seed": self.seed,
         }
 
 

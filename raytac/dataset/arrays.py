@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-__all__ = ["ARRAYS", "COLUMNS", "DATASET_OUTPUTS", "SHARED", "ArrayKind", "Column"]
-
 DATASET_OUTPUTS = ("rgb", "normals", "depth", "height", "contact", "wrench", "traction")
 """Names that ``outputs`` of a sweep accepts."""
 

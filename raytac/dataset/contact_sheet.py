@@ -13,8 +13,6 @@ from raytac.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["contact_figure", "contact_sheet"]
-
 _WIDE, _HIGH, _DPI = 1.75, 1.4, 100
 """Size of a panel [inch], and pixels to an inch."""
 _BAR = 5e-3
@@ -31,9 +29,7 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 
 
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
-    """Figure of the first ``count`` presses, row by row.
-
-    Each shows its number, object and depth, the image, and under it the indentation of the whole pad.
+    """Figure of the first ``count`` presses: number, object, depth, image and indentation of the pad.
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 
@@ -64,13 +60,13 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
             if name == "rgb":
                 axis.imshow(data[i]["rgb"])
                 pixel = data.description["sensors"][data.manifest["sensor"][i].as_py()]["pixel_m"][0]
-                _bar(axis, _BAR / pixel, "white")
+                _bar(axis, _BAR / pixel)
             else:
                 shared = data.shared(i)
                 x, y = 1e3 * shared["grid_x"], 1e3 * shared["grid_y"]
                 extent = (x[0], x[-1], y[-1], y[0])
                 maps = axis.imshow(1e3 * dents[i], extent=extent, cmap="cividis", vmin=0.0, vmax=1e3 * deepest or 1.0)
-                _bar(axis, 1e3 * _BAR, "white")
+                _bar(axis, 1e3 * _BAR)
     if maps is not None:
         bar = figure.colorbar(maps, ax=list(axes.flat), shrink=0.6, aspect=30, pad=0.01, extend="min")
         bar.set_label("indentation [mm]", fontsize=9)
@@ -88,17 +84,10 @@ def _dent(data: PressDataset, i: int) -> np.ndarray:
     return data.shared(i)["rest_height"].astype(float) - data[i]["height"]
 
 
-def _bar(axis: Any, length: float, colour: str) -> None:
-    """A scale bar of ``_BAR``, ``length`` in the axis' own unit, in the lower left corner."""
+def _bar(axis: Any, length: float) -> None:
+    """A white scale bar of ``_BAR``, ``length`` in the axis' own unit, in the lower left corner."""
     (x_low, x_high), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     x, y = x_low + 0.05 * (x_high - x_low), bottom + 0.07 * (top - bottom)
-    axis.plot([x, x + length], [y, y], color=colour, linewidth=2.0, solid_capstyle="butt", label="scale bar")
-    axis.text(
-        x + 0.5 * length,
-        y + 0.03 * (top - bottom),
-        f"{1e3 * _BAR:g} mm",
-        color=colour,
-        fontsize=7,
-        ha="center",
-        va="bottom",
-    )
+    axis.plot([x, x + length], [y, y], color="white", linewidth=2.0, solid_capstyle="butt", label="scale bar")
+    middle, above = x + 0.5 * length, y + 0.03 * (top - bottom)
+    axis.text(middle, above, f"{1e3 * _BAR:g} mm", color="white", fontsize=7, ha="center", va="bottom")

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from raytac.dataset.arrays import ARRAYS, COLUMNS, SHARED
+from raytac.dataset.arrays import ARRAYS, COLUMNS, SHARED, ArrayKind
 from raytac.dataset.plan import DatasetPlan
 from raytac.dataset.shard import ShardRecord, sha256_of
 from raytac.errors import InputError
 from raytac.io.atomic import read_regular, write_atomic
-
-__all__ = ["FILE", "FORMAT_VERSION", "describe", "read_description", "write_description"]
 
 FILE = "dataset.json"
 FORMAT_VERSION = 1
@@ -67,15 +65,9 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
         "shards": plan.shards,
         "manifest_sha256": sha256_of(manifest) if manifest is not None else "",
         "frame": _FRAME,
-        "arrays": {
-            name: {"dtype": array.dtype, "shape": ["N", *array.shape], "unit": array.unit, "meaning": array.meaning}
-            for name, array in ARRAYS.items()
-            if name in kept
-        },
+        "arrays": {name: _declared(array, "N") for name, array in ARRAYS.items() if name in kept},
         "arrays_of_a_shard": {
-            name: {"dtype": array.dtype, "shape": list(array.shape), "unit": array.unit, "meaning": array.meaning}
-            for name, array in SHARED.items()
-            if array.is_kept(plan.sweep.outputs, False)
+            name: _declared(array) for name, array in SHARED.items() if array.is_kept(plan.sweep.outputs, False)
         },
         "columns": {name: {"type": c.type, "unit": c.unit, "meaning": c.meaning} for name, c in COLUMNS.items()},
         "sensors": sensors,
@@ -83,6 +75,10 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
         "plan_sha256": plan.digest,
         "plan": plan.description,
     }
+
+
+def _declared(array: ArrayKind, *first: str) -> dict[str, Any]:
+    return {"dtype": array.dtype, "shape": [*first, *array.shape], "unit": array.unit, "meaning": array.meaning}
 
 
 def write_description(folder: Path, description: dict[str, Any]) -> None:

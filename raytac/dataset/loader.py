@@ -16,8 +16,6 @@ from raytac.dataset.manifest import read_manifest
 from raytac.dataset.shard import FOLDER, is_shard_file, open_shard
 from raytac.errors import InputError
 
-__all__ = ["PressDataset", "open_shard"]
-
 
 class PressDataset:
     """Sound presses of a data set; what ``torch.utils.data.DataLoader`` takes as a map-style data set, without PyTorch.
@@ -55,18 +53,16 @@ class PressDataset:
         """
         self.folder, self.description = Path(folder), read_description(Path(folder))
         if verify and not self.description["complete"]:
-            raise InputError(
-                "data set", value=self.folder, rule="is not complete: the command that renders it goes on with the rest"
-            )
+            rule = "is not complete: the command that renders it goes on with the rest"
+            raise InputError("data set", value=self.folder, rule=rule)
         table = read_manifest(self.folder, self.description["manifest_sha256"] if verify else None)
         keep = np.asarray(table["status"].to_pylist()) == "ok"
         self._files = _shard_files(self.folder, table.filter(keep), self.description["sensors"])
         self._verify = verify
         if sensor is not None:
-            if sensor not in self.description["sensors"]:
-                raise InputError(
-                    "sensor", value=sensor, rule="must be in the data set", choices=tuple(self.description["sensors"])
-                )
+            known = tuple(self.description["sensors"])
+            if sensor not in known:
+                raise InputError("sensor", value=sensor, rule="must be in the data set", choices=known)
             keep &= np.asarray(table["sensor"].to_pylist()) == sensor
         self.manifest = table.filter(keep)
         arrays = tuple(self.description["arrays"])

@@ -13,8 +13,6 @@ from raytac.dataset.shard import ShardRecord
 from raytac.errors import BackendError, InputError
 from raytac.io.atomic import read_regular, write_atomic
 
-__all__ = ["FILE", "check_pyarrow", "read_manifest", "write_manifest"]
-
 FILE = "manifest.parquet"
 REQUIRED = ("index", "status", "shard", "row", "sensor", "shard_sha256")
 """Columns that say where a press is, and never are empty."""

@@ -22,8 +22,7 @@ from raytac.observe import Randomization, randomised_sensor
 from raytac.physics.registry import scene_physics
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
-
-__all__ = ["DatasetPlan", "Presses", "press_scene_of"]
+from raytac.specs.toml import in_mm
 
 _DRAWS = 10
 """Uniform numbers that every press draws, used or not: a range that changes changes no other value."""
@@ -69,10 +68,7 @@ class Presses:
         axis = np.stack([np.zeros_like(azimuth), -np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=1)
         a = np.cos(lean)[:, None] * np.array([1.0, 0.0, 0.0, 0.0]) + np.sin(lean)[:, None] * axis
         w, z = np.cos(half), np.sin(half)
-        return np.stack(
-            [a[:, 0] * w, a[:, 1] * w + a[:, 2] * z, a[:, 2] * w - a[:, 1] * z, a[:, 0] * z],
-            axis=1,
-        )
+        return np.stack([a[:, 0] * w, a[:, 1] * w + a[:, 2] * z, a[:, 2] * w - a[:, 1] * z, a[:, 0] * z], axis=1)
 
 
 class DatasetPlan:
@@ -192,13 +188,8 @@ class DatasetPlan:
     def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] = ARRAYS) -> dict[str, tuple[int, ...]]:
         """Shape of every array of one press into a sensor, by name; with ``SHARED`` of those that a shard holds once."""
         width, height = self.resolution(sensor)
-        sizes = {
-            "H": height,
-            "W": width,
-            "Ny": self.grid(sensor).shape[0],
-            "Nx": self.grid(sensor).shape[1],
-            "M": sensor.markers.rows * sensor.markers.columns,
-        }
+        rows, columns = self.grid(sensor).shape
+        sizes = {"H": height, "W": width, "Ny": rows, "Nx": columns, "M": sensor.markers.rows * sensor.markers.columns}
         markers = self.sweep.markers is not None
         kept = {name: array for name, array in kinds.items() if array.is_kept(self.sweep.outputs, markers)}
         return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kept.items()}
@@ -232,14 +223,13 @@ class DatasetPlan:
     def description(self) -> dict[str, Any]:
         """All that the presses depend on but code and device, as plain values without any path."""
         sweep = self.sweep
-        plain = {
-            f.name: getattr(sweep, f.name)
-            for f in fields(sweep)
-            if f.name not in ("sensors", "objects", "source", "ranges", "name")
-        }
         facts = {
-            **plain,
-            "press": {f.name: list(getattr(sweep.ranges, f.name)) for f in fields(sweep.ranges)},
+            **{
+                name: value
+                for name, value in vars(sweep).items()
+                if name not in ("sensors", "objects", "source", "ranges", "name")
+            },
+            "press": {name: list(ends) for name, ends in vars(sweep.ranges).items()},
             "sensors": {s.name: _sensor_digest(s) for s in sweep.sensors},
             "objects": {scene.name: _object_of(scene) for scene in sweep.objects},
         }
@@ -270,10 +260,7 @@ class DatasetPlan:
                 raise self._error(f"{axis}_mm", ends, rule)
 
     def _check_markers(self, sensor: SensorSpec) -> None:
-        """Refuse shifts and turns of the pattern that take a marker out of the view.
-
-        They are refused here, before the press that draws them.
-        """
+        """Refuse shifts and turns of the pattern that take a marker out of the view, before one is drawn."""
         largest = self.randomization.markers
         if self.sweep.markers is not None and largest.moves_pattern:
             ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])
@@ -281,7 +268,7 @@ class DatasetPlan:
             MarkerPattern.of(sensor, self.resolution(sensor), shift=shift, turn=turn)
 
     def _error(self, key: str, ends: tuple[float, float], rule: str) -> RaytacError:
-        return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=[float(f"{v * 1e3:.6g}") for v in ends])
+        return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=in_mm(ends))
 
 
 def press_scene_of(scene: PressScene, ranges: Any) -> PressScene:

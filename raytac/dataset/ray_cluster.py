@@ -17,8 +17,6 @@ from raytac.checks import check_whole
 from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.errors import BackendError, RaytacError
 
-__all__ = ["render_on_ray"]
-
 _ATTEMPTS = 3
 """Times that a shard is begun before it is given up: what kills its worker each time is the shard."""
 
@@ -104,9 +102,8 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
     count = min(count, max(len(waiting), 1))
     settings = {"num_cpus": 1, "num_gpus": 1 if gpus else 0, "max_restarts": -1, "max_task_retries": 0}
     Worker = ray.remote(**settings)(_Worker)
-    local_job = replace(
-        job, device=job.device if gpus else "cpu"
-    )  # by value: what Ray starts again must not depend on an object's life
+    # By value: what Ray starts again must not depend on an object's life.
+    local_job = replace(job, device=job.device if gpus else "cpu")
     actors = [Worker.options(scheduling_strategy="SPREAD").remote(local_job) for _ in range(count)]
     # One before the others: it may bake a table, which those on its machine then find.
     for some in (actors[:1], actors[1:]) if waiting else ():
@@ -138,9 +135,8 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
         except ray.exceptions.RayActorError as error:
             if shard is None:
                 if not running:
-                    raise BackendError(
-                        f"no worker is left ({error}); run again to go on with the shards that are missing"
-                    ) from error
+                    text = f"no worker is left ({error}); run again to go on with the shards that are missing"
+                    raise BackendError(text) from error
                 text = f"a worker died each time it came back: the others go on without it ({error})"
                 warnings.warn(text, RuntimeWarning, stacklevel=2)
                 continue
@@ -162,6 +158,5 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
         give(actor)
         yield result
     if lost:
-        raise BackendError(
-            f"shards {lost}: their workers died {_ATTEMPTS} times each; all others are done, run again to try these once more"
-        )
+        text = f"their workers died {_ATTEMPTS} times each; all others are done, run again to try these once more"
+        raise BackendError(f"shards {lost}: {text}")

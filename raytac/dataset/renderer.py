@@ -20,8 +20,6 @@ from raytac.physics import NarrowContactWarning
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, SensorSpec
 
-__all__ = ["RenderJob", "ShardRenderer", "ShardResult"]
-
 _KEPT = 4
 """Sensors that a worker keeps built; each holds a renderer's scene."""
 _UNSETTLED = "the press did not settle, or its state is not finite"
@@ -77,11 +75,7 @@ class ShardRenderer:
         self._built: dict[tuple[int, int], _Built] = {}
 
     def prepare(self, shard: int = 0) -> None:
-        """Build what a shard needs, so that a machine that cannot render says so at once.
-
-        Raises:
-            BackendError: a renderer, solver or device does not work here.
-        """
+        """Build what a shard needs; ``BackendError`` if a renderer, solver or device does not work."""
         self._for(shard)
 
     def render(self, shard: int) -> ShardResult:
@@ -136,10 +130,7 @@ class ShardRenderer:
     # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, of which the first are the presses, and why each failed.
-
-        The reason is empty for a press that succeeded.
-        """
+        """Frame of B environments, the first of which are the presses, and why each failed (or "")."""
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():
@@ -195,12 +186,10 @@ class ShardRenderer:
         return ""
 
     def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
-        arrays: dict[str, Any] = {
-            name: getattr(frame, name) for name in self.plan.sweep.outputs if name not in ("rgb", "contact")
-        }
-        surface = frame.surface
+        outputs, surface = self.plan.sweep.outputs, frame.surface
+        arrays: dict[str, Any] = {name: getattr(frame, name) for name in outputs if name not in ("rgb", "contact")}
         arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
-        if "contact" in self.plan.sweep.outputs:
+        if "contact" in outputs:
             arrays["contact"] = surface.contact
         if "rgb" in frame.outputs:
             arrays["rgb"] = self._drifted(built, frame.rgb, presses)

@@ -10,20 +10,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from raytac.checks import check_known, check_whole
 from raytac.dataset.describe import FILE, describe, read_description, write_description
+from raytac.dataset.manifest import FILE as MANIFEST
 from raytac.dataset.manifest import check_pyarrow, write_manifest
 from raytac.dataset.plan import DatasetPlan
 from raytac.dataset.ray_cluster import render_on_ray
 from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
-from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore
+from raytac.dataset.shard import FOLDER, ShardRecord, ShardStore, sha256_of
 from raytac.errors import InputError
 from raytac.io.folder import FolderLock
 from raytac.io.progress import Progress
-
-__all__ = ["ENGINES", "Check", "RunReport", "render_dataset", "render_here", "verify_dataset"]
 
 _SPARE = 1.05
 """The estimated size must fit this many times on the disk."""
@@ -106,9 +104,8 @@ def render_dataset(
         job = RenderJob(plan, device, batch)
         start, done, first = time.perf_counter(), 0, None
         if missing:
-            results = (
-                render_here(job, missing) if engine == "local" else render_on_ray(job, missing, workers=workers, address=address)
-            )
+            on_ray = engine == "ray"
+            results = render_on_ray(job, missing, workers=workers, address=address) if on_ray else render_here(job, missing)
             total = sum(len(record.rows) for record in records.values())
             with Progress(desc="render", total=plan.sweep.count, initial=total, unit="press", show=progress) as bar:
                 for result in results:
@@ -135,9 +132,6 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     Raises:
         InputError: no data set, or one whose manifest differs from its checksum.
     """
-    from raytac.dataset.manifest import FILE as MANIFEST
-    from raytac.dataset.shard import sha256_of
-
     description = read_description(folder)
     manifest = Path(folder) / MANIFEST
     if description["complete"] and (not manifest.is_file() or sha256_of(manifest) != description["manifest_sha256"]):
@@ -153,8 +147,8 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
 
 def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
     """Records of the shards that are there and whole."""
-    records, there = {}, store.present()
-    for shard in Progress(there, desc="check", unit="shard", show=progress, leave=False):
+    records = {}
+    for shard in Progress(store.present(), desc="check", unit="shard", show=progress, leave=False):
         record = store.read(shard)
         if isinstance(record, ShardRecord):
             records[shard] = record
@@ -178,15 +172,11 @@ def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
         raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
     description = read_description(folder)
     if description["plan_sha256"] != plan.digest:
-        changed = _differences(description["plan"], plan.description)
-        rule = (
-            f"holds another data set, which differs in {', '.join(changed) or 'its version'}: choose another folder, or remove it"
-        )
+        old, new = description["plan"], plan.description
+        changed = [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
+        differs = ", ".join(changed) or "its version"
+        rule = f"holds another data set, which differs in {differs}: choose another folder, or remove it"
         raise InputError("out", value=folder, rule=rule)
-
-
-def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    return [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
 
 
 def _check_room(folder: Path, plan: DatasetPlan, records: dict[int, ShardRecord], say: Callable[[str], object]) -> None:

@@ -1,7 +1,4 @@
-"""Shards on disk: one ``.npz`` of arrays and one ``.json`` of rows each, checked by SHA-256.
-
-They are written as a whole or not at all.
-"""
+"""Shards on disk: a whole ``.npz`` of arrays and a ``.json`` of rows each, checked by SHA-256."""
 
 from __future__ import annotations
 
@@ -22,8 +19,6 @@ from raytac.dataset.renderer import Row, ShardResult
 from raytac.errors import InputError
 from raytac.io.arrays import npz_bytes
 from raytac.io.atomic import PARTIAL, open_regular, read_regular, write_atomic
-
-__all__ = ["FOLDER", "KINDS", "ShardRecord", "ShardStore", "is_shard_file", "open_shard", "sha256_of"]
 
 FOLDER = "shards"
 """Folder of the shards in a data set."""
@@ -60,18 +55,10 @@ class ShardStore:
             write_atomic(arrays, data)
         else:
             arrays.unlink(missing_ok=True)
-        record = ShardRecord(
-            result.shard, file, hashlib.sha256(data).hexdigest() if data else "", len(data), result.rows, result.made_by
-        )
-        kept = {
-            "plan_sha256": self._plan,
-            "file": file,
-            "sha256": record.sha256,
-            "bytes": record.bytes,
-            "made_by": record.made_by,
-            "rows_sha256": _rows_digest(record.rows),
-            "rows": record.rows,
-        }
+        sha256 = hashlib.sha256(data).hexdigest() if data else ""
+        record = ShardRecord(result.shard, file, sha256, len(data), result.rows, result.made_by)
+        kept = {"plan_sha256": self._plan, **{name: getattr(record, name) for name in ("file", "sha256", "bytes", "made_by")}}
+        kept |= {"rows_sha256": _rows_digest(record.rows), "rows": record.rows}
         write_atomic(self._path(result.shard, "json"), (json.dumps(kept, allow_nan=False) + "\n").encode())
         return record
 

@@ -22,8 +22,6 @@ from raytac.se3 import pose_error, rotations
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import BatchController
 
-__all__ = ["ACTIONS", "ActionControl"]
-
 ACTIONS = ("pose", "joints")
 """``pose``: an action moves the target of the tool's pose, in the axes of the task. ``joints``: it moves the targets of the arm's seven
 joints, by up to ``Motion.joint_step`` a step, and the opening if there is one."""

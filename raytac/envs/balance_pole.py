@@ -10,8 +10,6 @@ from raytac.envs.environments import TactileEnv, TactileVectorEnv
 from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances
 from raytac.se3 import pose, rotations
 
-__all__ = ["BalancePole", "BalancePoleEnv", "BalancePoleVectorEnv"]
-
 
 class BalancePole(Task):
     """Rules of ``BalancePoleEnv``, as code."""

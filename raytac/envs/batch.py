@@ -24,8 +24,6 @@ from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
 
-__all__ = ["StepResult", "TaskBatch", "VariationSampler"]
-
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s] in observations."""
 
@@ -278,13 +276,8 @@ class TaskBatch:
         """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading."""
         tool, body, goal = self._tool, self._body, self._goal
         position, turn = tool[:, :3, 3], pose_error(tool, self.start_tool)[:, 3:]
-        parts = [
-            (position - self.start_tool[:3, 3]) / _LENGTH,
-            turn,
-            self._speed / _SPEED,
-            self.control.opening() / _LENGTH,
-            self._action,
-        ]
+        moved, gap = (position - self.start_tool[:3, 3]) / _LENGTH, self.control.opening() / _LENGTH
+        parts = [moved, turn, self._speed / _SPEED, gap, self._action]
         result = {"state": np.concatenate(parts, axis=1), "goal": (goal - position) / _LENGTH}
         if self.body_seen:
             axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)

@@ -20,8 +20,6 @@ from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
 
-__all__ = ["EnvironmentPicture", "TactileEnv", "TactileVectorEnv", "serve_vector"]
-
 _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
 """Length of a drawn arrow over the marker's displacement."""
@@ -29,41 +27,61 @@ _PAPER, _INK, _DOT = (250, 250, 250), (43, 108, 176), (120, 120, 120)
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
 
 
-def _checked_render_mode(mode: str | None) -> str | None:
-    if mode is not None and mode not in _RENDER_MODES:
-        raise InputError("render_mode", value=mode, rule="must be None or a known mode", choices=_RENDER_MODES)
-    return mode
+class _Task:
+    """Common part of single environments and vectors: the batch, its pictures, and the end."""
+
+    task: ClassVar[type[Task]]
+    metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
+    closed = False
+
+    def _compose(self, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
+        """Check the mode and compose the world of ``TaskBatch``. Raises ``InputError`` for an unknown mode; as ``TaskBatch``."""
+        if render_mode is not None and render_mode not in _RENDER_MODES:
+            raise InputError("render_mode", value=render_mode, rule="must be None or a known mode", choices=_RENDER_MODES)
+        self.render_mode = render_mode
+        self.batch = TaskBatch(self.task(), num_envs=num_envs, **options)
+        self.metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 1.0 / self.batch.control_timestep}
+        self._observation: dict[str, np.ndarray] | None = None
+        self._picture: EnvironmentPicture | None = None
+
+    def _spaces(self) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
+        """Observations and actions of one environment."""
+        size = self.batch.control.size
+        return gymnasium_space(self.batch.arrays), gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise InputError("environment", value="closed", rule="must not be used after close(): make another")
+
+    def _pictures(self) -> tuple[np.ndarray, ...] | None:
+        """Pictures of all environments; None without a render mode."""
+        self._check_open()
+        if self.render_mode is None:
+            return None
+        if self._observation is None:
+            raise InputError("environment", value=0, rule="must be reset before it is drawn")
+        if self._picture is None:
+            self._picture = EnvironmentPicture(self.batch)
+        return tuple(self._picture.draw(b, self._observation) for b in range(self.batch.num_envs))
+
+    def _free(self) -> None:
+        """Free the renderer, if there is one."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
 
 
-def _check_open(closed: bool) -> None:
-    if closed:
-        raise InputError("environment", value="closed", rule="must not be used after close(): make another")
-
-
-def _action_space(size: int) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
-
-
-class TactileEnv(gymnasium.Env):
+class TactileEnv(_Task, gymnasium.Env):
     """One environment of a task; subclasses name the task, and their docstring specifies it.
 
     Keyword arguments are those of ``TaskBatch`` without ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
     reward), ``success`` and ``failed``.
     """
 
-    task: ClassVar[type[Task]]
-    metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
-
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         """Compose the world. ``render_mode`` is None or ``rgb_array``, else an ``InputError``; raises as ``TaskBatch``."""
-        self.closed = False
-        self.render_mode = _checked_render_mode(render_mode)
-        self.batch = TaskBatch(self.task(), num_envs=1, **options)
-        self.observation_space = gymnasium_space(self.batch.arrays)
-        self.action_space = _action_space(self.batch.control.size)
-        self.metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 1.0 / self.batch.control_timestep}
-        self._observation: dict[str, np.ndarray] | None = None
-        self._picture: EnvironmentPicture | None = None
+        self._compose(1, render_mode, options)
+        self.observation_space, self.action_space = self._spaces()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -72,7 +90,7 @@ class TactileEnv(gymnasium.Env):
 
         Raises ``InputError`` after ``close``.
         """
-        _check_open(self.closed)
+        self._check_open()
         super().reset(seed=seed)
         if seed is not None:
             self.batch.reseed([0], [seed])
@@ -84,7 +102,7 @@ class TactileEnv(gymnasium.Env):
 
         Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite, or after ``close``.
         """
-        _check_open(self.closed)
+        self._check_open()
         out = self.batch.step(np.asarray(action)[None])
         self._observation = out.observation
         info = {
@@ -101,24 +119,16 @@ class TactileEnv(gymnasium.Env):
             InputError: before the first ``reset``.
             BackendError: MuJoCo has no OpenGL to draw with (see ``SceneCamera``).
         """
-        _check_open(self.closed)
-        if self.render_mode is None:
-            return None
-        if self._observation is None:
-            raise InputError("environment", value=0, rule="must be reset before it is drawn")
-        if self._picture is None:
-            self._picture = EnvironmentPicture(self.batch)
-        return self._picture.draw(0, self._observation)
+        pictures = self._pictures()
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Free the renderer, if there is one; the environment cannot be used after that."""
         self.closed = True
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self._free()
 
 
-class TactileVectorEnv(gymnasium.vector.VectorEnv):
+class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
     """B environments of a task in one world: stepped together, and read by each sensor in one call.
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
@@ -126,9 +136,6 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
     in Gymnasium's own vectors. Environment b is seeded with seed + b and behaves as the single environment of that seed, noise of cameras
     and markers included.
     """
-
-    task: ClassVar[type[Task]]
-    metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
 
     def __init__(
         self,
@@ -150,25 +157,17 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             InputError: a value out of its choices.
         """
-        self.render_mode = _checked_render_mode(render_mode)
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError as error:
             choices = [mode.value for mode in _MODES]
             raise InputError("autoreset_mode", value=autoreset_mode, rule="must be a known mode", choices=choices) from error
+        self._compose(num_envs, render_mode, options)
         self.num_envs = num_envs
-        self.batch = TaskBatch(self.task(), num_envs=num_envs, **options)
-        self.single_observation_space = gymnasium_space(self.batch.arrays)
-        self.single_action_space = _action_space(self.batch.control.size)
+        self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {
-            "autoreset_mode": self._mode,
-            "render_modes": list(_RENDER_MODES),
-            "render_fps": 1.0 / self.batch.control_timestep,
-        }
-        self._observation: dict[str, np.ndarray] | None = None
-        self._picture: EnvironmentPicture | None = None
+        self.metadata["autoreset_mode"] = self._mode
         self._rngs = [seeding.np_random(None)[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
@@ -180,7 +179,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             InputError: seeds of another number than environments, a mask of another shape, or after ``close``.
         """
-        _check_open(self.closed)
+        self._check_open()
         mask = (options or {}).get("reset_mask")
         envs = chosen_envs(mask, self.num_envs)
         if seed is not None:
@@ -200,7 +199,7 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
-        _check_open(self.closed)
+        self._check_open()
         late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
         actions = np.asarray(actions)
         if len(late) and actions.ndim and len(actions) == self.num_envs:
@@ -226,20 +225,11 @@ class TactileVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """One picture of each environment, as ``TactileEnv.render``; None without a render mode. Raises the same."""
-        _check_open(self.closed)
-        if self.render_mode is None:
-            return None
-        if self._observation is None:
-            raise InputError("environment", value=0, rule="must be reset before it is drawn")
-        if self._picture is None:
-            self._picture = EnvironmentPicture(self.batch)
-        return tuple(self._picture.draw(b, self._observation) for b in range(self.num_envs))
+        return self._pictures()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderer, if there is one."""
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        self._free()
 
     def _reset(self, envs: Sequence[int] | np.ndarray) -> dict[str, np.ndarray]:
         return self.batch.reset([int(b) for b in envs], [self._rngs[b] for b in envs])
@@ -344,9 +334,10 @@ class EnvironmentPicture:
 
 
 def _enlarged(image: np.ndarray, height: int) -> np.ndarray:
+    """The image scaled to ``height`` [px]."""
     from PIL import Image
 
-    width = max(1, round(height * image.shape[1] / image.shape[0]))
+    width = max(1, round(image.shape[1] * height / len(image)))
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
 
 
@@ -356,9 +347,7 @@ def _column(panels: list[np.ndarray], height: int) -> np.ndarray:
 
     width = max(panel.shape[1] for panel in panels)
     sized = [Image.fromarray(p).resize((width, max(1, round(p.shape[0] * width / p.shape[1])))) for p in panels]
-    stacked = np.concatenate([np.asarray(image) for image in sized])
-    width = max(1, round(width * height / len(stacked)))
-    return np.asarray(Image.fromarray(stacked).resize((width, height), Image.Resampling.BILINEAR))
+    return _enlarged(np.concatenate([np.asarray(image) for image in sized]), height)
 
 
 def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

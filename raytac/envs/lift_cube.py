@@ -10,8 +10,6 @@ from raytac.envs.environments import TactileEnv, TactileVectorEnv
 from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
 from raytac.se3 import pose
 
-__all__ = ["LiftCube", "LiftCubeEnv", "LiftCubeVectorEnv"]
-
 
 class LiftCube(Task):
     """Rules of ``LiftCubeEnv``, as code."""

@@ -6,8 +6,6 @@ from typing import Final
 
 import gymnasium
 
-__all__ = ["IDS", "register_envs"]
-
 _MODULES: Final = {"PushCube": "push_cube", "BalancePole": "balance_pole", "LiftCube": "lift_cube", "RollBall": "roll_ball"}
 IDS: Final = tuple(f"raytac/{name}-v0" for name in _MODULES)
 """Names that ``gymnasium.make`` and ``gymnasium.make_vec`` take once ``raytac.envs`` is imported."""

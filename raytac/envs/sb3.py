@@ -19,8 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from raytac.envs.environments import TactileVectorEnv, serve_vector
 from raytac.errors import InputError
 
-__all__ = ["ProcessVecEnv", "TactileVecEnv", "one_thread"]
-
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Observations = dict[str, np.ndarray]
@@ -29,10 +27,7 @@ Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Give processes that start within one thread of BLAS each: small matrices gain nothing from more.
-
-    Many processes share the cores.
-    """
+    """Give processes that start within one thread of BLAS each; many processes share the cores."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
     try:
@@ -53,12 +48,9 @@ class _DictVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Attribute of the vector, repeated for every environment of ``indices``."""
-        return [self._attribute(attr_name)] * len(list(self._get_indices(indices)))
-
-    def _attribute(self, name: str) -> Any:
-        if name == "render_mode":
-            return None
-        raise AttributeError(name)
+        if attr_name != "render_mode":
+            raise AttributeError(attr_name)
+        return [None] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Raise ``InputError``: environments of one world share everything."""

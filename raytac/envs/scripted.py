@@ -9,8 +9,6 @@ import numpy as np
 
 from raytac.envs.batch import TaskBatch
 
-__all__ = ["SCRIPTED", "balance_pole", "lift_cube", "push_cube", "roll_ball"]
-
 GAINS = np.array([-5.2, -5.0, -32.4, -4.6])
 """Feedback gains of x, ẋ, θ, θ̇ (see ``balance_pole``)."""
 

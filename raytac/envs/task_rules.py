@@ -9,8 +9,6 @@ from typing import ClassVar
 
 import numpy as np
 
-__all__ = ["Motion", "Start", "Task", "TaskResult", "TaskState", "distances", "near"]
-
 
 @dataclass(frozen=True)
 class Motion:

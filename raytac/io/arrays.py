@@ -8,8 +8,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["npy_bytes", "npz_bytes"]
-
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of every member of an archive, so that equal arrays are equal files."""
 
@@ -22,10 +20,7 @@ def npy_bytes(array: np.ndarray) -> bytes:
 
 
 def npz_bytes(arrays: Mapping[str, np.ndarray], *, compress: bool = False) -> bytes:
-    """Contents of an ``.npz`` for ``numpy.load``; equal arrays give equal bytes.
-
-    ``numpy.savez`` does not promise that: it writes the time of day.
-    """
+    """Contents of an ``.npz``. Equal arrays give equal bytes, unlike those of ``numpy.savez``."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, values in arrays.items():

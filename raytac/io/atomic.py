@@ -1,7 +1,4 @@
-"""Whole files: written so that nobody sees half of one, even after a power failure.
-
-They are read only where they are regular files.
-"""
+"""Whole files: nobody sees half of one, even after a power failure; regular ones only."""
 
 from __future__ import annotations
 
@@ -11,8 +8,6 @@ import os
 import secrets
 import stat
 from pathlib import Path
-
-__all__ = ["PARTIAL", "open_regular", "read_regular", "sync_folder", "write_atomic"]
 
 PARTIAL = ".partial"
 """End of the names of files that are being written; they begin with a dot."""
@@ -66,10 +61,6 @@ def open_regular(path: Path) -> io.BufferedReader:
 
 
 def read_regular(path: Path) -> bytes:
-    """Contents of a regular file.
-
-    Raises:
-        OSError: see ``open_regular``.
-    """
+    """Contents of a regular file. Raises as ``open_regular``."""
     with open_regular(path) as stream:
         return stream.read()

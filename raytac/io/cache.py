@@ -11,14 +11,9 @@ from pathlib import Path
 
 from raytac.io.seal import SealError, read_sealed, write_sealed
 
-__all__ = ["cache_folder", "cache_root", "keep_cached", "read_cached", "warn_not_kept", "warn_unusable"]
-
 
 def cache_root() -> Path | None:
-    """Folder of the cache; None for a user without a home folder.
-
-    It is ``RAYTAC_CACHE`` if set, else ``raytac`` in ``XDG_CACHE_HOME`` or in ``~/.cache``.
-    """
+    """``RAYTAC_CACHE``, or ``raytac`` in ``XDG_CACHE_HOME`` or ``~/.cache``; None without home."""
     if chosen := os.environ.get("RAYTAC_CACHE"):
         return Path(chosen)
     try:
@@ -65,10 +60,7 @@ def warn_unusable(path: Path, error: Exception) -> None:
 
 
 def warn_not_kept(path: Path | None, error: Exception) -> None:
-    """Warn that an entry is used now and not kept.
-
-    The text is the same for all entries of a folder, so that it is shown once.
-    """
+    """Warn that an entry is not kept; once a folder, since the text is the same for all in it."""
     where = "the cache" if path is None else f"the cache {path.parent}"
     reason = getattr(error, "strerror", None) or error
     text = f"{where} cannot be written ({reason}): what is made is not kept; RAYTAC_CACHE names another folder"

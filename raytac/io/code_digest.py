@@ -1,7 +1,4 @@
-"""Digest of the source code that a result depends on, and the commit that runs.
-
-A cached result is used only by the code that computed it.
-"""
+"""Digest of the source code that a result depends on, and the commit that runs."""
 
 from __future__ import annotations
 
@@ -13,8 +10,6 @@ import sys
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-
-__all__ = ["code_digest", "git_state", "module_sources"]
 
 WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
 """Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
@@ -67,10 +62,7 @@ def code_digest(*roots: str) -> str:
 
 @cache
 def git_state() -> dict[str, str | int]:
-    """``git.commit``, and ``git.changed``: the number of tracked files of the package that differ.
-
-    Empty for an installed package.
-    """
+    """``git.commit``, and how many tracked files of the package differ; empty if installed."""
     package = Path(str(sys.modules["raytac"].__file__)).parent
     try:
         if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:

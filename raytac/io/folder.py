@@ -15,8 +15,6 @@ from types import TracebackType
 
 from raytac.errors import InputError, RaytacError
 
-__all__ = ["DISK_ERRORS", "LOCK", "FolderLock", "result_folder"]
-
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """Numbers of the errors of a disk, or of what standard output goes to."""
 
@@ -81,10 +79,7 @@ def _check_no_folders(out: Path, names: Iterable[str]) -> None:
 
 
 def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
-    """Move the files of ``work`` into ``out``.
-
-    If one cannot be moved, all that was there before goes back from ``old``.
-    """
+    """Move the files of ``work`` into ``out``; on an error all goes back as it was, from ``old``."""
     written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
     try:
         for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):
@@ -139,15 +134,13 @@ class FolderLock:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not self._is_there(handle):  # the run that had the lock has just removed the folder that it made
                 raise BlockingIOError
-        except BlockingIOError as error:
+        except (OSError, InputError) as error:
             os.close(handle)
-            raise InputError("out", value=folder, rule="is in use by another run") from error
-        except OSError as error:
-            os.close(handle)
-            raise InputError("out", value=folder, rule=f"cannot be locked ({error.strerror})") from error
-        except InputError:
-            os.close(handle)
-            raise
+            if isinstance(error, InputError):
+                raise
+            in_use = isinstance(error, BlockingIOError)
+            rule = "is in use by another run" if in_use else f"cannot be locked ({error.strerror})"
+            raise InputError("out", value=folder, rule=rule) from error
         self._handle = handle
 
     def release(self) -> None:

@@ -12,15 +12,9 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["HEADER_PREFIX", "png_bytes", "read_exr", "read_png", "vector_channels", "write_exr", "write_png", "write_sheet"]
-
 
 def png_bytes(rgb_u8: np.ndarray) -> bytes:
-    """``rgb_u8``, shape (H, W, 3), uint8, as the contents of a PNG file.
-
-    Raises:
-        InputError: another shape or type.
-    """
+    """A PNG file of ``rgb_u8``, (H, W, 3), uint8. Raises ``InputError`` for anything else."""
     if rgb_u8.ndim != 3 or rgb_u8.shape[2] != 3 or rgb_u8.dtype != np.uint8:
         raise InputError("rgb_u8", value=(rgb_u8.shape, str(rgb_u8.dtype)), rule="must have shape (H, W, 3) and type uint8")
     from PIL import Image
@@ -31,11 +25,7 @@ def png_bytes(rgb_u8: np.ndarray) -> bytes:
 
 
 def write_png(path: Path, rgb_u8: np.ndarray) -> None:
-    """Write ``png_bytes(rgb_u8)``.
-
-    Raises:
-        InputError: another shape or type.
-    """
+    """Write ``png_bytes(rgb_u8)``. Raises the same."""
     path.write_bytes(png_bytes(rgb_u8))
 
 

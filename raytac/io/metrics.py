@@ -1,7 +1,4 @@
-"""``metrics.json``: one flat object of dotted keys to numbers or strings.
-
-Every command and experiment writes one.
-"""
+"""``metrics.json`` of every command and experiment: dotted keys to numbers or strings."""
 
 from __future__ import annotations
 
@@ -17,8 +14,6 @@ from pathlib import Path
 
 from raytac.errors import InputError
 from raytac.io.atomic import write_atomic
-
-__all__ = ["REQUIRED", "VERSIONED", "Metric", "check_metrics", "read_metrics", "versions", "write_metrics"]
 
 Metric = int | float | str
 
@@ -74,11 +69,7 @@ def _plain(key: str, value: object) -> Metric:
 
 
 def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]:
-    """Check ``values``, write them as JSON with one key a line, and return them as written.
-
-    Raises:
-        InputError: see ``check_metrics``; nothing is written then.
-    """
+    """Check, write as JSON and return ``values``. Raises as ``check_metrics``, before writing."""
     checked = check_metrics(values)
     text = json.dumps(checked, indent=1, ensure_ascii=False) + "\n"
     write_atomic(path, text.encode("utf-8", "backslashreplace"))  # a path's undecodable bytes become JSON's own escapes

@@ -9,8 +9,6 @@ from typing import Literal
 
 from raytac.errors import InputError
 
-__all__ = ["CommonOptions", "DeviceName", "parse_names", "parse_outputs", "parse_resolution"]
-
 DeviceName = Literal["auto", "cpu", "cuda"]
 
 
@@ -25,13 +23,13 @@ class CommonOptions:
     seed: int = 0
     """Seed of every random number; the same seed gives the same result. In [0, 2^32)."""
 
+    def folder(self, *parts: str) -> Path:
+        """``out``, else the folder of these ``parts`` under runs/."""
+        return self.out if self.out is not None else Path("runs", *parts)
+
 
 def parse_resolution(text: str) -> tuple[int, int]:
-    """``"320x240"`` to (width, height) [px].
-
-    Raises:
-        InputError: not two positive whole numbers joined by ``x``.
-    """
+    """``"320x240"`` to (width, height) [px]. Raises ``InputError`` for anything else."""
     sides = re.fullmatch(r"\s*0*([1-9]\d{0,8})\s*x\s*0*([1-9]\d{0,8})\s*", text, re.ASCII | re.IGNORECASE)
     if sides is None:
         raise InputError("resolution", value=text, rule="must be WIDTHxHEIGHT in pixels, as in 320x240")
@@ -54,10 +52,6 @@ def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) 
 
 
 def parse_outputs(text: str, choices: tuple[str, ...]) -> tuple[str, ...]:
-    """``"rgb,depth"`` to names in the order of ``choices``, each once.
-
-    Raises:
-        InputError: an unknown name, or none.
-    """
+    """Names joined by commas, in the order of ``choices``. Raises as ``parse_names``."""
     names = parse_names(text, "outputs", choices)
     return tuple(name for name in choices if name in names)

@@ -7,8 +7,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-__all__ = ["Progress"]
-
 
 class Progress(tqdm):
     """A ``tqdm`` bar that writes plain lines where there is no terminal: into a log, a file or a pipe."""

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from raytac.io.atomic import read_regular, write_atomic
 
-__all__ = ["SealError", "read_sealed", "write_sealed"]
-
 _SIZE = hashlib.sha256().digest_size
 
 
@@ -21,11 +19,7 @@ class SealError(ValueError):
 
 
 def write_sealed(path: Path, data: bytes) -> None:
-    """Write ``data`` and its digest as a whole; the folder is made if need be.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write ``data`` and its digest as a whole, and make the folder. Raises ``OSError``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, data + _digest(path, data))
 

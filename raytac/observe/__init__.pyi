@@ -7,5 +7,5 @@ from .settings import MODALITIES as MODALITIES
 from .settings import SCALES as SCALES
 from .settings import ObservationSettings as ObservationSettings
 from .spaces import ArraySpec as ArraySpec
+from .spaces import as_tensors as as_tensors
 from .spaces import gymnasium_space as gymnasium_space
-from .tensors import as_tensors as as_tensors

@@ -9,8 +9,6 @@ from raytac.gel.surface import GelSurface
 from raytac.observe.observer import TactileObserver
 from raytac.sensor import TactileSensor
 
-__all__ = ["DeviceImages"]
-
 
 class DeviceImages:
     """The ``rgb`` of a ``TactileObserver``, from heights on the device to an image on the device.

@@ -23,8 +23,6 @@ from raytac.sensor import TactileSensor
 from raytac.sensor.options import sensor_spec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["CellMeans", "TactileObserver"]
-
 
 class TactileObserver:
     """Observations of one sensor in B environments.

@@ -13,8 +13,6 @@ from raytac.markers import MarkerPerturbation
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 
-__all__ = ["CameraDrift", "Randomization", "randomised_bodies", "randomised_sensor"]
-
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
 """Widths that are not relative to 1, and their upper bounds: a larger one is no mounting error."""
 
@@ -111,22 +109,13 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
     def factor(width: float, count: int = 1) -> np.ndarray:
         return 1.0 + width * rng.uniform(-1.0, 1.0, count)
 
-    leds = tuple(
-        replace(led, power=tuple(float(p) for p in np.asarray(led.power) * factor(r.led_power) * factor(r.led_colour, 3)))
-        for led in sensor.lights.leds
-    )
+    # The order of the draws is part of what a seed means.
+    powers = [np.asarray(led.power) * factor(r.led_power) * factor(r.led_colour, 3) for led in sensor.lights.leds]
+    leds = tuple(replace(led, power=tuple(power.tolist())) for led, power in zip(sensor.lights.leds, powers, strict=True))
     reflectance = np.minimum(np.asarray(sensor.coat.reflectance) * factor(r.reflectance, 3), 1.0)
-    gelpad = replace(
-        sensor.gelpad,
-        youngs_modulus=float(sensor.gelpad.youngs_modulus * factor(r.youngs_modulus)[0]),
-        friction=float(sensor.gelpad.friction * factor(r.friction)[0]),
-    )
-    return replace(
-        sensor,
-        lights=replace(sensor.lights, leds=leds),
-        coat=replace(sensor.coat, reflectance=tuple(float(v) for v in reflectance)),
-        gelpad=gelpad,
-    )
+    gel = {name: float(getattr(sensor.gelpad, name) * factor(getattr(r, name))[0]) for name in ("youngs_modulus", "friction")}
+    coat = replace(sensor.coat, reflectance=tuple(reflectance.tolist()))
+    return replace(sensor, lights=replace(sensor.lights, leds=leds), coat=coat, gelpad=replace(sensor.gelpad, **gel))
 
 
 def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:

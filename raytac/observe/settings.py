@@ -17,8 +17,6 @@ from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MODALITIES", "SCALES", "Layout", "ObservationSettings", "image_layout"]
-
 MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
 """Names that ``modalities`` accepts:
 
@@ -136,11 +134,7 @@ class Layout:
 
 
 def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
-    """Sizes of rendered and observed image.
-
-    Raises:
-        InputError: the rendered image would be larger than can be rendered.
-    """
+    """Sizes of rendered and observed image. Raises ``InputError`` if they are too large."""
     resolution = settings.resolution
     assert not isinstance(resolution, str)
     observed = sensor.camera.resolution if resolution is None else resolution

@@ -1,10 +1,10 @@
-"""Shapes, types and bounds of observations, with or without Gymnasium."""
+"""Observations for learners: shapes, types and bounds, spaces of Gymnasium, tensors of PyTorch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     import gymnasium
-
-__all__ = ["ArraySpec", "array_specs", "gymnasium_space"]
 
 
 @dataclass(frozen=True)
@@ -58,13 +56,24 @@ def _stacked(name: str, spec: ArraySpec, stack: int) -> ArraySpec:
 
 
 def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
-    """Arrays as a ``gymnasium.spaces.Dict`` of boxes.
-
-    Raises:
-        BackendError: Gymnasium is not installed.
-    """
+    """A ``Dict`` of boxes. Raises ``BackendError`` if Gymnasium is not installed."""
     try:
         from gymnasium import spaces
     except ImportError as error:
         raise BackendError(f"spaces need Gymnasium ({error}): `pip install 'raytac[rl]'`") from error
     return spaces.Dict({name: spaces.Box(spec.low, spec.high, spec.shape, spec.dtype) for name, spec in specs.items()})
+
+
+def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
+    """``torch.Tensor`` by name, through DLPack, without a copy; nested dictionaries stay nested.
+
+    Raises:
+        BackendError: PyTorch is not installed.
+    """
+    try:
+        import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it
+    except ImportError as error:
+        raise BackendError(f"tensors need PyTorch ({error}): `pip install 'raytac[rl]'`") from error
+    return {
+        name: as_tensors(value) if isinstance(value, Mapping) else torch.from_dlpack(value) for name, value in observation.items()
+    }

@@ -1,7 +1,4 @@
-"""Bake a table and write its folder: files as Taxim has them, coverage, and error.
-
-The error is that against the ray tracer, scene by scene.
-"""
+"""Bake a table and write its folder: files as Taxim has them, coverage, error by scene against the ray tracer."""
 
 from __future__ import annotations
 
@@ -21,6 +18,7 @@ from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import contact_box, mae, psnr, rmse
 from raytac.report.measure import machine
 from raytac.report.press import press_peaks
+from raytac.report.style import STYLE
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
@@ -29,18 +27,6 @@ if TYPE_CHECKING:
     from raytac.optics.taxim.bake.settings import BakeSettings
     from raytac.optics.taxim.table import PolyTable
     from raytac.optics.trace.tracer import Tracer
-
-__all__ = [
-    "BOX_MARGIN",
-    "ERROR_RANGE",
-    "SceneError",
-    "bake_metrics",
-    "error_metrics",
-    "run_bake",
-    "table_errors",
-    "write_coverage",
-    "write_table_sheet",
-]
 
 
 def run_bake(
@@ -112,95 +98,61 @@ def bake_metrics(baked: Baked, errors: dict[str, dict[str, SceneError]], bake_s:
 
 ERROR_RANGE = 32
 """Levels that the signed error is shown to, in either direction, the same in every sheet."""
-_STYLE: dict[Any, Any] = {
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 8,
-    "axes.linewidth": 0.6,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.fontsize": 7,
-}
 _FILLED = "#d9d9d9"
 _DEGREES = ("#fdcc8a", "#74a9cf", "#045a8d")
 
 
 def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
     """Samples of every bin, and the degree of its polynomial, over direction and magnitude of the slope."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib import rc_context
     from matplotlib.colors import ListedColormap, LogNorm
+    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     counts, degree = fit.counts[:-1, :-1].astype(float), fit.degree[:-1, :-1]
-    extent = (-180.0, 180.0, 0.0, 90.0)
-    with plt.rc_context(_STYLE):
-        figure, (first, right) = plt.subplots(1, 2, figsize=(7.0, 2.7), sharey=True, layout="constrained")
+    look: dict[str, Any] = {"origin": "lower", "extent": (-180.0, 180.0, 0.0, 90.0), "aspect": "auto", "interpolation": "nearest"}
+    with rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 2.7), layout="constrained")
+        first, right = figure.subplots(1, 2, sharey=True)
         for axes in (first, right):
             axes.set_facecolor(_FILLED)
             axes.set_xlabel("direction of the slope [°]")
             axes.set_xticks((-180, -90, 0, 90, 180))
             axes.set_yticks((0, 15, 30, 45, 60, 75, 90))
         first.set_ylabel("magnitude of the slope [°]")
-        shown = np.ma.masked_equal(counts, 0)
         norm = LogNorm(1, max(10.0, float(counts.max())))
-        image = first.imshow(
-            shown, origin="lower", extent=extent, aspect="auto", cmap="viridis", norm=norm, interpolation="nearest"
-        )
+        image = first.imshow(np.ma.masked_equal(counts, 0), cmap="viridis", norm=norm, **look)
         first.set_title(f"a  touched samples a bin, {sensor}")
         figure.colorbar(image, ax=first, pad=0.02)
-        shown = np.ma.masked_less(degree, 0)
-        colours = ListedColormap(_DEGREES)
-        right.imshow(
-            shown, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=-0.5, vmax=2.5, interpolation="nearest"
-        )
+        right.imshow(np.ma.masked_less(degree, 0), cmap=ListedColormap(_DEGREES), vmin=-0.5, vmax=2.5, **look)
         right.set_title("b  degree of the bin's polynomial")
         names = ("mean", "linear", "quadratic")
         keys = [Patch(facecolor=c, label=n) for c, n in zip(_DEGREES, names, strict=True)]
-        figure.legend(
-            handles=[*keys, Patch(facecolor=_FILLED, label="no sample (filled)")],
-            loc="outside lower right",
-            ncols=4,
-            frameon=False,
-        )
+        keys.append(Patch(facecolor=_FILLED, label="no sample (filled)"))
+        figure.legend(handles=keys, loc="outside lower right", ncols=4, frameon=False)
         figure.savefig(path, dpi=300)
-        plt.close(figure)
 
 
 def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> None:
-    """Sheet of one row a scene: ray tracer, table, table with shadows, signed error of the table.
-
-    The error is the mean of the channels.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    """Draw a row a scene: ray tracer, table, table with shadows, signed errors (mean of channels)."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
     names = {"taxim": "table", "taxim_shadow": "with shadows"}
     scenes = list(errors["taxim"])
     columns = 1 + 2 * len(errors)
     first = errors["taxim"][scenes[0]].traced
     cell = 1.75
-    with plt.rc_context(_STYLE):
+    with rc_context(STYLE):
         size = (columns * cell + 0.6, len(scenes) * (cell * first.shape[0] / first.shape[1] + 0.16) + 0.2)
-        figure, grid = plt.subplots(len(scenes), columns, figsize=size, squeeze=False, layout="constrained")
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(scenes), columns, squeeze=False)
         shown = None
         for row, scene in enumerate(scenes):
             images = [("ray tracer", errors["taxim"][scene].traced, "")]
             for family, by_scene in errors.items():
-                images.append(
-                    (
-                        names[family],
-                        by_scene[scene].table,
-                        "equal" if np.isinf(by_scene[scene].box_psnr) else f"{by_scene[scene].box_psnr:.1f} dB",
-                    )
-                )
+                ratio = by_scene[scene].box_psnr
+                images.append((names[family], by_scene[scene].table, "equal" if np.isinf(ratio) else f"{ratio:.1f} dB"))
             for axes, (title, image, note) in zip(grid[row], images, strict=False):
                 axes.imshow(image, interpolation="nearest")
                 axes.set_title(f"{scene}: {title}" if not note else f"{title}, {note}")
@@ -210,12 +162,10 @@ def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> N
                 shown = axes.imshow(off, cmap="RdBu_r", vmin=-ERROR_RANGE, vmax=ERROR_RANGE, interpolation="nearest")
                 axes.set_title(f"error, {names[family]}")
             for axes in grid[row]:
-                axes.set_xticks(())
-                axes.set_yticks(())
+                axes.set(xticks=(), yticks=())
         assert shown is not None
         figure.colorbar(shown, ax=grid, shrink=0.8, pad=0.01, aspect=40, label="table − ray tracer [levels]")
         figure.savefig(path, dpi=200)
-        plt.close(figure)
 
 
 BOX_MARGIN = 15 / 320
@@ -258,10 +208,7 @@ class SceneError:
 
 
 def table_errors(
-    sensor: SensorSpec,
-    surfaces: Mapping[str, GelSurface],
-    table: PolyTable,
-    tracer: Tracer,
+    sensor: SensorSpec, surfaces: Mapping[str, GelSurface], table: PolyTable, tracer: Tracer
 ) -> dict[str, dict[str, SceneError]]:
     """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against the images of ``tracer`` by scene.
 
@@ -285,10 +232,7 @@ def table_errors(
 
 
 def error_metrics(errors: Mapping[str, Mapping[str, SceneError]]) -> dict[str, Metric]:
-    """Keys ``<family>.<scene>.psnr_box_db``, ``.contact_mae_levels``, ``.psnr_frame_db`` and ``.uncovered_share``.
-
-    A PSNR of equal images, which is infinite, and a share without contact are left out.
-    """
+    """``<family>.<scene>.<figure>`` of finite figures: not the PSNR of equal images, for one."""
     metrics: dict[str, Metric] = {}
     for family, by_scene in errors.items():
         for scene, error in by_scene.items():

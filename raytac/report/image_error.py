@@ -13,23 +13,6 @@ import numpy as np
 
 from raytac.errors import BackendError, InputError
 
-__all__ = [
-    "FLIP_PPD",
-    "METRICS",
-    "RING_WIDTH",
-    "SSIM_SIGMA",
-    "contact_box",
-    "error_maps",
-    "flip_map",
-    "has_flip",
-    "image_errors",
-    "mae",
-    "psnr",
-    "regions",
-    "rmse",
-    "ssim_map",
-]
-
 METRICS = ("mae", "rmse", "psnr", "ssim", "flip")
 """MAE and RMSE [levels of 255], PSNR [dB], SSIM and FLIP [1]."""
 RING_WIDTH = 2e-3
@@ -110,10 +93,7 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def contact_box(contact: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the contact's bounding box with ``margin`` [px] on each side.
-
-    It stays within the image, and is all of it without contact.
-    """
+    """Rows and columns of the contact and a ``margin`` [px] in the image; all without contact."""
     height, width = contact.shape
     if not contact.any():
         return slice(0, height), slice(0, width)

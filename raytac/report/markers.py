@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from raytac.markers.registry import models_without_coat
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.report.measure import machine
 from raytac.report.press_store import PressStore, press_code
+from raytac.report.style import STYLE
 from raytac.specs import validate_press
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.press import PADS
@@ -40,17 +41,6 @@ from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = [
-    "FILES",
-    "MotionReport",
-    "calibrate_markers",
-    "draw_arrows",
-    "error_metrics",
-    "error_table",
-    "press_all",
-    "run_calibrate_markers",
-]
 
 FILES = ("marker_motion.toml", "errors.md", "errors.png", "arrows.png", "metrics.json")
 """Files that a calibration writes."""
@@ -244,18 +234,6 @@ def error_table(report: MotionReport) -> str:
     return "\n".join(lines) + "\n"
 
 
-_STYLE: dict[Any, Any] = {
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 8,
-    "axes.linewidth": 0.6,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.fontsize": 7,
-}
 _LOOK = {
     "surface": ("surface tracking", "#1b1b1b"),
     "fots": ("FOTS", "#0072b2"),
@@ -337,7 +315,7 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
             last = max(k for k, frame in enumerate(chosen) if frame.load == load)
             rows.append((load, chosen[: last + 1]))
     resolution = probed.camera.resolution
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         size = (1.8 * len(order) + 0.1, len(rows) * (1.8 * resolution[1] / resolution[0] + 0.24))
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(len(rows), len(order), squeeze=False)
@@ -375,7 +353,7 @@ def write_errors(path: Path, report: MotionReport) -> None:
 
     models = list(dict.fromkeys(row.model for row in report.errors))
     loads = list(dict.fromkeys(row.load for row in report.errors))
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=(3.5, 2.4), layout="constrained")
         axes = figure.subplots()
         width = 0.8 / (len(models) + 1)

@@ -1,7 +1,4 @@
-"""Measurement of what reports state: times of warm calls, the machine, and the confidence of a proportion.
-
-Times are taken over surfaces that change, as in a control loop.
-"""
+"""Times of warm calls over changing surfaces, the machine, the confidence of a proportion."""
 
 from __future__ import annotations
 
@@ -20,13 +17,9 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
 
-__all__ = ["machine", "moving", "once", "timed", "timed_within", "wilson_interval"]
-
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
-    """``count`` batches from ``surfaces`` (B = 1, one grid) in turn.
-
-    Each environment has 70 to 100 % of the indentation.
+    """``count`` batches of ``surfaces`` (B = 1) in turn, at 70 to 100 % of their indentation.
 
     No two frames are alike, so that nothing is measured that a cache of the last frame would save.
     """
@@ -56,9 +49,7 @@ def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> 
 
 
 def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: int, budget_s: float) -> np.ndarray:
-    """As ``timed``, with fewer calls where ``frames`` of them take longer than ``budget_s`` seconds.
-
-    There are at least three calls.
+    """As ``timed``, but of at most ``budget_s`` [s] where at least three calls fit.
 
     A slow call is warmed up once only, by the first input.
     """

@@ -21,8 +21,6 @@ from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FILES", "exr_channels", "exr_header", "press_metrics", "press_peaks", "run_press"]
-
 FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "preview.png", "metrics.json")
 """Every file that a press may write; those of an earlier press that a new one does not write are removed."""
 
@@ -96,9 +94,8 @@ def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) ->
 
 def exr_header(sensor: TactileSensor, scene: PressScene, frame: TactileFrame) -> dict[str, str]:
     """Origin of an image: sensor, scene, mode, seed, units and versions; all text."""
-    size = _image_size(frame)
     header = {key: str(value) for key, value in sensor.sampling.items()}
-    if size is not None:
+    if (size := _image_size(frame)) is not None:
         header["resolution"] = f"{size[0]}x{size[1]}"
     if "layers" in frame.outputs:
         header["layers"] = " ".join(f"led_{name}" for name in frame.layers)

@@ -18,8 +18,6 @@ from raytac.io.seal import read_sealed, write_sealed
 from raytac.markers.calibration_presses import Press, PressStates
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PressStore", "press_code"]
-
 _CODE = ("ipc", "raytac.physics")
 """Packages of which every module may change what a press does."""
 

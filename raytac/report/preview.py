@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -18,26 +19,18 @@ from matplotlib.ticker import MaxNLocator
 from raytac.gel.surface import PadGrid
 from raytac.markers import MarkerFrame
 from raytac.report.markers import draw_arrows
+from raytac.report.style import STYLE
 from raytac.specs.sensor import CameraSpec, SensorSpec
-
-__all__ = ["DIFFERENCE_RANGE", "PreviewData", "camera_extent_mm", "difference_to_rest", "draw_preview", "write_preview"]
 
 DIFFERENCE_RANGE = 64
 """Grey levels (of 255) that the difference panel shows to full scale, in either direction; the same in every preview."""
 
 _STYLE = {
+    **STYLE,
     "font.family": "sans-serif",
-    "font.size": 8,
-    "axes.titlesize": 8,
     "axes.titlepad": 4,
-    "axes.titlelocation": "left",
     "axes.labelsize": 7.5,
     "axes.labelpad": 1.5,
-    "axes.linewidth": 0.6,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
     "xtick.major.size": 2.5,
     "ytick.major.size": 2.5,
     "xtick.major.pad": 2,
@@ -83,6 +76,9 @@ class PreviewData:
     """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
 
 
+_Panel = Callable[[Axes, PreviewData], None]
+
+
 def camera_extent_mm(camera: CameraSpec) -> tuple[float, float, float, float]:
     """Left, right, bottom, top edge of the whole image on the plane z = 0 [mm]."""
     (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
@@ -105,28 +101,26 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
 
     The section begins the last row and is as wide as leaves no place empty, one to three panels.
     """
-    maps: list[Callable[[Axes], None]] = [lambda axes: _object_panel(axes, data), lambda axes: _indentation_panel(axes, data)]
-    if data.rgb is not None:
-        maps.append(lambda axes: _image_panel(axes, data))
-    if data.normals is not None:
-        maps.append(lambda axes: _normals_panel(axes, data))
-    if data.rgb is not None and data.rest_rgb is not None:
-        maps.append(lambda axes: _difference_panel(axes, data))
-    if data.markers is not None:
-        maps.append(lambda axes: _marker_panel(axes, data))
-    if data.traction is not None:
-        maps.append(lambda axes: _pressure_panel(axes, data))
-        if _is_sheared(data):
-            maps.append(lambda axes: _shear_panel(axes, data))
-    rows = -(-(len(maps) + 1) // 3)
-    panels = [(draw, 1) for draw in maps]
+    chosen: tuple[tuple[_Panel, bool], ...] = (
+        (_object_panel, True),
+        (_indentation_panel, True),
+        (_image_panel, data.rgb is not None),
+        (_normals_panel, data.normals is not None),
+        (_difference_panel, data.rgb is not None and data.rest_rgb is not None),
+        (_marker_panel, data.markers is not None),
+        (_pressure_panel, data.traction is not None),
+        (_shear_panel, _is_sheared(data)),
+    )
+    panels = [(draw, 1) for draw, is_there in chosen if is_there]
+    rows = -(-(len(panels) + 1) // 3)
     # Its long label has no room beside a colour bar: at the left edge, or beside the object, which has none.
-    panels.insert(max(1, 3 * (rows - 1)), (lambda axes: _section_panel(axes, data, sensor), 3 * rows - len(maps)))
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
+    section = partial(_section_panel, sensor=sensor), 3 * rows - len(panels)
+    panels.insert(max(1, 3 * (rows - 1)), section)
+    with matplotlib.rc_context(_STYLE):
         return _lay_out(panels, rows, data)
 
 
-def _lay_out(panels: list[tuple[Callable[[Axes], None], int]], rows: int, data: PreviewData) -> Figure:
+def _lay_out(panels: list[tuple[_Panel, int]], rows: int, data: PreviewData) -> Figure:
     """Place the panels, each with its width in columns, by hand, so that they line up whatever their labels are."""
     x_low, x_high, bottom, top = data.extent_mm
     wide = 1.62  # leaves room for a colour bar's figures at the right edge
@@ -141,7 +135,7 @@ def _lay_out(panels: list[tuple[Callable[[Axes], None], int]], rows: int, data: 
         x, y = margin + column * (wide + between), total - heading - (row + 1) * (above + high) - row * below
         across = span * wide + (span - 1) * between
         axes = figure.add_axes((x / width, y / total, across / width, high / total))
-        draw(axes)
+        draw(axes, data)
         axes.set_title(f"({'abcdefghi'[index]}) {axes.get_title(loc='left')}", loc="left")
         place += span
     return figure
@@ -212,8 +206,8 @@ def _marker_panel(axes: Axes, data: PreviewData) -> None:
     axes.set_title(f"markers × {magnified:g}, longest {longest:.1f} px", loc="left")
 
 
-def _traction_title(kind: str, data: PreviewData) -> str:
-    return f"{kind} traction [kPa]" + (", rest place" if data.traction_at_rest else "")
+def _traction_axes(axes: Axes, data: PreviewData, kind: str, note: str = "") -> None:
+    _map_axes(axes, data, f"{kind} traction [kPa]" + (", rest place" if data.traction_at_rest else "") + note)
 
 
 def _is_sheared(data: PreviewData) -> bool:
@@ -223,7 +217,7 @@ def _is_sheared(data: PreviewData) -> bool:
 
 def _pressure_panel(axes: Axes, data: PreviewData) -> None:
     assert data.traction is not None
-    _map_axes(axes, data, _traction_title("normal", data) + ("" if _is_sheared(data) else ", no shear"))
+    _traction_axes(axes, data, "normal", "" if _is_sheared(data) else ", no shear")
     pressure = -1e-3 * data.traction[..., 2]
     extent = _grid_extent_mm(data.grid)
     _colour_bar(axes, axes.imshow(pressure, extent=extent, cmap="magma", vmin=0.0, vmax=max(float(pressure.max()), 1e-3)))
@@ -232,7 +226,7 @@ def _pressure_panel(axes: Axes, data: PreviewData) -> None:
 def _shear_panel(axes: Axes, data: PreviewData) -> None:
     """Size of the shear traction, and its direction at some places where it is not small."""
     assert data.traction is not None
-    _map_axes(axes, data, _traction_title("shear", data))
+    _traction_axes(axes, data, "shear")
     shear = 1e-3 * data.traction[..., :2]
     size = np.hypot(shear[..., 0], shear[..., 1])
     largest = max(float(size.max()), 0.1)

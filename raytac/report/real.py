@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +23,6 @@ from raytac.io.progress import Progress
 from raytac.optics.trace.config import RayTraced
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
-
-__all__ = [
-    "ABLATIONS",
-    "BOX_MARGIN",
-    "Ablation",
-    "RealSettings",
-    "compare_real",
-    "draw",
-    "noise_floor",
-    "press_scores",
-    "summary",
-    "table_text",
-]
-
 
 SHOWN = 3
 """Presses on the image sheet: in true colour, with their noise, more make a large file."""
@@ -61,22 +46,21 @@ class Ablation:
 
 
 def _leds(sensor: SensorSpec, **changes: Any) -> SensorSpec:
-    leds = tuple(dataclasses.replace(led, **changes) for led in sensor.lights.leds)
-    return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=leds))
+    leds = tuple(replace(led, **changes) for led in sensor.lights.leds)
+    return replace(sensor, lights=replace(sensor.lights, leds=leds))
 
 
 def _one_a_colour(sensor: SensorSpec) -> SensorSpec:
     first = [next(led for led in sensor.lights.leds if led.layer == layer) for layer in sensor.lights.layers]
-    return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=tuple(first)))
+    return replace(sensor, lights=replace(sensor.lights, leds=tuple(first)))
 
 
 def _linear(sensor: SensorSpec) -> SensorSpec:
-    response = dataclasses.replace(sensor.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))
-    return dataclasses.replace(sensor, response=response)
+    return replace(sensor, response=replace(sensor.response, gamma=1.0, black_level=(0.0, 0.0, 0.0)))
 
 
 def _flat(sensor: SensorSpec) -> SensorSpec:
-    return dataclasses.replace(sensor, gelpad=dataclasses.replace(sensor.gelpad, dome_radius=(np.inf, np.inf)))
+    return replace(sensor, gelpad=replace(sensor.gelpad, dome_radius=(np.inf, np.inf)))
 
 
 ABLATIONS: dict[str, Ablation] = {
@@ -169,19 +153,9 @@ def compare_real(
                 bar.update()
             train, test = splits[0][1]
             for name in ablations:
-                one = ABLATIONS[name]
+                one = replace(ABLATIONS[name], prior=ABLATIONS[name].prior or priors["press"][0])
                 changed = one.sensor(sensor)
-                tracing = RayTraced(shadows=settings.shadows != one.other_shadows, bounce=one.bounce)
-                models = _fitted(
-                    changed,
-                    shots.take(train),
-                    settings,
-                    bar,
-                    modes=("raytrace",),
-                    one=one,
-                    prior=one.prior or priors["press"][0],
-                    tracing=tracing,
-                )
+                models = _fitted(changed, shots.take(train), settings, bar, modes=("raytrace",), one=one)
                 seen, _ = _tested(models, changed, shots.take(test))
                 for key, value in summary(press_scores(sensor, seen["raytrace"], shots.take(test))).items():
                     metrics[f"ablation.{name}.{key}"] = value
@@ -199,8 +173,11 @@ def compare_real(
             for k, errors in enumerate(of)
         }
         metrics["noise_floor"] = noise_floor(sensor, shots)
-        head: dict[str, Metric] = {"command": "compare-real", "device": device, "seed": settings.seed, "sensor": sensor.name}
-        head |= {
+        head: dict[str, Metric] = {
+            "command": "compare-real",
+            "device": device,
+            "seed": settings.seed,
+            "sensor": sensor.name,
             "presses": len(shots.presses),
             "folds": settings.folds,
             "tested_folds": len(priors["press"]),
@@ -211,8 +188,6 @@ def compare_real(
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             **versions(),
         }
-        from raytac.report.real import draw, table_text
-
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
         shown = sorted(images)[len(images) // (2 * SHOWN) :: max(1, len(images) // SHOWN)][:SHOWN]
         draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")
@@ -227,11 +202,8 @@ def _fitted(
     bar: Any,
     *,
     modes: tuple[str, ...] = MODES,
-    one: Ablation | None = None,
-    prior: str | None = None,
-    tracing: RayTraced | None = None,
+    one: Ablation = Ablation(),
 ) -> Models:
-    one = Ablation() if one is None else one
     return fit_models(
         sensor,
         shots,
@@ -242,8 +214,8 @@ def _fitted(
         starts=settings.starts,
         rounds=settings.rounds,
         settle=one.settle,
-        prior=settings.prior if prior is None else prior,
-        tracing=RayTraced(shadows=settings.shadows) if tracing is None else tracing,
+        prior=settings.prior if one.prior is None else one.prior,
+        tracing=RayTraced(shadows=settings.shadows != one.other_shadows, bounce=one.bounce),
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
     )
 
@@ -283,10 +255,10 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
         value = metrics.get(key)
         return "–" if value is None else format(value, digits)
 
-    lines = [
-        "| mode | contact MAE | contact RMSE | ring MAE | box PSNR [dB] | box SSIM | frame MAE | contact, ring MAE, labelled circles | ms |"
-    ]
-    lines.append("|" + "---|" * 9)
+    measures = (
+        "contact MAE | contact RMSE | ring MAE | box PSNR [dB] | box SSIM | frame MAE | contact, ring MAE, labelled circles"
+    )
+    lines = [f"| mode | {measures} | ms |", "|" + "---|" * 9]
     for key, name in _ROWS:
         cells = [cell(f"{key}.{m}") for m in ("contact_mae", "contact_rmse", "ring_mae", "box_psnr")]
         cells += [
@@ -315,19 +287,16 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
 
 
 def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
-    """A row a press: the photograph, every mode that uses the one at rest, and its signed error (grey is none), cut to what is about the
-    contact."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    """Draw a row a press: the photograph, every mode that uses the one at rest, and its signed error (grey is none), cut to what is about
+    the contact."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
     modes = [(key, name) for key, name in _ROWS if key in images[0] and key not in (ALONE, "background")]
     columns = ["photograph", *(name for _, name in modes), *(f"{name}, error × 4" for _, name in modes)]
-    with plt.rc_context({"font.size": 6.5}):
-        figure, axes = plt.subplots(
-            len(real), len(columns), figsize=(1.1 * len(columns), 1.12 * len(real)), squeeze=False, layout="constrained"
-        )
+    with rc_context({"font.size": 6.5}):
+        figure = Figure(figsize=(1.1 * len(columns), 1.12 * len(real)), layout="constrained")
+        axes = figure.subplots(len(real), len(columns), squeeze=False)
         for line, photo, own, (x, y, r) in zip(axes, real, images, circles, strict=True):
             low_x, low_y = (max(0, int(c - 2.2 * r)) for c in (x, y))
             box = np.s_[low_y : int(y + 2.2 * r), low_x : int(x + 2.2 * r)]
@@ -338,7 +307,6 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
         figure.savefig(path, dpi=110)
-        plt.close(figure)
 
 
 BOX_MARGIN = 15
@@ -346,9 +314,7 @@ BOX_MARGIN = 15
 
 
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
-    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press.
-
-    Regions are those of the labelled circles.
+    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press and labelled circle.
 
     MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
     ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.

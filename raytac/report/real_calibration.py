@@ -29,8 +29,6 @@ from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
 from raytac.specs.sensor_file import lights_text, sensor_files
 
-__all__ = ["OUTLIER", "run_calibrate_optics"]
-
 FITTED = ("raytrace", "taxim", "mlp")
 """Models that photographs are fitted by; Phong's has nothing to fit."""
 OUTLIER = 2.0
@@ -86,11 +84,10 @@ def run_calibrate_optics(
                 bar.update()
                 bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
 
-            settings = FitSettings(fixed=("gamma",))
             models = fit_models(
                 sensor,
                 train,
-                settings=settings,
+                settings=FitSettings(fixed=("gamma",)),
                 modes=(model, ALONE) if model == "raytrace" else (model,),
                 device=device,
                 seed=seed,
@@ -102,9 +99,14 @@ def run_calibrate_optics(
                 tick=tick,
             )
         mode, fitted = models.modes[model], models.fitted
-        metrics: dict[str, Metric] = {"command": "calibrate", "model": model, "device": mode.device, "seed": seed}
-        metrics |= {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "data": data, "sensor": sensor.name}
-        metrics |= {
+        metrics: dict[str, Metric] = {
+            "command": "calibrate",
+            "model": model,
+            "device": mode.device,
+            "seed": seed,
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+            "data": data,
+            "sensor": sensor.name,
             "holdout": holdout,
             "shadows": int(shadows),
             "shadow_table": shadow_table,
@@ -137,10 +139,8 @@ def run_calibrate_optics(
             print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
         if model == "raytrace":
             error = f"{metrics.get('held_out.contact_mae', metrics['fitted.contact_mae']):.2f}"
-            what = "on is_test-out presses" if is_test.any() else "on the fitted presses"
-            comment = (
-                f"Fitted to {int((~is_test).sum())} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
-            )
+            what = "on held-out presses" if is_test.any() else "on the fitted presses"
+            comment = f"Fitted to {(~is_test).sum()} presses of {data}: mean absolute error in the contact {error} of 255 {what}."
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
             alone = models.modes[ALONE]
             assert isinstance(alone, Tracer)

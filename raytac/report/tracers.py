@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.optics.trace.tracer import Tracer
 
-__all__ = ["Tracers", "path_trace"]
-
 
 @dataclass(frozen=True)
 class Tracers:
@@ -29,10 +27,7 @@ class Tracers:
     built: dict[str, Any] = field(default_factory=dict)
 
     def get(self, size: tuple[int, int], config: RayTraced | None = None, outputs: tuple[str, ...] = ("rgb",)) -> Tracer:
-        """Ray tracer for images of ``size`` (width, height) [px].
-
-        Path tracers light all LEDs in one pass of three channels, which is all that a plain image needs.
-        """
+        """Ray tracer of images of ``size`` (width, height) [px]; path tracers have one layer."""
         return self.mode(size, RayTraced() if config is None else config, outputs)  # type: ignore[return-value]
 
     def mode(self, size: tuple[int, int], config: OpticsConfig[Any], outputs: tuple[str, ...] = ("rgb",)) -> OpticalMode:

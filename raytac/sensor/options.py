@@ -1,7 +1,4 @@
-"""Checks of a sensor's options, made before anything is computed.
-
-A message names the value, the rule and the choices.
-"""
+"""Checks of a sensor's options, made before anything is computed."""
 
 from __future__ import annotations
 
@@ -23,17 +20,6 @@ from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, valida
 if TYPE_CHECKING:
     from raytac.optics.base import OpticsConfig
     from raytac.physics.base import PhysicsConfig
-
-__all__ = [
-    "LARGEST_SIDE",
-    "checked_markers",
-    "checked_outputs",
-    "checked_resolution",
-    "press_scene",
-    "sensor_outputs",
-    "sensor_spec",
-    "warn_of_other_shape",
-]
 
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""

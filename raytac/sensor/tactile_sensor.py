@@ -39,8 +39,6 @@ from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig
 
-__all__ = ["TactileSensor"]
-
 
 class TactileSensor:
     """A simulated GelSight sensor.
@@ -331,14 +329,12 @@ class TactileSensor:
         self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
     ) -> TactileFrame:
         """The frame with the images that are asked for; ``done``: when the surface was there."""
-        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers, "label": self.label}
+        fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers}
         if self._optical_outputs:
             images = self.optical_mode.render(surface)
-            fields |= {name: getattr(images, name, None) for name in IMAGES} | {
-                "label": self.label
-            }  # a mode is named once it is built
+            fields |= {name: getattr(images, name, None) for name in IMAGES}
             time_ms["optics"] = 1e3 * (time.perf_counter() - done)
-        return TactileFrame(surface, time_ms=time_ms, **fields)
+        return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
         """Frame of untouched pads, what every difference image is taken from; markers keep their history.
@@ -400,19 +396,12 @@ class TactileSensor:
         return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the loaded scene's object at the surface's poses, pad frame [m], shape (B, Ny, Nx), inf where it is not.
-
-        None if the surface has no object.
-        """
+        """Underside of the loaded object [m], (B, Ny, Nx), inf beside it; None without an object."""
         return None if self._pad is None else self._pad.object_height(surface)
 
     @property
     def optical_mode(self) -> OpticalMode:
-        """The renderer, built on first use.
-
-        Raises:
-            RaytacError: as ``OpticsConfig.build``.
-        """
+        """The renderer, built on first use. Raises as ``OpticsConfig.build``."""
         mode = self._mode
         if mode is None:
             mode = self._mode = self.optics.build(

@@ -9,8 +9,6 @@ from typing import Final
 from raytac.assets import AssetKind, asset_root
 from raytac.errors import SpecError
 
-__all__ = ["available", "find_file", "is_file", "name_of"]
-
 _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
     "sensor": ("scenes", "sensors"),
     "press scene": ("scenes", "press"),

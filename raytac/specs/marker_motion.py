@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from raytac.specs.files import find_file
-from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml
-
-__all__ = ["MARKER_MOTION_SCHEMA", "MarkerMotionSpec", "PunchSpec", "load_marker_motion", "marker_motion_text"]
+from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml, split_unit
 
 
 @dataclass(frozen=True)
@@ -104,35 +102,30 @@ def load_marker_motion(name_or_path: str | Path, *, base: Path | None = None) ->
 
 def marker_motion_text(motion: MarkerMotionSpec) -> str:
     """The file of ``motion``; ``load_marker_motion`` reads it back, to six digits."""
-    degrees = 180.0 / 3.141592653589793
-    punch = motion.punch
-    rows = {
-        "fots": {
-            "dilate_gain_per_mm3": (motion.dilate_gain * 1e-9, "integral form of the published sum; see docs/markers.md"),
-            "dilate_lambda_per_mm2": (motion.dilate_lambda * 1e-6, "lambda_d"),
-            "shear_lambda_per_mm2": (motion.shear_lambda * 1e-6, "lambda_s"),
-            "shear_max_mm": (motion.shear_max * 1e3, "cap of the shear that markers follow"),
-            "twist_lambda_per_mm2": (motion.twist_lambda * 1e-6, "lambda_t"),
-            "twist_max_deg": (motion.twist_max * degrees, "cap of the twist that markers follow"),
-        },
-        "punch": {}
-        if punch is None
-        else {
-            "anisotropy": (punch.anisotropy, "kappa: nu / (2 - nu) on a half-space"),
-            "reach_mm": (punch.reach * 1e3, "length over which the half-space's motion fades in the pad"),
-            "slip_per_mm": (punch.slip * 1e-3, "shear that sticks, by mean indentation times radius"),
-        },
-        "force_field": {
-            "gain": (motion.field_gain, "displacement by penetration along a wall's normal"),
-            "shear": (motion.field_shear, "k_t / k_n"),
-            "friction": (motion.field_friction, "Coulomb's cap"),
-        },
-    }
     lines = ["# Marker motion of a gelpad, written by `raytac calibrate markers`. Lengths in mm.", ""]
     lines += ['provenance = """', *motion.provenance.strip().splitlines(), '"""']
-    for table, values in rows.items():
-        if not values:
+    for table, owner, prefix in (("fots", motion, ""), ("punch", motion.punch, ""), ("force_field", motion, "field_")):
+        if owner is None:
             continue
         lines += ["", f"[{table}]"]
-        lines += [f"{key} = {value:.6g}".ljust(40) + f"# {note}" for key, (value, note) in values.items()]
+        for key in MARKER_MOTION_SCHEMA[table]:
+            name, unit = split_unit(key)
+            value = getattr(owner, prefix + name) * unit.denominator / unit.numerator
+            lines.append(f"{key} = {value:.6g}".ljust(40) + f"# {_NOTES[key]}")
     return "\n".join(lines) + "\n"
+
+
+_NOTES = {
+    "dilate_gain_per_mm3": "integral form of the published sum; see docs/markers.md",
+    "dilate_lambda_per_mm2": "lambda_d",
+    "shear_lambda_per_mm2": "lambda_s",
+    "shear_max_mm": "cap of the shear that markers follow",
+    "twist_lambda_per_mm2": "lambda_t",
+    "twist_max_deg": "cap of the twist that markers follow",
+    "anisotropy": "kappa: nu / (2 - nu) on a half-space",
+    "reach_mm": "length over which the half-space's motion fades in the pad",
+    "slip_per_mm": "shear that sticks, by mean indentation times radius",
+    "gain": "displacement by penetration along a wall's normal",
+    "shear": "k_t / k_n",
+    "friction": "Coulomb's cap",
+}

@@ -11,8 +11,6 @@ import numpy as np
 from raytac.errors import MeshError
 from raytac.specs.files import is_file
 
-__all__ = ["MESH_SUFFIXES", "SIZE_RANGE", "load_mesh"]
-
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
 _FARTHEST = 1e9
 """Farthest that a vertex may be [file units]: beyond it vertices cannot be distinguished."""

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Crossings", "find_crossings"]
-
 _CHUNK = 1 << 18
 """Most pairs of boxes that are looked at together."""
 _MOST_PAIRS = 20_000

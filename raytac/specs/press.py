@@ -13,22 +13,8 @@ from raytac.specs.sensor import Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
 from raytac.specs.toml import Number, Schema, Text, check_fields
 
-__all__ = [
-    "DYNAMICS",
-    "MOVES",
-    "PADS",
-    "POSE_SCHEMA",
-    "SCENE_SCHEMA",
-    "STAGE_SCHEMA",
-    "ObjectSpec",
-    "PressScene",
-    "StageSpec",
-]
-
 MOVES = ("object", "case")
 """Sides that a press can move; the other one stands still."""
-PHYSICS = ("rigid", "ipc")
-"""Physics of the gel: the rigid pad with its Gaussians, or the soft pad of the contact solver."""
 PADS = ("coarse", "medium", "fine")
 """Mesh levels of the soft pad."""
 DYNAMICS = ("kinematic", "affine", "soft")

@@ -13,9 +13,7 @@ from raytac.specs.mesh import MESH_SUFFIXES, load_mesh
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion, warn_of_crossings
-from raytac.specs.toml import Table, Text, read_toml
-
-__all__ = ["load_press", "press_of", "validate_press"]
+from raytac.specs.toml import Table, Text, in_mm, read_toml
 
 _KIND = "kind"
 
@@ -49,10 +47,7 @@ def load_press(name_or_path: str | Path) -> PressScene:
     if target.kind != "none" and not stages:
         raise top.error("at least one [[trajectory]] stage is needed to press the object", "trajectory")
     trajectory = _read_trajectory(stages)
-    free = target.dynamics == "affine" and [
-        s.kind for s in trajectory if s.kind not in ("indent", "release") or s.depth is not None
-    ]
-    if free:
+    if target.dynamics == "affine" and any(s.kind not in ("indent", "release") or s.depth is not None for s in trajectory):
         rule = "a free body (affine) can only be laid on the pad by its weight: indent with force_n, and release"
         raise top.section("object").error(rule, "dynamics", target.dynamics)
     return PressScene(name_of(path), target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
@@ -102,27 +97,18 @@ def press_of(
         heights = check_numbers("heights", source, (None, None), finite=True)
         if not heights.size or heights.min() < 0 or heights.max() == 0:
             raise InputError("heights", value=heights.shape, rule="must be >= 0 everywhere and > 0 somewhere [m]")
-        spacing = check_number("pitch", pitch, "(0, 0.01]", "m")
-        return _pressed_in("heights", "heights", {"pitch": spacing}, depth, heights=tuple(map(tuple, heights.tolist())))
+        params: dict[str, float | int | str] = {"pitch": check_number("pitch", pitch, "(0, 0.01]", "m")}
+        rows = tuple(map(tuple, heights.tolist()))
+        target = ObjectSpec("heights", params, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1, heights=rows)
+        return PressScene("heights", target, (StageSpec("indent", depth=depth),))
     if not is_mesh:
         return load_press(source)
     path, scale = Path(source).absolute(), check_number("scale", 0.001 if scale is None else scale, "(0, 10]", "m per file unit")
     vertices, faces = load_mesh(path, scale)
     warn_of_crossings(str(path), vertices, faces)
     x, y, _ = (-0.5 * (vertices.min(axis=0) + vertices.max(axis=0))).tolist()
-    return _pressed_in(name_of(path), "mesh", {"path": str(path), "scale": scale}, depth, (x, y, 0.0))
-
-
-def _pressed_in(
-    name: str,
-    kind: str,
-    params: dict[str, float | int | str],
-    depth: float | None,
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    heights: tuple[tuple[float, ...], ...] = (),
-) -> PressScene:
-    target = ObjectSpec(kind, params, position, (1.0, 0.0, 0.0, 0.0), 0.1, heights=heights)
-    return PressScene(name, target, (StageSpec("indent", depth=depth),))
+    target = ObjectSpec("mesh", {"path": str(path), "scale": scale}, (x, y, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
+    return PressScene(name_of(path), target, (StageSpec("indent", depth=depth),))
 
 
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
@@ -142,14 +128,14 @@ def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
     for index, stage in enumerate(scene.trajectory):
         if stage.depth is not None and not stage.depth < pad.thickness:
             rule = f"the press must be less deep than the pad of {sensor.name} is thick, {pad.thickness * 1e3:.4g} mm"
-            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].depth_mm", value=_mm(stage.depth))
+            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].depth_mm", value=in_mm(stage.depth))
         dx, dy = stage.shear
         if abs(x + dx) > half[0] or abs(y + dy) > half[1]:
             rule = (
-                f"the shear must leave the object on the pad of {sensor.name}: from {[_mm(x), _mm(y)]} mm to "
+                f"the shear must leave the object on the pad of {sensor.name}: from {in_mm((x, y))} mm to "
                 f"|x| <= {half[0] * 1e3:.4g} mm, |y| <= {half[1] * 1e3:.4g} mm"
             )
-            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].shear_mm", value=[_mm(dx), _mm(dy)])
+            raise SpecError(rule, file=scene.source, key=f"trajectory[{index}].shear_mm", value=in_mm(stage.shear))
 
 
 def _read_object(table: Table) -> ObjectSpec:
@@ -161,8 +147,8 @@ def _read_object(table: Table) -> ObjectSpec:
         return ObjectSpec(kind, {}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0)
     x, y = values.pop("position")
     quaternion, mass, dynamics = values.pop("quaternion"), values.pop("mass"), values.pop("dynamics")
-    elastic = {name: values.pop(name) for name in ("youngs_modulus", "poisson_ratio")}
-    elastic = {name: value for name, value in elastic.items() if value is not None}
+    given = {name: values.pop(name) for name in ("youngs_modulus", "poisson_ratio")}
+    elastic = {name: value for name, value in given.items() if value is not None}
     if elastic and dynamics != "soft":
         key = "youngs_modulus_kpa" if "youngs_modulus" in elastic else "poisson_ratio"
         raise table.error('is the material of a soft object, so dynamics must be "soft"', key, table.data[key])
@@ -189,7 +175,3 @@ def _read_trajectory(tables: tuple[Table, ...]) -> tuple[StageSpec, ...]:
             touching = False
         stages.append(StageSpec(**values))
     return tuple(stages)
-
-
-def _mm(length: float) -> float:
-    return float(f"{length * 1e3:.6g}")

@@ -6,8 +6,7 @@ import math
 
 from raytac.errors import SpecError
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
-
-__all__ = ["check_slab", "led_corners", "validate_sensor"]
+from raytac.specs.toml import in_mm
 
 _COEFFICIENT = 5.0
 """Most that a coefficient of a colour shading may be, as in the file."""
@@ -38,11 +37,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
 
 def check_slab(sensor: SensorSpec) -> None:
-    """Check that camera and LEDs lie in the air below the slab of ``refraction.model = "slab"``.
-
-    Raises:
-        SpecError: as ``validate_sensor``.
-    """
+    """Check that camera and LEDs lie below a slab that refracts. Raises as ``validate_sensor``."""
     if sensor.refraction.model != "slab":
         return
     _check_camera_behind(sensor)
@@ -54,26 +49,26 @@ def check_slab(sensor: SensorSpec) -> None:
                 f"LED {led.name!r} reaches up to z = {highest * 1e3:.4g} mm: with refraction.model = 'slab' "
                 f"all of it must lie below the slab's air face, z < {-back * 1e3:.4g} mm (thickness plus plate)"
             )
-            raise SpecError(rule, file=sensor.lights.source, key=f"led[{index}].position_mm", value=_mm(led.position))
+            raise SpecError(rule, file=sensor.lights.source, key=f"led[{index}].position_mm", value=in_mm(led.position))
 
 
 def _check_dome(sensor: SensorSpec) -> None:
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)
     if any(radius <= extent for radius, extent in zip(pad.dome_radius, half, strict=True)):
-        rule = f"must be more than half the pad, {_mm(half)} mm; inf is flat"
-        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
+        rule = f"must be more than half the pad, {in_mm(half)} mm; inf is flat"
+        raise _error(sensor, "gelpad.dome_radius_mm", in_mm(pad.dome_radius), rule)
     depth = pad.sag(*half)
     if depth >= pad.thickness:
         rule = f"the dome falls {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
-        raise _error(sensor, "gelpad.dome_radius_mm", _mm(pad.dome_radius), rule)
+        raise _error(sensor, "gelpad.dome_radius_mm", in_mm(pad.dome_radius), rule)
 
 
 def _check_camera_behind(sensor: SensorSpec) -> None:
     camera, back = sensor.camera, _back_face(sensor)
     if camera.position[2] >= -back:
         rule = f"the camera must lie behind the gel, z < {-back * 1e3:.4g} mm, and look along +z"
-        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+        raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
 
 
 def _check_camera(sensor: SensorSpec) -> None:
@@ -82,19 +77,19 @@ def _check_camera(sensor: SensorSpec) -> None:
     _check_camera_behind(sensor)
     if not _in_case(sensor, camera.position):
         rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
-        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+        raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
     view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
     centre = tuple(
         at + (n / 2 - principal) * pitch
         for at, n, principal, pitch in zip((x, y), camera.resolution, camera.principal_point, camera.pixel_pitch, strict=True)
     )
     if any(abs(c) > size / 2 for c, size in zip(centre, pad.size, strict=True)):
-        rule = f"the camera does not see the pad: its view is centred at {_mm(centre)} mm, off the pad of {_mm(pad.size)} mm"
-        raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+        rule = f"the camera does not see the pad: its view is centred at {in_mm(centre)} mm, off the pad of {in_mm(pad.size)} mm"
+        raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
     for outer, name in ((pad.size, "pad"), (case.size, "case")):
         if any(v > size + _SLACK for v, size in zip(view, outer, strict=True)):
-            rule = f"the view of {_mm(view)} mm (resolution times pitch) must not be larger than the {name}, {_mm(outer)} mm"
-            raise _error(sensor, "camera.pixel_pitch_mm", _mm(camera.pixel_pitch), rule)
+            rule = f"the view of {in_mm(view)} mm (resolution times pitch) must not be larger than the {name}, {in_mm(outer)} mm"
+            raise _error(sensor, "camera.pixel_pitch_mm", in_mm(camera.pixel_pitch), rule)
     _check_view(sensor)
 
 
@@ -113,7 +108,7 @@ def _check_view(sensor: SensorSpec) -> None:
             )
             if abs((pixels / 2 - principal) * pitch) > abs(at):
                 raise _error(sensor, "camera.principal_point_px", list(camera.principal_point), rule)
-            raise _error(sensor, "camera.position_mm", _mm(camera.position), rule)
+            raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
 
 
 def _check_vignetting(sensor: SensorSpec) -> None:
@@ -165,38 +160,37 @@ def _check_markers(sensor: SensorSpec) -> None:
     counts = (markers.columns, markers.rows)
     if any(n > 1 and pitch < 2 * markers.radius for n, pitch in zip(counts, markers.pitch, strict=True)):
         rule = f"dots must not overlap: each pitch at least {2e3 * markers.radius:.4g} mm"
-        raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
+        raise _error(sensor, "markers.pitch_mm", in_mm(markers.pitch), rule)
     reach = [abs(o) + (n - 1) / 2 * p + markers.radius for o, n, p in zip(markers.offset, counts, markers.pitch, strict=True)]
     if any(r > s / 2 + _SLACK for r, s in zip(reach, size, strict=True)):
-        rule = f"the grid reaches {_mm(reach)} mm from the centre: must stay on the pad of {_mm(size)} mm"
-        raise _error(sensor, "markers.pitch_mm", _mm(markers.pitch), rule)
+        rule = f"the grid reaches {in_mm(reach)} mm from the centre: must stay on the pad of {in_mm(size)} mm"
+        raise _error(sensor, "markers.pitch_mm", in_mm(markers.pitch), rule)
 
 
 def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     pad, back = sensor.gelpad, _back_face(sensor)
     half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
-    file, key, value = sensor.lights.source, f"led[{index}].position_mm", _mm(led.position)
     for x, y, z in (led.position, *led_corners(led)):
-        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
-            rule = f"LED {led.name!r} lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
-            raise SpecError(rule, file=file, key=key, value=value)
         rest = -pad.sag(min(abs(x), half_x), min(abs(y), half_y))
-        if z > rest + _SLACK:
-            rule = f"LED {led.name!r} lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
-            raise SpecError(rule, file=file, key=key, value=value)
-        if not _in_case(sensor, (x, y, z)):
-            rule = f"LED {led.name!r}, {_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
-            raise SpecError(rule, file=file, key=key, value=value)
+        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
+            rule = f" lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
+        elif z > rest + _SLACK:
+            rule = f" lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
+        elif not _in_case(sensor, (x, y, z)):
+            rule = f", {in_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
+        else:
+            continue
+        key = f"led[{index}].position_mm"
+        raise SpecError(f"LED {led.name!r}{rule}", file=sensor.lights.source, key=key, value=in_mm(led.position))
 
 
 def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     """Corners of the emitting rectangle, pad frame [m], by the convention of ``LedSpec.size``."""
-    u, v = led.edges
     a, b = led.size[0] / 2, led.size[1] / 2
-    p = led.position
 
     def corner(s: float, t: float) -> Vec3:
-        return (p[0] + s * u[0] + t * v[0], p[1] + s * u[1] + t * v[1], p[2] + s * u[2] + t * v[2])
+        x, y, z = (p + s * u + t * v for p, u, v in zip(led.position, *led.edges, strict=True))
+        return x, y, z
 
     return corner(-a, -b), corner(a, -b), corner(a, b), corner(-a, b)
 
@@ -215,10 +209,6 @@ def _in_case(sensor: SensorSpec, point: Vec3) -> bool:
 def _case_rule(sensor: SensorSpec) -> str:
     (sx, sy), floor = sensor.case.size, sensor.case.floor_z
     return f"|x| <= {sx * 500:.4g} mm, |y| <= {sy * 500:.4g} mm, z >= {floor * 1e3:.4g} mm"
-
-
-def _mm(values: tuple[float, ...] | list[float]) -> list[float]:
-    return [float(f"{v * 1e3:.6g}") for v in values]
 
 
 def _error(sensor: SensorSpec, key: str, value: object, rule: str) -> SpecError:

@@ -15,17 +15,7 @@ from raytac.errors import MeshError, SpecError
 from raytac.specs.files import is_file
 from raytac.specs.mesh import load_mesh
 from raytac.specs.mesh_crossing import find_crossings
-from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, split_unit
-
-__all__ = [
-    "OBJECT_SCHEMA",
-    "check_params",
-    "check_quaternion",
-    "check_shape",
-    "resolved",
-    "unit_quaternion",
-    "warn_of_crossings",
-]
+from raytac.specs.toml import Integer, Number, Schema, Table, Text, check_fields, in_mm, split_unit
 
 _LENGTH = Number("(0, 100]")
 
@@ -81,9 +71,8 @@ def check_params(kind: str, params: Mapping[str, Any], schema: Schema, prefix: s
     known = [split_unit(key)[0] for key in schema]
     for name in params:
         if name not in known:
-            raise SpecError(
-                f"is no length or count of the kind {kind!r}", key=f"{prefix}.{name}", value=params[name], choices=known
-            )
+            rule = f"is no length or count of the kind {kind!r}"
+            raise SpecError(rule, key=f"{prefix}.{name}", value=params[name], choices=known)
     _check_lengths(kind, params, prefix, None)
 
 
@@ -118,16 +107,16 @@ def _check_lengths(kind: str, p: Mapping[str, Any], prefix: str, file: Path | No
     """Lengths [m] of one object that contradict each other."""
     key = rule = ""
     if kind == "cone" and p["tip_radius"] >= p["radius"]:
-        key, rule = "tip_radius_mm", f"must be less than radius_mm = {_mm(p['radius'])}"
+        key, rule = "tip_radius_mm", f"must be less than radius_mm = {in_mm(p['radius'])}"
     elif kind == "torus" and p["minor_radius"] >= p["major_radius"]:
-        key, rule = "minor_radius_mm", f"must be less than major_radius_mm = {_mm(p['major_radius'])}"
+        key, rule = "minor_radius_mm", f"must be less than major_radius_mm = {in_mm(p['major_radius'])}"
     elif kind == "pins" and p["rows"] * p["columns"] > 1 and p["pitch"] < 2 * p["pin_radius"]:
-        key, rule = "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {_mm(p['pin_radius'])}"
+        key, rule = "pitch_mm", f"pins must not overlap: at least twice pin_radius_mm = {in_mm(p['pin_radius'])}"
     elif kind == "coin" and p["relief_height"] >= p["thickness"]:
-        key, rule = "relief_height_mm", f"must be less than thickness_mm = {_mm(p['thickness'])}"
+        key, rule = "relief_height_mm", f"must be less than thickness_mm = {in_mm(p['thickness'])}"
     if key:
         dotted = f"{prefix}.{key}" if prefix else key
-        raise SpecError(rule, file=file, key=dotted, value=_mm(p[key.removesuffix("_mm")]))
+        raise SpecError(rule, file=file, key=dotted, value=in_mm(p[key.removesuffix("_mm")]))
 
 
 def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:
@@ -147,7 +136,3 @@ def warn_of_crossings(path: str, vertices: np.ndarray, faces: np.ndarray) -> Non
     if crossings:
         text = crossings.text(1e-3, "mm")
         warnings.warn(f"mesh {path}: {text}; the rigid pad takes its lowest faces, physics='ipc' refuses it", stacklevel=3)
-
-
-def _mm(length: float) -> float:
-    return float(f"{length * 1e3:.6g}")

@@ -12,8 +12,6 @@ from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.toml import ANY, REQUIRED, Integer, Number, Schema, Text, check_fields, split_unit
 
-__all__ = ["MARKER_NOISE_SCHEMA", "RANDOMIZATION_SCHEMA", "RANGE_SCHEMA", "SWEEP_SCHEMA", "PressRanges", "Range", "SweepSpec"]
-
 Range = tuple[float, float]
 """Least and greatest value; draws are uniform between them."""
 

@@ -11,8 +11,6 @@ from raytac.specs.sensor_file import load_sensor
 from raytac.specs.sweep import MARKER_NOISE_SCHEMA, RANDOMIZATION_SCHEMA, RANGE_SCHEMA, SWEEP_SCHEMA, PressRanges, SweepSpec
 from raytac.specs.toml import Table, read_toml
 
-__all__ = ["load_sweep"]
-
 
 def load_sweep(name_or_path: str | Path) -> SweepSpec:
     """Read and check a sweep, with the sensors and press scenes that it names.
@@ -30,17 +28,9 @@ def load_sweep(name_or_path: str | Path) -> SweepSpec:
     values = top.read(SWEEP_SCHEMA, sections=("press", "randomization"))
     sensors = tuple(load_sensor(find_file("sensor", name, base=path.parent)) for name in values.pop("sensors"))
     objects = tuple(load_press(find_file("press scene", name, base=path.parent)) for name in values.pop("objects"))
-    randomization, markers = _read_randomization(top)
-    return SweepSpec(
-        name_of(path),
-        sensors,
-        objects,
-        ranges=_read_ranges(top.section("press")),
-        randomization=randomization,
-        marker_perturbation=markers,
-        source=path,
-        **values,
-    )
+    values["ranges"] = _read_ranges(top.section("press"))
+    values["randomization"], values["marker_perturbation"] = _read_randomization(top)
+    return SweepSpec(name_of(path), sensors, objects, source=path, **values)
 
 
 def _read_ranges(table: Table) -> PressRanges:

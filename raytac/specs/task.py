@@ -15,24 +15,6 @@ from raytac.specs.sensor import SensorSpec, Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
 from raytac.specs.toml import ANY, Number, Schema, Text, check_fields
 
-__all__ = [
-    "BODY_SCHEMA",
-    "COUPLINGS",
-    "MOTIONS",
-    "MOUNT_SCHEMA",
-    "OWNERS",
-    "PAIR_FRICTION",
-    "ROBOTS",
-    "ROBOT_SCHEMA",
-    "SHAPE_SCHEMA",
-    "TASK_SCHEMA",
-    "BodySpec",
-    "MountSpec",
-    "Quaternion",
-    "RobotSpec",
-    "TaskScene",
-]
-
 ROBOTS = ("panda_one_sensor", "panda_two_fingers", "floating_gripper", "fixed_sensor")
 """Robots that raytac builds itself; any other is the path of an MJCF file."""
 OWNERS = ("ipc", "mujoco")

@@ -22,9 +22,7 @@ from raytac.specs.task import (
     RobotSpec,
     TaskScene,
 )
-from raytac.specs.toml import Schema, Table, Text, read_toml, split_unit
-
-__all__ = ["load_scene", "load_task"]
+from raytac.specs.toml import Table, Text, read_toml, split_unit
 
 _OWN: Final = {
     "panda_one_sensor": ("joints_deg",),
@@ -115,7 +113,7 @@ def _read_mount(table: Table) -> MountSpec:
 def _read_body(table: Table) -> BodySpec:
     kind = table.read_one("kind", Text(choices=tuple(SHAPE_SCHEMA)))
     values = table.read({"kind": Text(), **BODY_SCHEMA, **SHAPE_SCHEMA[kind]})
-    own = {key: values.pop(key) for key in _names(SHAPE_SCHEMA[kind])}
+    own = {name: values.pop(name) for name in (split_unit(key)[0] for key in SHAPE_SCHEMA[kind])}
     del values["kind"]
     check_shape(table, kind, own)
     values["quaternion"] = unit_quaternion(table, values["quaternion"])
@@ -130,10 +128,6 @@ def _read_body(table: Table) -> BodySpec:
     optional = ("owner", "density", "youngs_modulus", "poisson_ratio")
     values = {key: value for key, value in values.items() if not (key in optional and value is None)}
     return BodySpec(kind=kind, params=own, **values)
-
-
-def _names(schema: Schema) -> list[str]:
-    return [split_unit(key)[0] for key in schema]
 
 
 def _check_names(tables: tuple[Table, ...], bodies: tuple[BodySpec, ...]) -> None:

@@ -10,28 +10,13 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from raytac.checks import Interval, is_number, is_whole
 from raytac.errors import SpecError
-
-__all__ = [
-    "ANY",
-    "REQUIRED",
-    "Flag",
-    "Integer",
-    "Number",
-    "Schema",
-    "Table",
-    "Text",
-    "Unit",
-    "check_fields",
-    "read_toml",
-    "split_unit",
-]
 
 REQUIRED: Final = object()
 """Default of a field that a file must give."""
@@ -84,6 +69,10 @@ class Unit:
             return float(f"{float(value) * self.denominator / self.numerator:.6g}")
         except OverflowError:  # an integer beyond all floats
             return value
+
+
+in_mm = Unit(*_UNITS["mm"]).shown
+"""A length or several [m] as a file writes them [mm]."""
 
 
 def split_unit(key: str) -> tuple[str, Unit]:
@@ -146,14 +135,16 @@ class Number(_Field):
     default: Any = REQUIRED
     word: str = ""
     _range: Interval = field(init=False, repr=False)
+    _noun: ClassVar = "number"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_range", Interval.parse(self.interval))
 
     def rule(self, unit: Unit) -> str:
-        many = "a list of numbers, each" if self.length == ANY else f"{self.length} numbers, each"
+        many = "a list of" if self.length == ANY else self.length
+        what = f"{many} {self._noun}s, each" if self.length else f"a {self._noun}"
         word = f', or "{self.word}"' if self.word else ""
-        return f"must be {many if self.length else 'a number'} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
+        return f"must be {what} in {self.interval}{' ' + unit.text if unit.text else ''}{word}"
 
     def parse(self, value: object, unit: Unit) -> float | str | tuple[float, ...]:
         return self.word if self.word and value == self.word else super().parse(value, unit)
@@ -170,31 +161,34 @@ class Number(_Field):
             raise self.refused(unit)
         return si
 
-    def check(self, value: object, unit: Unit) -> None:
+    def check(self, value: Any, unit: Unit) -> None:
         if self.word and isinstance(value, str) and value == self.word:
             return
-        _check_items(self, value, is_number, _in_si(self._range, unit), unit)
+        items: Any = (value,)
+        if self.length:
+            if not isinstance(value, (tuple, list)) or (len(value) != self.length and not (self.length == ANY and value)):
+                raise self.refused(unit)
+            items = value
+        interval = _in_si(self._range, unit)
+        if not all(self._is_kind(item) and item in interval for item in items):
+            raise self.refused(unit)
+
+    def _is_kind(self, value: object) -> bool:
+        return is_number(value)
 
 
-@dataclass(frozen=True)
-class Integer(_Field):
+class Integer(Number):
     """A whole number, or ``length`` of them, in ``interval``."""
 
-    interval: str
-    length: int = 0
-    default: Any = REQUIRED
-
-    def rule(self, unit: Unit) -> str:
-        number = f"{self.length} whole numbers, each" if self.length else "a whole number"
-        return f"must be {number} in {self.interval}{' ' + unit.text if unit.text else ''}"
+    _noun = "whole number"
 
     def _one(self, value: object, unit: Unit) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value not in Interval.parse(self.interval):
+        if isinstance(value, bool) or not isinstance(value, int) or value not in self._range:
             raise self.refused(unit)
         return value
 
-    def check(self, value: object, unit: Unit) -> None:
-        _check_items(self, value, is_whole, Interval.parse(self.interval), unit)
+    def _is_kind(self, value: object) -> bool:
+        return is_whole(value)
 
 
 @dataclass(frozen=True)
@@ -249,18 +243,7 @@ def _in_si(interval: Interval, unit: Unit) -> Interval:
     return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
 
 
-def _check_items(spec: _Field, value: Any, is_kind: Callable[[object], bool], interval: Interval, unit: Unit) -> None:
-    """Refuse what is not one number of a kind in ``interval``, or as many of them as the field's ``length`` says."""
-    items: Sequence[Any] = (value,)
-    if spec.length:
-        if not isinstance(value, (tuple, list)) or (len(value) != spec.length and not (spec.length == ANY and value)):
-            raise spec.refused(unit)
-        items = value
-    if not all(is_kind(item) and item in interval for item in items):
-        raise spec.refused(unit)
-
-
-Schema = Mapping[str, Number | Integer | Text | Flag]
+Schema = Mapping[str, Number | Text | Flag]
 
 
 def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
@@ -298,12 +281,8 @@ class Table:
         """An error about ``key`` of this table (about the whole table if empty)."""
         return SpecError(rule, file=self.file, key=self._dotted(key), value=value, choices=choices)
 
-    def read_one(self, key: str, spec: Number | Integer | Text | Flag) -> Any:
-        """One field in SI, checked; the other keys of the table are left alone.
-
-        Raises:
-            SpecError: missing key, wrong type, or a value out of its range.
-        """
+    def read_one(self, key: str, spec: Number | Text | Flag) -> Any:
+        """One field in SI. Raises ``SpecError``: missing key, wrong type, value out of range."""
         _, unit = split_unit(key)
         if key not in self.data:
             if spec.default is REQUIRED:
@@ -348,11 +327,7 @@ class Table:
 
 
 def read_toml(path: Path) -> Table:
-    """The top table of a TOML file.
-
-    Raises:
-        SpecError: the file is missing, cannot be read, is longer than ``_LARGEST``, or is not TOML.
-    """
+    """The top table of a file. Raises ``SpecError``: missing, unreadable, too long, or no TOML."""
     try:
         with path.open("rb") as stream:
             text = stream.read(_LARGEST + 1)

@@ -1,7 +1,4 @@
-"""The page: buttons, sliders, images and figures around the 3-D view.
-
-It forwards what users do, and draws what the player reports.
-"""
+"""The page around the 3-D view: it forwards what users do, and draws what the player reports."""
 
 from __future__ import annotations
 
@@ -18,8 +15,6 @@ from raytac.view.session import QUANTITIES, Control, PadView, Session, Snapshot
 
 if TYPE_CHECKING:
     from viser import GuiEvent, GuiSliderHandle, ViserServer
-
-__all__ = ["ARROW_SCALE", "Page", "picture"]
 
 _MODES = {
     "starting": "computing the first image …",
@@ -210,9 +205,8 @@ _RIGHT = "text-align:right"
 
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:
-    cells = "".join(
-        f"<tr><td>{html.escape(label)}</td><td style='{_RIGHT}'>{html.escape(value)}</td></tr>" for label, value in rows
-    )
+    row = f"<tr><td>{{}}</td><td style='{_RIGHT}'>{{}}</td></tr>"
+    cells = "".join(row.format(html.escape(label), html.escape(value)) for label, value in rows)
     return f"<table style='{_TABLE}'>{cells}</table>"
 
 
@@ -252,9 +246,9 @@ def picture(pad: PadView, *, arrows: bool) -> np.ndarray | None:
             draw.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=_INK)
             continue
         end = np.array([x + dx, y + dy])
-        draw.line([(x, y), (float(end[0]), float(end[1]))], fill=_INK, width=2)
+        draw.line([(x, y), tuple(end.tolist())], fill=_INK, width=2)
         along, across = np.array([dx, dy]) / length, np.array([-dy, dx]) / length
         head = min(7.0, 0.5 * length)
         tip = [end, end - head * along + 0.45 * head * across, end - head * along - 0.45 * head * across]
-        draw.polygon([(float(px), float(py)) for px, py in tip], fill=_INK)
+        draw.polygon([tuple(point.tolist()) for point in tip], fill=_INK)
     return np.asarray(image)

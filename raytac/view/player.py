@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from raytac.errors import InputError, RaytacError
 from raytac.view.session import Session, Snapshot
 
-__all__ = ["Player", "Status"]
-
 _FASTEST = 1.0 / 30.0
 """Least time between two states while playing [s]: no browser shows more, and a slow line is not flooded."""
 _SMOOTH = 0.8
@@ -69,10 +67,7 @@ class Player:
         self._thread.start()
 
     def close(self, patience: float | None = None) -> bool:
-        """End the thread after the state it is computing; True if it ended within ``patience`` seconds.
-
-        None waits however long it takes.
-        """
+        """End after the state that is computed; True if within ``patience`` [s] (None: any time)."""
         with self._wakeup:
             self._is_closing = True
             self._wakeup.notify()
@@ -95,11 +90,7 @@ class Player:
         self._order("reset")
 
     def drive(self, name: str, value: float) -> None:
-        """Take a control to ``value``.
-
-        Raises:
-            InputError: no control of that name.
-        """
+        """Take a control to ``value``. Raises ``InputError`` for an unknown control."""
         if name not in self._names:
             raise InputError("name", value=name, rule="must be a control of the session", choices=self._names)
         with self._wakeup:

@@ -15,24 +15,21 @@ from raytac.physics.base import PadReading
 from raytac.physics.soft.bodies import OBJECT, PAD
 from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import TactileSensor
-from raytac.shapes.part import Part
 from raytac.shapes.triangulate import object_surface
 from raytac.specs import PressScene, validate_press
 from raytac.specs.press import StageSpec
 from raytac.view.sensor_view import (
-    MESH_COLOUR,
-    MESH_WIDTH,
     coat_edges,
-    grid_faces,
+    coat_lines,
+    coat_pad,
     narrow_warning,
     pad_view,
     sensor_lines,
     sensor_solids,
+    square,
     strided,
 )
-from raytac.view.session import CameraPlace, Control, Lines, Pad, Snapshot, Solid, check_targets, reaching
-
-__all__ = ["PressSession"]
+from raytac.view.session import CameraPlace, Control, Snapshot, Solid, check_targets, reaching
 
 _STRIDE_MM, _TURN_DEG, _PUSH = 0.1, 2.0, 0.25
 """Largest change from one state to the next towards a slider's value: [mm], [degrees], [N]."""
@@ -77,10 +74,10 @@ class PressSession:
         self.camera = CameraPlace((0.9 * size, -1.75 * size, 1.35 * size), (0.0, 0.0, -0.15 * size))
         self._own_controls = self._make_controls(scene) if self._is_drivable else ()
         self._grid = strided(self._pad.grid)
-        quantities = ("indentation", *(("pressure", "shear") if "traction" in sensor.outputs else ()))
-        self.pads = (Pad(sensor.spec.name, grid_faces(self._grid), quantities),)
+        self.pads = (coat_pad(sensor.spec.name, sensor, self._grid),)
         self.solids = (*sensor_solids(sensor.spec), *self._object_solids())
-        self.lines = (*sensor_lines(sensor.spec), *self._coat_lines())
+        coat = (coat_lines("coat_mesh"),) if isinstance(self._pad, SoftPad) else ()
+        self.lines = (*sensor_lines(sensor.spec), *coat)
         self._targets: dict[str, float] = {}
         """Controls that were moved and hold the object, in their own unit."""
         self._states: Iterator[PadReading] = iter(())
@@ -120,9 +117,8 @@ class PressSession:
             return False
         if state.failed[0]:
             self._states, self._has_ended = iter(()), True
-            raise RaytacError(
-                "the physics broke down here: the state did not settle or is not finite; reset, or try smaller steps"
-            )
+            text = "the physics broke down here: the state did not settle or is not finite; reset, or try smaller steps"
+            raise RaytacError(text)
         self._state, self._shot = state, None
         self.controls = reaching(self.controls, self._places())
         return True
@@ -140,18 +136,8 @@ class PressSession:
         thickness = 1e3 * self._sensor.spec.gelpad.thickness
         deepest = max([_DEEPEST * thickness, *(1e3 * (stage.depth or 0.0) for stage in scene.trajectory)])
         return (
-            Control(
-                "depth",
-                "depth [mm]",
-                0.0,
-                round(deepest, 2),
-                0.01,
-                "Below first touch; 0 lifts the object off",
-                instead_of="force",
-            ),
-            Control(
-                "force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear and twist", instead_of="depth"
-            ),
+            Control("depth", "depth [mm]", 0.0, round(deepest, 2), 0.01, "Below first touch; 0 lifts the object off", "force"),
+            Control("force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear and twist", "depth"),
             Control("shear_x", "shear x [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("shear_y", "shear y [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),
@@ -201,10 +187,11 @@ class PressSession:
         if closed:
             surface = object_surface(closed, _SAG)
             shapes.append(Solid("object", surface.vertices, surface.faces, _OBJECT_COLOUR, hides_pads=True))
+        corners, faces = square(2.0 * max(self._sensor.spec.gelpad.size))
         for k, part in enumerate(p for p in self._pad.parts if p.kind == "plane"):
-            shapes.append(
-                Solid(f"object_plane_{k}", *_square(part, 2.0 * max(self._sensor.spec.gelpad.size)), _OBJECT_COLOUR, 0.5)
-            )
+            pose = part.object_from_part
+            vertices = corners @ pose[:3, :3].T + pose[:3, 3]
+            shapes.append(Solid(f"object_plane_{k}", vertices, faces, _OBJECT_COLOUR, 0.5))
         return tuple(shapes)
 
     def _soft_object(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -215,19 +202,13 @@ class PressSession:
         vertices, faces = solver.scene.mesh(OBJECT, PAD)
         return vertices[0], faces
 
-    def _coat_lines(self) -> tuple[Lines, ...]:
-        """Edges of the soft pad's own mesh over the smooth coat."""
-        if not isinstance(self._pad, SoftPad):
-            return ()
-        return (Lines("coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH),)  # laid on the first state's surface
-
     def _drawn(self, frame: TactileFrame, image_ms: float) -> Snapshot:
         name, surface = self._sensor.spec.name, frame.surface
         poses = {solid.name: self._state.pad_from_object[0] for solid in self.solids if solid.name.startswith("object")}
         reshaped: dict[str, np.ndarray] = {}
         if isinstance(self._pad, SoftPad):
             if surface.coat is not None:
-                reshaped["coat_mesh"] = coat_edges(surface.coat.mesh, surface.coat.positions[0], surface, self._grid)
+                reshaped["coat_mesh"] = coat_edges(surface, self._grid)
             soft = self._soft_object()
             if soft is not None:
                 reshaped["object"], poses["object"] = soft[0], np.eye(4)
@@ -256,11 +237,3 @@ class PressSession:
 
 def _steps(share: float) -> int:
     return max(int(np.ceil(abs(share))), 1)
-
-
-def _square(part: Part, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """A square of the plane z = 0 of a part, object frame: vertices and faces, seen from both sides."""
-    corners = 0.5 * size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    pose = part.object_from_part
-    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
-    return corners @ pose[:3, :3].T + pose[:3, 3], faces

@@ -14,8 +14,6 @@ from raytac.view.session import PadView, Quantity, Session, Snapshot, round_up
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
 
-__all__ = ["ColourScale", "SceneView", "coloured_glb", "legend_html", "split_creases", "vertex_normals"]
-
 _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 
@@ -48,23 +46,14 @@ class SceneView:
         for solid in session.solids:
             source, faces = split_creases(solid.vertices, solid.faces)
             self._sources[solid.name] = source
-            self._solids[solid.name] = scene.add_mesh_simple(
-                f"/solids/{solid.name}",
-                scale * solid.vertices[source],
-                faces,
-                color=solid.colour,
-                opacity=_opacity(solid.opacity),
-            )
-        self._lines = {
-            lines.name: scene.add_line_segments(
-                f"/lines/{lines.name}",
-                _f32(scale * lines.segments),
-                lines.colour,
-                thickness=lines.width,
-                thickness_units="screen",
-            )
-            for lines in session.lines
-        }
+            look = {"color": solid.colour, "opacity": _opacity(solid.opacity)}
+            vertices = scale * solid.vertices[source]
+            self._solids[solid.name] = scene.add_mesh_simple(f"/solids/{solid.name}", vertices, faces, **look)
+        self._lines = {}
+        for lines in session.lines:
+            look = {"thickness": lines.width, "thickness_units": "screen"}
+            segments = _f32(scale * lines.segments)
+            self._lines[lines.name] = scene.add_line_segments(f"/lines/{lines.name}", segments, lines.colour, **look)
         self._hiding = {solid.name: solid.opacity for solid in session.solids if solid.hides_pads}
         self._placed: dict[str, np.ndarray] = {}
         """Pose that each solid and line was drawn at last."""
@@ -107,17 +96,14 @@ class SceneView:
                     self._lines[name].points = _f32(self._scale * points)
             for name, view in snapshot.pads.items():
                 values = view.values[quantity if quantity in view.values else "indentation"]
-                glb = coloured_glb(
-                    self._scale * np.nan_to_num(view.vertices), self._pads[name].faces, scales[quantity].colours(values)
-                )
-                pose = view.world_from_pad
+                vertices, colours = self._scale * np.nan_to_num(view.vertices), scales[quantity].colours(values)
+                glb = coloured_glb(vertices, self._pads[name].faces, colours)
+                position, wxyz = self._scale * view.world_from_pad[:3, 3], quaternion(view.world_from_pad[:3, :3])
                 if name in self._coats:
                     coat = self._coats[name]
-                    coat.glb_data = glb
-                    coat.position, coat.wxyz = self._scale * pose[:3, 3], quaternion(pose[:3, :3])
+                    coat.glb_data, coat.position, coat.wxyz = glb, position, wxyz
                 else:
-                    place = {"position": self._scale * pose[:3, 3], "wxyz": quaternion(pose[:3, :3])}
-                    self._coats[name] = self._server.scene.add_glb(f"/coats/{name}", glb, **place)
+                    self._coats[name] = self._server.scene.add_glb(f"/coats/{name}", glb, position=position, wxyz=wxyz)
 
 
 def _opacity(opacity: float) -> float | None:
@@ -185,12 +171,8 @@ def coloured_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -
     text += b" " * (-len(text) % 4)
     binary = b"".join(array.tobytes() for array, *_ in blocks)  # every block is a multiple of four bytes long
     total = 12 + 8 + len(text) + 8 + len(binary)
-    heads = (
-        struct.pack("<4sII", b"glTF", 2, total),
-        struct.pack("<I4s", len(text), b"JSON"),
-        struct.pack("<I4s", len(binary), b"BIN\0"),
-    )
-    return heads[0] + heads[1] + text + heads[2] + binary
+    head = struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def _linear_u8(colours: np.ndarray) -> np.ndarray:
@@ -205,9 +187,7 @@ _SHARP = 35.0
 
 
 def split_creases(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give both sides of every sharp edge vertices of their own.
-
-    Normals that are averaged over the faces of a vertex are then right.
+    """Give both sides of every sharp edge vertices of their own, for normals by vertex.
 
     Args:
         vertices: shape (V, 3).
@@ -253,28 +233,22 @@ def _joined(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         label = lowered
 
 
-_MAP = "viridis"
-
-
 def _table() -> np.ndarray:
     """The colour map's 256 entries, 8-bit sRGB, (256, 3)."""
     from matplotlib import colormaps
 
-    return np.rint(255.0 * colormaps[_MAP](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    return np.rint(255.0 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
 
 
 class ColourScale:
-    """Scale from 0 to a round number that is at least the greatest value since ``reset``.
-
-    Colours thus keep their meaning in a motion.
-    """
+    """Scale from 0 to a round number that is at least the greatest value since ``reset``."""
 
     def __init__(self, quantity: Quantity) -> None:
-        self.quantity = quantity
-        self._table = _table()
-        self.full = quantity.least
+        self.quantity, self._table = quantity, _table()
+        self.reset()
 
     def reset(self) -> None:
+        """Begin again, at the least full scale of the quantity."""
         self.full = self.quantity.least
 
     def include(self, values: np.ndarray) -> None:

@@ -5,32 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from raytac.frame import TactileFrame
-from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.surface import GelSurface, PadGrid, rest_height
 from raytac.physics.soft.contact_width import LEAST_CELLS
+from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
-from raytac.view.session import Lines, PadView, Solid
-
-__all__ = [
-    "MESH_COLOUR",
-    "MESH_WIDTH",
-    "coat_edges",
-    "gel_solid",
-    "grid_faces",
-    "narrow_warning",
-    "pad_view",
-    "sensor_lines",
-    "sensor_solids",
-    "strided",
-]
+from raytac.view.session import Lines, Pad, PadView, Solid
 
 _MOST_VERTICES = 12_000
 """Of a drawn coat: what goes to the browser with every state; finer grids are thinned out."""
 _CLEAR = 2e-5
 """Height of lines above the faces below them [m]."""
-MESH_COLOUR, MESH_WIDTH = (205, 212, 222), 0.8
-"""Of a soft pad's own mesh over its smooth coat; the width on the screen [px]."""
-_GEL, _CASE, _VIEW = (176, 205, 212), (105, 112, 122), (190, 150, 60)
+_GEL, _CASE, _VIEW, _MESH = (176, 205, 212), (105, 112, 122), (190, 150, 60), (205, 212, 222)
 
 
 def strided(grid: PadGrid) -> PadGrid:
@@ -47,6 +32,22 @@ def _thinned(count: int, step: int) -> np.ndarray:
     """Every ``step``-th of ``count`` numbers and the last."""
     taken = np.arange(0, count, step)
     return taken if taken[-1] == count - 1 else np.append(taken, count - 1)
+
+
+def coat_pad(name: str, sensor: TactileSensor, grid: PadGrid) -> Pad:
+    """The coat of a sensor over the nodes of ``grid``, with the quantities that it outputs."""
+    return Pad(name, grid_faces(grid), ("indentation", *(("pressure", "shear") if "traction" in sensor.outputs else ())))
+
+
+def coat_lines(name: str) -> Lines:
+    """Edges of a soft pad's own mesh over its smooth coat; the first frame's ``coat_edges`` say where and how many."""
+    return Lines(name, np.zeros((1, 2, 3)), _MESH, 0.8)
+
+
+def square(size: float) -> tuple[np.ndarray, np.ndarray]:
+    """A square of ``size`` [m] of the plane z = 0 about the origin: vertices and faces, seen from both sides."""
+    corners = 0.5 * size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
 
 
 def grid_faces(grid: PadGrid) -> np.ndarray:
@@ -89,17 +90,19 @@ def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
     )
 
 
-def coat_edges(mesh: CoatMesh, vertices: np.ndarray, surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
-    """Grid lines of a simulated coat on the surface that is drawn, as segments (N, 2, 3) [m].
+def coat_edges(surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
+    """Grid lines of a soft pad's coat on the surface that is drawn, as segments (N, 2, 3) [m].
+
+    The heights of the mesh's vertices do not count, since the surface is curved between them.
 
     Args:
-        mesh: of the coat.
-        vertices: where its vertices are now, shape (V, 3) [m]; their heights do not count, since between them the surface is curved.
-        surface: what is drawn, of environment ``env``.
+        surface: with a coat.
         grid: nodes of ``surface`` that are drawn (from ``strided``).
+        env: environment.
     """
-    rows, columns = mesh.shape
-    at = vertices[:, :2].reshape(rows, columns, 2)
+    assert surface.coat is not None
+    mesh = surface.coat.mesh
+    at = surface.coat.positions[env][:, :2].reshape(*mesh.shape, 2)
     along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 2)
     ends = np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 2)])
     wanted = int(np.ceil(max(np.diff(mesh.lines_x).max(), np.diff(mesh.lines_y).max()) / (0.5 * min(grid.pitch))))
@@ -135,8 +138,24 @@ def _places(full: PadGrid, grid: PadGrid) -> tuple[np.ndarray, ...]:
 
 
 def gel_solid(spec: SensorSpec, name: str = "gel") -> Solid:
-    """The gel block below its coat, see-through; pad frame."""
-    return Solid(name, *_block(spec), _GEL, 0.35)
+    """The gel block below its coat, see-through, down from the resting edge of the coat; pad frame."""
+    gel = spec.gelpad
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, 25) for size in gel.size)
+    around = np.concatenate(
+        [
+            np.column_stack([x[:-1], np.full(24, y[0])]),
+            np.column_stack([np.full(24, x[-1]), y[:-1]]),
+            np.column_stack([x[:0:-1], np.full(24, y[-1])]),
+            np.column_stack([np.full(24, x[0]), y[:0:-1]]),
+        ]
+    )
+    top = np.column_stack([around, rest_height(gel, around[:, 0], around[:, 1])])
+    back = np.column_stack([around, np.full(len(around), -gel.thickness)])
+    n = len(around)
+    here, after = np.arange(n), (np.arange(n) + 1) % n
+    sides = np.concatenate([np.stack([here + n, after + n, after], 1), np.stack([here + n, after, here], 1)])
+    floor = np.stack([np.full(n - 2, n), np.arange(n + 2, 2 * n), np.arange(n + 1, 2 * n - 1)], axis=1)
+    return Solid(name, np.concatenate([top, back]), np.concatenate([sides, floor]), _GEL, 0.35)
 
 
 def sensor_solids(spec: SensorSpec) -> tuple[Solid, ...]:
@@ -151,30 +170,10 @@ def sensor_lines(spec: SensorSpec) -> tuple[Lines, ...]:
     camera = spec.camera
     (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
     eye = np.asarray(camera.position)
-    corners = np.array([[u, v] for u, v in ((0, 0), (width, 0), (width, height), (0, height))], float)
+    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], float)
     seen = np.column_stack([eye[0] + (corners[:, 0] - cx) * px, eye[1] + (corners[:, 1] - cy) * py, np.zeros(4)])
     rays = [np.stack([np.broadcast_to(eye, (4, 3)), seen], axis=1), np.stack([seen, np.roll(seen, -1, axis=0)], axis=1)]
     return Lines("case", case, _CASE), Lines("camera_view", np.concatenate(rays), _VIEW)
-
-
-def _block(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Sides and back of the gel as triangles, under the resting edge of the coat."""
-    gel = spec.gelpad
-    x, y = (np.linspace(-0.5 * size, 0.5 * size, 25) for size in gel.size)
-    around = np.concatenate(
-        [
-            np.column_stack([x[:-1], np.full(24, y[0])]),
-            np.column_stack([np.full(24, x[-1]), y[:-1]]),
-            np.column_stack([x[:0:-1], np.full(24, y[-1])]),
-            np.column_stack([np.full(24, x[0]), y[:0:-1]]),
-        ]
-    )
-    top = np.column_stack([around, rest_height(gel, around[:, 0], around[:, 1])])
-    back = np.column_stack([around, np.full(len(around), -gel.thickness)])
-    here, after, n = np.arange(len(around)), (np.arange(len(around)) + 1) % len(around), len(around)
-    sides = np.concatenate([np.stack([here + n, after + n, after], 1), np.stack([here + n, after, here], 1)])
-    floor = np.stack([np.full(n - 2, n), np.arange(n + 2, 2 * n), np.arange(n + 1, 2 * n - 1)], axis=1)
-    return np.concatenate([top, back]), np.concatenate([sides, floor])
 
 
 def _lights(spec: SensorSpec) -> tuple[Solid, ...]:
@@ -183,7 +182,7 @@ def _lights(spec: SensorSpec) -> tuple[Solid, ...]:
         u, v = np.asarray(led.edges)
         half_u, half_v = 0.5 * led.size[0] * u, 0.5 * led.size[1] * v
         corners = np.asarray(led.position) + np.array([-half_u - half_v, half_u - half_v, half_u + half_v, half_v - half_u])
-        faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
+        faces = square(1.0)[1]
         power = np.asarray(led.power)
         red, green, blue = (round(60 + 195 * float(p)) for p in power / max(float(power.max()), 1e-12))
         lights.append(Solid(f"leds/{led.name}", corners, faces, (red, green, blue)))

@@ -1,7 +1,4 @@
-"""viser's server behind a guard: addresses of the page, and checked messages.
-
-Requests of other pages are refused, and messages are checked before viser sees them.
-"""
+"""viser's server behind a guard: other pages are refused, and messages checked before viser sees them."""
 
 from __future__ import annotations
 
@@ -25,8 +22,6 @@ from raytac.errors import BackendError, InputError
 
 if TYPE_CHECKING:
     from viser import ViserServer
-
-__all__ = ["LARGEST", "BadMessage", "PageAddresses", "checked_message", "guarded_server", "one_line"]
 
 _LOG = logging.getLogger("raytac.view")
 _FAULTS = (CloseCode.PROTOCOL_ERROR, CloseCode.INVALID_DATA, CloseCode.MESSAGE_TOO_BIG)
@@ -140,10 +135,7 @@ def _who(connection: ServerConnection) -> str:
 
 
 class _OneLine(logging.Filter):
-    """Logs faults of a connection in one line, without a traceback; a request that is no HTTP, or never comes, not at all.
-
-    Browsers open connections ahead that they then do not use.
-    """
+    """Logs faults of a connection in one line. Connections that browsers open ahead are none."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if record.msg == "opening handshake failed":

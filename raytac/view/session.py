@@ -15,22 +15,6 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = [
-    "QUANTITIES",
-    "CameraPlace",
-    "Control",
-    "Lines",
-    "Pad",
-    "PadView",
-    "Quantity",
-    "Session",
-    "Snapshot",
-    "Solid",
-    "check_targets",
-    "reaching",
-    "round_up",
-]
-
 Colour = tuple[int, int, int]
 """8-bit sRGB."""
 
@@ -84,15 +68,15 @@ def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> 
 
 def reaching(controls: Sequence[Control], places: Mapping[str, float]) -> tuple[Control, ...]:
     """The controls with ends moved out to a round number wherever something is beyond them, so that a slider can show it."""
-    return tuple(_reaching(control, places.get(control.name, control.low)) for control in controls)
-
-
-def _reaching(control: Control, place: float) -> Control:
-    if place > control.high + 0.5 * control.step:
-        return replace(control, high=round_up(place))
-    if place < control.low - 0.5 * control.step:
-        return replace(control, low=-round_up(-place))
-    return control
+    moved = []
+    for control in controls:
+        place = places.get(control.name, control.low)
+        if place > control.high + 0.5 * control.step:
+            control = replace(control, high=round_up(place))
+        elif place < control.low - 0.5 * control.step:
+            control = replace(control, low=-round_up(-place))
+        moved.append(control)
+    return tuple(moved)
 
 
 def round_up(value: float) -> float:
@@ -211,11 +195,7 @@ class Session(Protocol):
         ...
 
     def drive(self, targets: Mapping[str, float]) -> None:
-        """Set where controls shall take the scene; ``advance`` goes there.
-
-        Raises:
-            RaytacError: a target that cannot be.
-        """
+        """Set where ``advance`` takes the controls. Raises ``RaytacError`` for what cannot be."""
         ...
 
     def advance(self) -> bool:

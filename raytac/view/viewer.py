@@ -13,18 +13,12 @@ from raytac.view.player import Player
 from raytac.view.server import PageAddresses
 from raytac.view.session import Session
 
-__all__ = ["Viewer", "check_address", "check_viewer"]
-
 _PATIENCE = 10.0
 """Longest wait at the end for the state that is being computed [s]; the thread is a daemon and ends with the program."""
 
 
 def check_viewer() -> None:
-    """Say now, in one line, that the web server is missing.
-
-    Raises:
-        BackendError: viser is not installed.
-    """
+    """Raise ``BackendError`` if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
         raise BackendError('the viewer needs viser, and it is not installed: `pip install "raytac[view]"`')
 

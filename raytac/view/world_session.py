@@ -15,21 +15,10 @@ from raytac.robots.ik import DifferentialIk
 from raytac.robots.impedance import JointImpedance
 from raytac.se3 import rotations
 from raytac.shapes.triangulate import part_surface
-from raytac.view.sensor_view import (
-    MESH_COLOUR,
-    MESH_WIDTH,
-    coat_edges,
-    gel_solid,
-    grid_faces,
-    narrow_warning,
-    pad_view,
-    strided,
-)
-from raytac.view.session import CameraPlace, Colour, Control, Lines, Pad, Snapshot, Solid, check_targets
+from raytac.view.sensor_view import coat_edges, coat_lines, coat_pad, gel_solid, narrow_warning, pad_view, square, strided
+from raytac.view.session import CameraPlace, Colour, Control, Snapshot, Solid, check_targets
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import WorldState
-
-__all__ = ["Steering", "WorldSession"]
 
 _SHOWN_GROUPS = 3
 """Geoms of MuJoCo's first groups are shown, as its own viewer does."""
@@ -43,10 +32,7 @@ _NEAREST, _FARTHEST = 0.12, 0.6
 
 
 class WorldSession:
-    """One environment of a world (see ``Session``).
-
-    A state that is shown is ``steps`` control steps after the last one: images cost more than steps.
-    """
+    """One environment of a world, shown every ``steps`` control steps: images cost most."""
 
     units_per_metre = 10.0
     is_driven_at_rest = False
@@ -67,18 +53,14 @@ class WorldSession:
         label = next(iter(self._sensors.values())).label
         self.title = f"{world.scene.name} · {world.scene.robot.model.rsplit('/', 1)[-1]} · {label}"
         self.controls: tuple[Control, ...] = self._steering.controls
-        self.pads = tuple(
-            Pad(name, grid_faces(self._grids[name]), ("indentation", *(("pressure", "shear") if "traction" in s.outputs else ())))
-            for name, s in self._sensors.items()
-        )
+        self.pads = tuple(coat_pad(name, sensor, self._grids[name]) for name, sensor in self._sensors.items())
         self._body_of: dict[str, int] = {}
         """Body of the model that carries a solid, by the solid's name."""
         self._soft = [body.name for body in world.scene.bodies if body.dynamics == "soft"]
-        self.solids = (*self._geoms(), *self._gels(), *self._soft_bodies())
+        gels = (gel_solid(sensor.spec, f"{name}_gel") for name, sensor in self._sensors.items())
+        self.solids = (*self._geoms(), *gels, *self._soft_bodies())
         self.camera = self._camera()
-        # Their number of segments is known with the first frame, which computes images.
-        simulated = self._sensors if world.physics.is_simulated else ()
-        self.lines = tuple(Lines(f"{name}_coat_mesh", np.zeros((1, 2, 3)), MESH_COLOUR, MESH_WIDTH) for name in simulated)
+        self.lines = tuple(coat_lines(f"{name}_coat_mesh") for name in (self._sensors if world.physics.is_simulated else ()))
         self._physics_ms = 0.0
         self._shot: Snapshot | None = None
 
@@ -125,8 +107,8 @@ class WorldSession:
             body = int(model.geom_bodyid[geom])
             part = geom_part(model, geom)
             if part.kind == "plane":
-                corners = 0.5 * _PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-                vertices, faces = corners, np.array([[0, 1, 2], [0, 2, 3]])
+                vertices, faces = square(_PLANE)
+                faces = faces[:2]  # seen from above
             else:
                 surface = part_surface(part, _ROUND * max(part.size, default=0.05))
                 vertices, faces = surface.vertices, surface.faces
@@ -136,10 +118,6 @@ class WorldSession:
             colour: Colour = (round(255 * red), round(255 * green), round(255 * blue))
             hides = body in objects and part.kind != "plane"
             yield Solid(name, vertices @ pose[:3, :3].T + pose[:3, 3], faces, colour, alpha, hides)
-
-    def _gels(self) -> Iterator[Solid]:
-        for name, sensor in self._sensors.items():
-            yield gel_solid(sensor.spec, f"{name}_gel")
 
     def _soft_bodies(self) -> Iterator[Solid]:
         specs = {body.name: body for body in self._world.scene.bodies}
@@ -169,9 +147,7 @@ class WorldSession:
         for name, frame in frames.items():
             poses[f"{name}_gel"] = poses[f"{name}_coat_mesh"] = state.world_from_pad[name][0]
             if frame.surface.coat is not None:
-                reshaped[f"{name}_coat_mesh"] = coat_edges(
-                    frame.surface.coat.mesh, frame.surface.coat.positions[0], frame.surface, self._grids[name]
-                )
+                reshaped[f"{name}_coat_mesh"] = coat_edges(frame.surface, self._grids[name])
             for part, value in frame.time_ms.items():
                 time_ms[part] = time_ms.get(part, 0.0) + value
         return Snapshot(
@@ -209,8 +185,6 @@ _FREQUENCY = 60.0
 
 class Steering:
     """Controller of one environment: ``aim`` sets targets, ``go`` advances by one control step.
-
-    It is a ``raytac.world.state.Controller``.
 
     Arms with torque motors follow by differential inverse kinematics and joint impedance, a driven frame by its servos. Other robots
     are held at their start.

@@ -20,8 +20,6 @@ from raytac.report.compare.metrics import known, resolutions, select, summaries
 from raytac.report.compare.run import Comparison
 from raytac.report.compare.store import Row
 
-__all__ = ["error_range", "signed_error", "write_pareto", "write_sheet_of_scene"]
-
 WIDTH_IN = 7.16
 """Width of two columns of an IEEE paper [in]."""
 STYLE: dict[Any, Any] = {
@@ -55,9 +53,7 @@ class Look:
 
 
 def write_pareto(comparison: Comparison, path: Path) -> None:
-    """Error against time of a frame, with log axes: a row of panels a resolution.
-
-    Whole frame, contact and shadow ring are beside each other.
+    """Error against time of a frame, log axes: whole frame, contact, shadow ring; a row a resolution.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
     the mean noise of the reference, below which no error can be resolved.
@@ -118,14 +114,12 @@ def _panel(axes: Axes, rows: Sequence[Row], column: str, looks: dict[str, Look])
     all_summaries = summaries(rows)
     for family in dict.fromkeys(summary.family for summary in all_summaries):
         look = looks[family]
-        colour, marker, line = look.colour, look.marker, look.line
+        colour, own = look.colour, [summary for summary in all_summaries if summary.family == family]
         if look.timed_only:
-            for s in (s for s in all_summaries if s.family == family):
-                axes.axvline(s.ms, color=colour, linestyle=line, linewidth=0.8, zorder=1)
+            for s in own:
+                axes.axvline(s.ms, color=colour, linestyle=look.line, linewidth=0.8, zorder=1)
             continue
-        points = sorted(
-            (s for s in all_summaries if s.family == family and s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0
-        )
+        points = sorted((s for s in own if s.errors.get(column, 0) > 0), key=lambda s: s.spp or 0)
         for s in points:
             values = known(select(rows, mode=s.mode), column)
             axes.plot([s.ms, s.ms], [min(values), max(values)], color=colour, linewidth=0.6, alpha=0.5, zorder=2)
@@ -138,7 +132,7 @@ def _panel(axes: Axes, rows: Sequence[Row], column: str, looks: dict[str, Look])
                 place["xytext"] = (place["xytext"][0], -8.0)
             axes.annotate(label, (s.ms, s.errors[column]), fontsize=6, color=colour, zorder=4, **place)
         x, y = [s.ms for s in points], [s.errors[column] for s in points]
-        axes.plot(x, y, color=colour, marker=marker, linestyle=line, linewidth=1.0, markersize=4.5, zorder=3)
+        axes.plot(x, y, color=colour, marker=look.marker, linestyle=look.line, linewidth=1.0, markersize=4.5, zorder=3)
     noise = [value for value in known(rows, f"noise_{column}") if value > 0]
     if noise:
         floor = statistics.mean(noise)

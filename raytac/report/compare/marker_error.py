@@ -1,7 +1,4 @@
-"""Error and time of the cheap marker models against surface tracking.
-
-They are measured on presses of the soft pad that no fit has seen.
-"""
+"""Error and time of the cheap marker models against surface tracking, on presses that no fit has seen."""
 
 from __future__ import annotations
 
@@ -10,14 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from raytac.io.metrics import Metric
-from raytac.report.markers import error_metrics, press_all
+from raytac.report.markers import error_metrics
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from raytac.markers.calibration import ModelError
     from raytac.markers.calibration_presses import PressFrame
-
-__all__ = ["PAD", "MarkerErrors", "held_out_frames", "marker_error_metrics", "marker_errors"]
 
 PAD = "medium"
 """Level of the soft pad where none is asked for: the one that shipped marker motion was fitted to."""
@@ -52,18 +47,6 @@ class MarkerErrors:
         """(model, its errors in the order of ``loads``, its time [ms]) of every model."""
         models = dict.fromkeys(row.model for row in self.errors)
         return [(name, [row for row in self.errors if row.model == name], self.times_ms[name]) for name in models]
-
-
-def held_out_frames(sensor: SensorSpec, *, pad: str, device: str, quick: bool = False) -> list[PressFrame]:
-    """States of the presses that no fit sees, on the soft pad of level ``pad``; ``quick``: few of them.
-
-    Raises:
-        RaytacError: a press did not settle, or fits nowhere on this sensor.
-        BackendError: the solver cannot run here.
-    """
-    from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
-
-    return press_all(sensor, QUICK_HELD_OUT if quick else HELD_OUT, pad, device, progress=True)
 
 
 def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, device: str) -> MarkerErrors:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +15,6 @@ from raytac.report.compare.physics_error import physics_metrics
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
-
-__all__ = [
-    "EqualError",
-    "Summary",
-    "compare_metrics",
-    "cost_at",
-    "equal_errors",
-    "resolutions",
-    "select",
-    "spp_for_error",
-    "summaries",
-]
-
 
 KEYS = {"mae": "mae_levels", "rmse": "rmse_levels", "psnr": "psnr_db", "ssim": "ssim", "flip": "flip"}
 
@@ -84,9 +72,9 @@ def summaries(rows: Sequence[Row]) -> list[Summary]:
 
 
 def _summary(rows: list[Row]) -> Summary:
-    first = rows[0].figures
+    first: dict[str, Any] = rows[0].figures
 
-    def middle(name: str) -> float | None:
+    def middle(name: str) -> Any:
         values = known(rows, name)
         return statistics.median(values) if values else None
 
@@ -102,24 +90,15 @@ def _summary(rows: list[Row]) -> Summary:
                 errors[f"{region}_psnr_worst"] = min(values)
             elif values:
                 errors[f"{region}_{metric}"] = float(np.mean(values))
-    firsts = known(rows, "first_image_s")
     return Summary(
-        resolution=str(first["resolution"]),
-        mode=str(first["mode"]),
-        family=str(first["family"]),
-        label=str(first["label"]),
-        words=str(first["words"]),
-        short=str(first["short"]),
-        unbiased=first["unbiased"] is True,
-        spp=None if first["spp"] is None else int(first["spp"]),
-        device=str(first["device"]),
+        **{
+            name: first[name] for name in ("resolution", "mode", "family", "label", "words", "short", "unbiased", "spp", "device")
+        },
+        **{name: middle(name) for name in ("batch_ms_per_frame", "memory_mib", "memory_mib_per_env")},
         scenes=len(rows),
         ms=statistics.median(known(rows, "ms")),
         batch=int(first["batch"] or 0),
-        batch_ms_per_frame=middle("batch_ms_per_frame"),
-        first_image_s=firsts[0] if firsts else None,
-        memory_mib=middle("memory_mib"),
-        memory_mib_per_env=middle("memory_mib_per_env"),
+        first_image_s=next(iter(known(rows, "first_image_s")), None),
         errors=errors,
         at_noise=any(row.figures["at_noise"] is True for row in rows),
     )
@@ -195,10 +174,10 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         key = _key(summary.family, summary.device, summary.resolution, summary.spp)
         metrics |= {f"{key}.ms": summary.ms, f"{key}.fps": 1e3 / summary.ms}
         optional = {
-            "batch_ms_per_frame": summary.batch_ms_per_frame,
-            "first_image_s": summary.first_image_s,
-            "memory_mib": summary.memory_mib,
-            "memory_mib_per_env": summary.memory_mib_per_env,
+            **{
+                name: getattr(summary, name)
+                for name in ("batch_ms_per_frame", "first_image_s", "memory_mib", "memory_mib_per_env")
+            },
             "psnr_db": summary.errors.get("frame_psnr_worst"),
             "mae_levels": summary.errors.get("frame_mae"),
             "rmse_levels": summary.errors.get("frame_rmse"),
@@ -245,9 +224,8 @@ def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
     """Time of the package over ours at the largest resolution that both ran at, medians over scenes, batch 1."""
     metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
-        ours, peers = (
-            known(select(rows, resolution=resolution, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer")
-        )
+        here = select(rows, resolution=resolution)
+        ours, peers = (known(select(here, family=f"{family}{shadow}"), "ms") for family in ("taxim", "peer"))
         if ours and peers:
             metrics[f"taxim{shadow}.vs_peer_speedup"] = statistics.median(peers) / statistics.median(ours)
             metrics[f"taxim{shadow}.vs_peer_resolution"] = resolution

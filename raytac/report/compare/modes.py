@@ -16,8 +16,6 @@ from raytac.report.tracers import Tracers
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsImages
 
-__all__ = ["Mode", "Setting", "comparison_modes"]
-
 
 @dataclass(frozen=True)
 class Setting:

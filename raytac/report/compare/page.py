@@ -12,8 +12,6 @@ from raytac.report.compare.metrics import compare_metrics, equal_errors, resolut
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
 
-__all__ = ["FILES", "report_html", "write_comparison", "write_parquet"]
-
 FILES = ("report.html", "pareto.png", "results.parquet", "metrics.json")
 """Files of every comparison, besides ``sheet_<scene>_<resolution>.png``, ``rows/`` and ``references/``."""
 TEMPLATE = "compare_report.html.j2"
@@ -72,34 +70,33 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
     templates = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=templates, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     flip = any(row.figures["frame_flip"] is not None for row in rows)
-    fast = [row.figures for row in rows]
-    noise = list({(f["scene"], f["resolution"]): f for f in fast if f["noise_frame_rmse"] is not None}.values())
+    figures = [row.figures for row in rows]
+    noise = list({(f["scene"], f["resolution"]): f for f in figures if f["noise_frame_rmse"] is not None}.values())
     scenes = ", ".join(Path(scene).stem for scene in settings.scenes)
-    lead = (
-        f"Every optical mode of raytac rendered the same gel surfaces ({scenes}) of the sensor {_sensor(comparison)} in one run on "
-        f"{comparison.device}: how far is each from the converged reference, and what does a frame cost?"
-    )
     return environment.get_template(TEMPLATE).render(
-        title="Speed against error of the optical modes",
-        lead=lead,
-        quick=settings.quick,
+        sensor=rows[0].figures["sensor"] if rows else settings.sensor,
+        device=comparison.device,
+        scenes=scenes,
         pareto=_embedded(pareto),
         tables=[
             {
                 "resolution": resolution.replace("x", " × "),
-                "scenes": f"over {scenes}",
                 "summaries": [s for s in summary if s.resolution == resolution],
             }
             for resolution in resolutions(rows)
         ],
         batch=next((s.batch for s in summary), 0),
+        settings=settings,
+        has_flip=has_flip(),
+        flip_ppd=f"{FLIP_PPD:.2f}",
+        ring_mm=f"{1e3 * RING_WIDTH:g}",
         flip=flip,
         errors_wide=4 if flip else 3,
         any_at_noise=any(s.at_noise for s in summary),
         noise=noise,
         reference_spp=f"{settings.reference_spp:,}",
         equal=equal_errors(rows),
-        families={row.figures["family"]: row.figures["words"] for row in comparison.rows},
+        families={f["family"]: f["words"] for f in figures},
         left_out=comparison.left_out,
         physics=comparison.physics,
         markers=comparison.markers,
@@ -115,63 +112,9 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
             for chosen in [select(rows, scene=scene, resolution=size)]
         ],
         regions=REGIONS,
-        terms=_terms(comparison),
         facts=sorted(comparison.facts.items()),
     )
 
 
-def _sensor(comparison: Comparison) -> str:
-    return str(comparison.rows[0].figures["sensor"]) if comparison.rows else comparison.settings.sensor
-
-
 def _embedded(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-def _terms(comparison: Comparison) -> list[tuple[str, str]]:
-    """Definitions, as in docs/comparison.md."""
-    settings = comparison.settings
-    batch = next((row.figures["batch"] for row in comparison.rows), 0)
-    terms = [
-        (
-            "frame",
-            "From a new gel surface in host memory to the 8-bit image in host memory. Surfaces differ from frame to frame: the press at "
-            "70 to 100 % of its indentation.",
-        ),
-        (
-            "time",
-            f"Median of up to {settings.frames} warm frames, at least three, within {settings.budget_s:g} s; at batch {batch} the time of "
-            "a call over its environments. First image: building the mode and its first frame; kernels may come from a cache on disk.",
-        ),
-        (
-            "reference",
-            f"The path tracer `reference` at {settings.reference_spp:,} samples a pixel without limit of depth, in two independent halves.",
-        ),
-        (
-            "images",
-            "8-bit RGB after the sensor's response (gamma included), as a camera delivers them. All figures are taken on these values.",
-        ),
-        ("MAE, RMSE", "Mean absolute and root mean square difference over pixels and channels, in levels of 255."),
-        ("PSNR", "20 log10(255 / RMSE) [dB]."),
-        (
-            "SSIM",
-            "Wang et al. 2004: Gaussian window of 11 pixels (sigma 1.5), K1 = 0.01, K2 = 0.03, L = 255, population covariance, each "
-            "channel by itself, then the mean; pixels within 5 of the edge are left out.",
-        ),
-    ]
-    if has_flip():
-        text = f"LDR-FLIP (Andersson et al. 2020) at {FLIP_PPD:.2f} pixels per degree, values read as sRGB; mean over pixels."
-        terms.append(("FLIP", text))
-    else:
-        terms.append(("FLIP", "Left out: the package flip-evaluator is not installed."))
-    return [
-        *terms,
-        ("contact", "Pixels in which the camera sees gel that the object touches."),
-        ("shadow ring", f"Pixels outside the contact and at most {1e3 * RING_WIDTH:g} mm from it, measured on the gel plane."),
-        ("box", "Bounding box of the contact."),
-        (
-            "memory",
-            "Peak of Dr.Jit's arrays during a frame of one environment, and what each further one adds at the batch above; acceleration "
-            "structures of the ray tracer are not counted.",
-        ),
-    ]

@@ -13,8 +13,6 @@ from raytac.errors import BackendError
 from raytac.gel.surface import GelSurface
 from raytac.optics.base import OpticsImages
 
-__all__ = ["AWAY_MM", "PeerTaxim", "contact_height_map"]
-
 AWAY_MM = 5.0
 """Height above the gel that stands for no object [mm]."""
 
@@ -45,10 +43,7 @@ def contact_height_map(surface: GelSurface, size: tuple[int, int], width_mm: flo
 
 
 class PeerTaxim:
-    """``taxim`` with its own calibration of a domed GelSight; fulfils ``raytac.optics.base.OpticalMode``.
-
-    Its image shows another sensor than ours, so only its time compares.
-    """
+    """The package ``taxim`` with its own sensor, as an ``OpticalMode``: only its time compares."""
 
     def __init__(self, size: tuple[int, int], *, shadow: bool, device: str) -> None:
         """``size`` (width, height) [px]; ``device`` ``cpu`` or ``cuda``; on CUDA it needs a JAX that was built for it.

@@ -18,15 +18,10 @@ from raytac.report.tracers import Tracers
 from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 
-__all__ = ["PhysicsError", "physics_errors", "physics_metrics"]
-
 
 @dataclass(frozen=True)
 class PhysicsError:
-    """Differences of one press on both pads.
-
-    Root mean square of the height [µm], mean absolute difference of the ``fast`` image [levels of 255].
-    """
+    """Differences of one press on both pads: RMS of height [µm], MAE of ``fast`` [levels of 255]."""
 
     scene: str
     resolution: str

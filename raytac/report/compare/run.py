@@ -24,7 +24,7 @@ from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
 from raytac.io.progress import Progress
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
-from raytac.report.compare.marker_error import MarkerErrors, held_out_frames, marker_errors
+from raytac.report.compare.marker_error import MarkerErrors, marker_errors
 from raytac.report.compare.modes import Mode, Setting, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
 from raytac.report.compare.settings import CompareSettings
@@ -38,8 +38,6 @@ from raytac.specs import load_sensor
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
-
-__all__ = ["BATCH", "REGIONS", "Comparison", "run_comparison"]
 
 REGIONS = ("frame", "contact", "ring", "box")
 """Parts of an image over which errors are taken, as ``raytac.report.image_error.regions`` makes them."""
@@ -114,22 +112,17 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
             markers = _marker_errors(settings, device)
     known = versions()
     known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
-    return Comparison(
-        settings,
-        device,
-        tuple(run.rows),
-        run.images,
-        tuple(run.left_out),
-        run.measured,
-        facts | known,
-        tuple(run.physics),
-        markers,
-    )
+    rows, left_out, physics = tuple(run.rows), tuple(run.left_out), tuple(run.physics)
+    return Comparison(settings, device, rows, run.images, left_out, run.measured, facts | known, physics, markers)
 
 
 def _marker_errors(settings: CompareSettings, device: str) -> MarkerErrors:
+    """Errors on presses that no fit sees; with ``quick`` on few of them."""
+    from raytac.markers.calibration_presses import HELD_OUT, QUICK_HELD_OUT
+    from raytac.report.markers import press_all
+
     spec, pad = load_sensor(settings.sensor), settings.pad or ("coarse" if settings.quick else MARKER_PAD)
-    frames = held_out_frames(spec, pad=pad, device=device, quick=settings.quick)
+    frames = press_all(spec, QUICK_HELD_OUT if settings.quick else HELD_OUT, pad, device, progress=True)
     return marker_errors(spec, frames, pad=pad, device=device)
 
 
@@ -304,10 +297,7 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region.
-
-        The halves are independent, so half their difference has the variance of their mean.
-        """
+        """Noise of the reference by region: half the difference of independent halves varies as their mean."""
         one, two = self._halves
         figures = {}
         for region, mask in self.masks.items():

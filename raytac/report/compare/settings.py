@@ -14,8 +14,6 @@ from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
 from raytac.specs import PADS, load_press, load_sensor, validate_press
 
-__all__ = ["SPP", "CompareSettings"]
-
 SPP = (1, 4, 16, 64)
 """Samples a pixel of the sampled modes."""
 

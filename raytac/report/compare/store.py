@@ -21,8 +21,6 @@ from raytac.io.seal import read_sealed, write_sealed
 from raytac.optics.trace.config import RayTraced
 from raytac.report.tracers import Tracers, path_trace
 
-__all__ = ["References", "Row", "RowStore", "row_key"]
-
 Value = str | int | float | bool | None
 
 
@@ -106,19 +104,13 @@ class References:
         return hashlib.sha256(self._basis + surface.height.astype(np.float32).tobytes()).hexdigest()[:20]
 
     def halves(self, scene: str, surface: GelSurface) -> np.ndarray:
-        """Two linear images of ``spp`` / 2 samples a pixel with independent seeds, (2, H, W, 3) float32.
-
-        Read if they were computed before; a file that cannot be read is computed again.
-        """
+        """Two linear images of ``spp`` / 2 samples and independent seeds, (2, H, W, 3); read if kept."""
         path = self.folder / f"{scene}-{self.key(surface)}.npz"
         kept = self._read(path)
         if kept is not None:
             return kept
-        tracer, seed, half = (
-            self.tracers.get(self.size, RayTraced("reference", progress=True)),
-            2 * self.tracers.seed,
-            self.spp // 2,
-        )
+        tracer = self.tracers.get(self.size, RayTraced("reference", progress=True))
+        seed, half = 2 * self.tracers.seed, self.spp // 2
         self.say(f"reference of {scene}, {self.size[0]}x{self.size[1]}: 2 x {half} spp")
         halves = np.stack([path_trace(tracer, surface, half, seed + k) for k in (0, 1)])
         write_sealed(path, npz_bytes({"halves": halves}))
