@@ -30,13 +30,11 @@ class Light:
 
 @dataclass(frozen=True)
 class ExtraLight:
-    """Light beyond the direct light, to first order about the LEDs ``at``.
-
-    ``at``: (L, 7), rows as those of ``LightParameters.leds``.
-    """
+    """Light beyond the direct light, to first order about the LEDs ``at``."""
 
     light: Light
     at: np.ndarray
+    """(L, 7), rows as those of ``LightParameters.leds``."""
     by_led: Mapping[int, Light]
     """Slope of every LED's light by a column of its row; columns that are not named change nothing."""
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from raytac.checks import check_methods
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.device_mode import Float, UInt8
+from raytac.optics.device_mode import Float, UInt8, upload
 from raytac.optics.runtime import no_collection
 
 __all__ = ["DeviceImage", "ImageCut"]
@@ -67,10 +66,7 @@ class DeviceImage:
 
     def upload(self, surface: GelSurface) -> tuple[Float, UInt8]:
         """Heights (B·Ny·Nx) and contact of a surface on the device; heights must be finite."""
-        heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
-        contact = self.mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
-        dr.eval(heights, contact)
-        return heights, contact
+        return upload(self.mi, surface)
 
     def __call__(self, heights: Float, contact: UInt8 | None = None) -> Any:
         """Images (B, height, width, 3), uint8, a Dr.Jit tensor that DLPack hands on without a copy; they are there when this returns.

@@ -166,9 +166,8 @@ class PolyTable:
             raise InputError("covered", value=value, rule=f"must be bool of shape {shape[1:3]}, or None")
         image = self.background
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape) < 3 or not np.isfinite(image).all():
-            raise InputError(
-                "background", value=image.shape, rule="must be a finite image of shape (H, W, 3), at least 3 x 3 pixels"
-            )
+            rule = "must be a finite image of shape (H, W, 3), at least 3 x 3 pixels"
+            raise InputError("background", value=image.shape, rule=rule)
         for name in ("rest_image", "gel_map"):
             array, expected = getattr(self, name), image.shape if name == "rest_image" else image.shape[:2]
             if array is not None and array.shape != expected:

@@ -22,7 +22,7 @@ UNIT = 1e3
 than a pixel on the pad, so the scene is built in millimetres."""
 
 PLATES = ("wall_left", "wall_right", "wall_top", "wall_bottom", "floor")
-"""The rectangles of the case."""
+"""The rectangles of the case: its walls at −x, x, −y and y, and its floor."""
 
 __all__ = ["PLATES", "UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
 
@@ -114,14 +114,9 @@ class SensorScene:
                 rectangle["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": self._glow(None)}}
             return rectangle
 
-        z = -depth / 2
-        return {
-            "wall_left": plate((-hx, 0, z), (1, 0, 0), (hy, depth / 2), (0, 0, 1)),
-            "wall_right": plate((hx, 0, z), (-1, 0, 0), (hy, depth / 2), (0, 0, 1)),
-            "wall_top": plate((0, -hy, z), (0, 1, 0), (hx, depth / 2), (0, 0, 1)),
-            "wall_bottom": plate((0, hy, z), (0, -1, 0), (hx, depth / 2), (0, 0, 1)),
-            "floor": plate((0, 0, -depth), (0, 0, 1), (hx, hy), (0, 1, 0)),
-        }
+        walls = (((-1, 0), hy), ((1, 0), hy), ((0, -1), hx), ((0, 1), hx))
+        plates = [plate((x * hx, y * hy, -depth / 2), (-x, -y, 0), (half, depth / 2), (0, 0, 1)) for (x, y), half in walls]
+        return dict(zip(PLATES, [*plates, plate((0, 0, -depth), (0, 0, 1), (hx, hy), (0, 1, 0))], strict=True))
 
     def _glass(self, slab: Slab) -> dict[str, Any]:
         """The slab's face; its normal points to the air, −z, so that the gel is the interior."""
