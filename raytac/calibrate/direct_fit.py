@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.direct_light import LedLight, case_light, led_light
+from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
-from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import (
     CEILING,
     DARKEST,
@@ -135,8 +134,6 @@ class DirectFit:
         self.circle_sigma = CIRCLE_SIGMA * native[0]
         self.ties = side_ties(start.p, len(self.flat(start)))
 
-    # ------------------------------------------------------------------ forward model
-
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
         return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
 
@@ -168,8 +165,6 @@ class DirectFit:
         pressed, flat, rest = total
         image = encode((decode(self.behind, gamma) - black) * pressed / flat + black, gamma)
         return image, encode(rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, gamma)
-
-    # ------------------------------------------------------------------ parameters as one vector
 
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
@@ -214,8 +209,6 @@ class DirectFit:
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
-
-    # ------------------------------------------------------------------ least squares
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Levels by which the presses' pixels (M, 3) and the image at rest (K, 3) are off, not weighted."""

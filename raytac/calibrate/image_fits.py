@@ -29,17 +29,7 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 
-__all__ = [
-    "MlpSettings",
-    "PressSamples",
-    "ShadingSettings",
-    "TableSettings",
-    "fit_mlp",
-    "fit_table",
-    "press_samples",
-    "with_cast_shadows",
-    "with_shading",
-]
+__all__ = ["PressSamples", "ShadingSettings", "fit_mlp", "fit_table", "press_samples", "with_cast_shadows", "with_shading"]
 
 
 @dataclass(frozen=True)
@@ -263,13 +253,9 @@ def with_shading(
 ) -> SensorSpec:
     """The sensor with the colour shading that brings its image at rest to ``background`` (H, W, 3) [levels].
 
-    ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels of
-    the image to first order. ``tracing``: how rays are traced.
-
-    Raises:
-        InputError: more than half of a channel of ``background`` is not brighter than the sensor's black level, or no light reaches a
-            pixel at rest.
-        BackendError: the ray tracer cannot run on ``device``.
+    ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels
+    of the image to first order. ``tracing``: how rays are traced. Raises InputError: more than half of a channel of ``background`` is not
+    brighter than the sensor's black level, or no light reaches a pixel at rest; BackendError: the ray tracer cannot run on ``device``.
     """
     height, width = background.shape[:2]
     bare = sensor.response.unshaded

@@ -116,8 +116,7 @@ def press_surface(
 ) -> GelSurface:
     """The pad under every ball as a batch of surfaces on ``grid``; arguments as for ``pixel_geometry``.
 
-    Raises:
-        InputError: a contact circle as wide as its ball.
+    Raises InputError: a contact circle as wide as its ball.
     """
     on_pad = circles_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius

@@ -20,11 +20,9 @@ from raytac.specs.sensor_check import led_corners
 
 __all__ = [
     "CEILING",
-    "CHANNELS",
     "HEIGHT",
     "HEIGHTS",
     "LightParameters",
-    "Ties",
     "darkest",
     "leds_at_walls",
     "leds_split",

@@ -73,8 +73,7 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
     """The fully visible presses, at the sensor's own resolution.
 
-    Raises:
-        InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
+    Raises InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
     """
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
@@ -137,11 +137,8 @@ def fit_lights(
 
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
-    pixels and places. ``tick`` is called with the stage and the cost after every step.
-
-    Raises:
-        InputError: refraction, LEDs of no colour, or fewer values than parameters.
-        BackendError: the ray tracer cannot run on ``device``.
+    pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, LEDs of no colour,
+    or fewer values than parameters; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":

@@ -42,8 +42,7 @@ class DeviceImage:
             cut: what is kept.
             difference: give (255 + image − image at rest) // 2 instead of the image.
 
-        Raises:
-            InputError: a mode that has no images on the device, or a cut beyond the rendered image.
+        Raises InputError: a mode that has no images on the device, or a cut beyond the rendered image.
         """
         what = "a mode that renders on the device, such as taxim, phong or raytrace with the integrator fast"
         check_methods("optics", mode, ("prepare", "render_device"), ("mi", "camera", "outputs"), what)
@@ -75,8 +74,7 @@ class DeviceImage:
             heights: [m], B·Ny·Nx of them on this device, finite, which is not checked: a Dr.Jit array, or a float32 PyTorch tensor.
             contact: where the object touches, as many bytes; only for modes that need it.
 
-        Raises:
-            InputError: no whole number of grids, or contact missing.
+        Raises InputError: no whole number of grids, or contact missing.
         """
         mi = self.mi
         heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))

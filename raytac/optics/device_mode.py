@@ -98,8 +98,6 @@ class DeviceMode(ABC):
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._set_up()
 
-    # ---------------------------------------------------------------- what a mode gives
-
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
         """Last part of the constructor: what a mode needs beyond that, and checks of its configuration."""
 
@@ -118,8 +116,6 @@ class DeviceMode(ABC):
     def _bytes_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment's image takes [byte], before Dr.Jit's rounding."""
         return 0
-
-    # ---------------------------------------------------------------- grid and memory
 
     def prepare(self, grid: PadGrid) -> None:
         """Build what depends on the pad's grid; done at the first frame and kept.
@@ -162,8 +158,6 @@ class DeviceMode(ABC):
             rule += f"{self._memory / 1e9:.1f} GB and an array at most 2^32 values; render in parts"
             raise InputError("number of environments", value=envs, rule=rule)
 
-    # ---------------------------------------------------------------- images
-
     @property
     def _lit(self) -> bool:
         """True if any output needs light."""
@@ -181,9 +175,7 @@ class DeviceMode(ABC):
         return self._images(surface, heights, failed, self._lit_images(surface, heights, failed) if self._lit else {})
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
-        """Images on the device, of device arrays; nothing leaves it.
-
-        Dr.Jit records the kernels at the first call of a batch size and replays them afterwards.
+        """Images on the device, of device arrays; recorded at the first call of a batch size and replayed afterwards.
 
         Args:
             heights: of the coat [m], B·Ny·Nx; must be finite, which is not checked here.
@@ -230,8 +222,6 @@ class DeviceMode(ABC):
         field = CoatField(self.mi, self.layout, inputs.rest, heights)
         seen = see(self.mi, field, self.camera, dr.width(heights) // (self.layout.nx * self.layout.ny))
         return seen.p, seen.n
-
-    # ---------------------------------------------------------------- from host to device
 
     def _shape(self, envs: int) -> tuple[int, int, int]:
         """(B, H, W)."""
@@ -289,7 +279,7 @@ def device_envs(nodes: int, heights: Float, **others: Any) -> int:
     if width == 0 or width % nodes:
         raise InputError("heights", value=width, rule=f"must hold a whole number of grids of {nodes} nodes")
     for name, array in others.items():
-        if array is None or dr.width(array) != width:
-            value = None if array is None else dr.width(array)
-            raise InputError(name, value=value, rule=f"must have one value a node, {width} here")
+        own = None if array is None else dr.width(array)
+        if own != width:
+            raise InputError(name, value=own, rule=f"must have one value a node, {width} here")
     return width // nodes

@@ -61,8 +61,8 @@ class NodeGrid:
         x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < nx - 1, i + 1, i)
         y_minus, y_plus = dr.select(iy > 0, i - nx, i), dr.select(iy < self.ny - 1, i + nx, i)
         zx = (dr.gather(mi.Float, z, x_plus) - dr.gather(mi.Float, z, x_minus)) / (mi.Float(x_plus - x_minus) * self.dx)
-        rows = mi.Float((y_plus - y_minus) // nx)
-        return zx, (dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)) / (rows * self.dy)
+        rise = dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)
+        return zx, rise / (mi.Float((y_plus - y_minus) // nx) * self.dy)
 
 
 @dataclass(frozen=True)
@@ -85,13 +85,12 @@ class CoatLayout(NodeGrid):
 class CoatField:
     """B coat surfaces as device arrays, computed each frame from heights.
 
-    ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
-    four corners of a cell, for the walks; the normal points to the
-    camera side (n_z < 0) and comes from central differences, as the vertex normals of the reference's mesh do.
+    ``nodes`` holds (z, n_x, n_y, n_z) a node, so that one packet gather brings the normal, and ``cells`` the heights at the four corners
+    of a cell, for the walks. Normals point to the camera side (n_z < 0), as the vertex normals of the reference's mesh do.
     """
 
     def __init__(self, mi: Any, layout: CoatLayout, rest: Any, height: Any) -> None:
-        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx) are device Floats [m]."""
+        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx): device Floats [m]."""
         self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
         self.nodes, self.cells = dr.ravel(pack_nodes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
         dr.eval(self.nodes, self.cells)
@@ -257,10 +256,7 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Hit of one camera ray per pixel, in the pad frame.
-
-    Environment index, point, normal and direction to the camera.
-    """
+    """Hit of one camera ray per pixel, in the pad frame: environment, point, normal, direction to the camera."""
 
     env: Any
     p: Any
@@ -288,10 +284,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
 
 
 def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-    """Contact, and what ``outputs`` name of normals with positions and of camera depth, by the fields of ``OpticsImages``.
-
-    ``p`` and ``n``: points and normals that the pixels of all environments see, on the device.
-    """
+    """Contact, and as ``outputs`` say normals with positions, and depth, of the seen points ``p`` and normals ``n`` on the device."""
     width, height = camera.resolution
     shape, grid = (surface.batch, height, width), surface.grid
     points = np.array(p).T.reshape(*shape, 3)

@@ -23,8 +23,7 @@ __all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
 def checked_ink(surface: GelSurface) -> np.ndarray | None:
     """The surface's ink, (B, Ny, Nx) float32; None if it has none.
 
-    Raises:
-        InputError: another shape than the heights', or values outside [0, 1].
+    Raises InputError: another shape than the heights', or values outside [0, 1].
     """
     if surface.ink is None:
         return None
@@ -53,8 +52,7 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
     coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat.
     """
-    coat, response = sensor.coat, sensor.response
-    s = coat.specular
+    coat, response, s = sensor.coat, sensor.response, sensor.coat.specular
 
     def inked(*levels: Any) -> tuple[Any, ...]:
         result = []

@@ -44,9 +44,6 @@ _BGR = ("b", "g", "r")
 """Upstream's names of the channels red, green, blue."""
 
 
-# -------------------------------------------------------------------- reading
-
-
 def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> PolyTable:
     """Table of a calibration folder: upstream's, or one that ``save_calibration`` wrote.
 
@@ -200,9 +197,6 @@ def _numbers(path: Path, place: tuple[int, ...], row: Any) -> np.ndarray:
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6:
         raise CalibrationError("must be finite, at most 10^6", file=path, key=key, value=row)
     return array
-
-
-# -------------------------------------------------------------------- writing
 
 
 def save_calibration(table: PolyTable, folder: str | Path) -> None:

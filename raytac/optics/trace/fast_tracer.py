@@ -69,8 +69,6 @@ class FastTracer(Tracer):
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 
-    # ---------------------------------------------------------------- images
-
     def _other_images(self, frame: DeviceFrame, failed: np.ndarray) -> dict[str, Any]:
         return {"layers": self._to_numpy_layers(frame.layers, len(failed))} if "layers" in self.outputs else {}
 
@@ -140,10 +138,7 @@ def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
     """``sensor`` with a number in place of an exposure of ``AUTO``: ``mid_grey_exposure`` of its image at rest by ``fast``.
 
     That image has the sensor's own resolution and one ray a pixel, whatever else is rendered, so that every mode finds the same number.
-
-    Raises:
-        SpecError: no exposure makes that image mid-grey.
-        BackendError: Mitsuba cannot run on ``device``.
+    Raises SpecError: no exposure makes that image mid-grey; BackendError: Mitsuba cannot run on ``device``.
     """
     if sensor.response.exposure != AUTO:
         return sensor

@@ -130,10 +130,7 @@ class BounceField:
         return g.nx * g.ny * (16 * channels + 16 + 16 * (channels // 3) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """Fill the grid for the coat ``field``: ``radiosity`` gives B [radiance · sr] of each channel at a sample of the coat.
-
-        Returns one packed (e, v_x, v_y, v_z) array a channel, length 4 · B · nodes.
-        """
+        """Packed (e, v_x, v_y, v_z) for the coat ``field``, an array a channel; ``radiosity``: B [radiance · sr] of each at a sample."""
         g, channels, offsets = self.patches, len(self.case), dr.width(self.offset_x)
         i = dr.arange(mi.UInt32, envs * (g.nx * g.ny))
         env, ix, iy = i // (g.nx * g.ny), i % g.nx, (i // g.nx) % g.ny
@@ -150,9 +147,6 @@ class BounceField:
         packets = [dr.ravel(mi.Vector4f(*b[k : k + 3], 0)) for k in range(0, channels, 3)]
         dr.eval(patches, packets)
         area = g.dx * g.dy / np.pi
-
-        def more(k: Any, v: list[Any]) -> Any:
-            return k < offsets
 
         def add(k: Any, v: list[Any]) -> tuple[Any, list[Any]]:
             ox, oy = dr.gather(mi.Int32, self.offset_x, k), dr.gather(mi.Int32, self.offset_y, k)
@@ -174,7 +168,7 @@ class BounceField:
             return k + 1, out
 
         start = (mi.UInt32(0), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in range(channels)])
-        _, gathered = dr.while_loop(start, more, add, label="coat bounce")
+        _, gathered = dr.while_loop(start, lambda k, v: k < offsets, add, label="coat bounce")
         node = i - env * (g.nx * g.ny)
         result = []
         for base, v in zip(self.case, gathered, strict=True):

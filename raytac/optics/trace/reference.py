@@ -116,8 +116,8 @@ def trace(
 ) -> list[Any]:
     """Radiance along ``ray``: a list of 3 · G Floats, R, G, B of each group in turn.
 
-    ``seen=False`` treats the first vertex like a later one, for light that arrives at the ray's origin from the case or the coat: the
-    case's own direct light is then left to ``connect`` at the origin.
+    ``seen=False`` treats the first vertex like a later one, for light that arrives at the ray's origin from the case or the coat; the
+    case's own direct light is then for ``connect`` at the origin.
     """
     n = dr.width(ray.o)
     layers = max(groups) + 1
@@ -201,9 +201,6 @@ def trace(
             beta, active = dr.select(ghost, gbeta, beta / (1 - GHOST)), dr.select(ghost, gactive, active)
         depth = 1
 
-    def alive(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> Any:
-        return active
-
     def bounce(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> tuple[Any, ...]:
         si, scale, mirrored = advance(mi, scene, sampler, ray, active)
         if scale is not None:
@@ -218,7 +215,7 @@ def trace(
 
     # The sampler is part of the state: its random numbers must differ from turn to turn.
     state = (sampler, ray, beta, radiance, dr.full(mi.UInt32, depth, n), active)
-    return dr.while_loop(state, alive, bounce, label="path")[3]
+    return dr.while_loop(state, lambda *state: state[-1], bounce, label="path")[3]
 
 
 def enter(mi: Any, slab: Slab, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:

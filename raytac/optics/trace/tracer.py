@@ -46,8 +46,6 @@ class Tracer(DeviceMode):
         if config.flat_field is not None:
             self._check_image("flat_field", config.flat_field)
 
-    # ---------------------------------------------------------------- what a tracer gives
-
     @property
     @abstractmethod
     def samples(self) -> int:
@@ -64,8 +62,6 @@ class Tracer(DeviceMode):
     def _rest_light(self, rest: np.ndarray) -> np.ndarray:
         """Linear image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx)."""
         return total(self._layers(rest))[0]
-
-    # ---------------------------------------------------------------- shared
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
@@ -105,8 +101,7 @@ class Tracer(DeviceMode):
     def _warn_if_saturated(self, grid: PadGrid) -> None:
         """Warn of an image at rest that is white over a large part, and name the exposure that would make it mid-grey."""
         rest = grid.rest[None].astype(np.float32)
-        share = saturated_share(self._rest_image(rest))
-        if share <= SATURATED:
+        if (share := saturated_share(self._rest_image(rest))) <= SATURATED:
             return
         response, advice = self.sensor.response, "the light is too uneven for any exposure"
         try:

@@ -86,11 +86,8 @@ def bake(
     """Calibrate a table on the ray tracer ``fast`` with this sensor's own optics.
 
     The same arguments give the same table on one device. ``resolution`` (width, height) [px] is that of the calibration images, None the
-    sensor's own. ``seed``: where the sequence of presses starts, and of the fit of the case's light.
-
-    Raises:
-        InputError: a value out of its choices.
-        BackendError: the ray tracer cannot run on ``device``.
+    sensor's own. ``seed``: where the sequence of presses starts, and of the fit of the case's light. Raises InputError: a value out of
+    its choices; BackendError: the ray tracer cannot run on ``device``.
     """
     return calibrate(
         Calibration(sensor, device=device, resolution=resolution, seed=seed), settings=settings, seed=seed, progress=progress
