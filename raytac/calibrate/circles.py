@@ -44,12 +44,9 @@ class FoundCircles:
 
 
 def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
-    """The contact circle of every press, found without labels.
+    """The contact circle of every press, without labels; ``pixel_pitch`` [m]: a contact is not wider than its ball.
 
-    ``pixel_pitch`` [m]: a contact is not wider than its ball.
-
-    Raises:
-        InputError: a ball whose contact could be wider than the image.
+    Raises InputError for a ball whose contact could be wider than the image.
     """
     smallest = min(presses.resolution)
     widest = presses.ball_radius / pixel_pitch
@@ -80,10 +77,7 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
 
 
 def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3).
-
-    It is −1 where too little of a circle is in the image.
-    """
+    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3); −1 where too little of one is in the image."""
     x, y, r = np.asarray(circles, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     sides, valid = [], True

@@ -1,6 +1,4 @@
-"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses.
-
-The forward model is direct light.
+"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses, with direct light as forward model.
 
 Residuals are those of the presses with the real background B as flat field, and of the image at rest,
 
@@ -18,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.direct_light import LedLight, case_light, led_light
+from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
-from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import (
     CEILING,
     DARKEST,
@@ -132,10 +129,10 @@ class DirectFit:
         self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
         self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
+        # Images depend on the heights of LEDs by shadows alone.
+        self._sees_heights = extra is not None and HEIGHT in extra.by_led
         self.circle_sigma = CIRCLE_SIGMA * native[0]
         self.ties = side_ties(start.p, len(self.flat(start)))
-
-    # ------------------------------------------------------------------ forward model
 
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
         return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
@@ -147,14 +144,12 @@ class DirectFit:
     def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
         """Light at what ``seen`` gives, at the same pixels at rest and over the image at rest."""
         geometries = (seen, self.flat_geometry, self.rest_geometry)
-        return Light(
-            *(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE).light for led in p.leds]) for g in geometries)
-        )
+        return Light(*(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE) for led in p.leds]) for g in geometries))
 
-    def _led_layers(self, p: LightParameters, seen: PixelGeometry, direct: list[np.ndarray]) -> np.ndarray:
+    def _led_layers(self, p: LightParameters, seen: PixelGeometry, leds: list[LedLight]) -> np.ndarray:
         """(L, M, 3): direct light of every LED and the even glow that goes with it."""
         even = case_light(seen)[:, None] * self.even_gain
-        return np.stack([light[:, None] + p.glow[k] * even for light, k in zip(direct, p.layer, strict=True)])
+        return np.stack([led.light[:, None] + p.glow[k] * even for led, k in zip(leds, p.layer, strict=True)])
 
     def total(self, p: LightParameters, light: Light) -> list[np.ndarray]:
         """Linear light (M, 3) in the pixels of presses, in the same at rest, over the image at rest."""
@@ -171,22 +166,14 @@ class DirectFit:
         image = encode((decode(self.behind, gamma) - black) * pressed / flat + black, gamma)
         return image, encode(rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, gamma)
 
-    # ------------------------------------------------------------------ parameters as one vector
-
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
         per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1)] * len(p.leds)
-        slopes = len(self.start.slopes)
-        rest = [("power", p.power.size), ("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", slopes)]
-        return per_led + rest
+        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", len(self.start.slopes))]
+        return [*per_led, ("power", p.power.size), *rest]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
         return np.concatenate([np.full(n, SIGMA[name]) for name, n in self.blocks(p)])
-
-    @property
-    def _sees_heights(self) -> bool:
-        """True if images depend on the heights of LEDs, which only shadows do."""
-        return self.extra is not None and HEIGHT in self.extra.by_led
 
     def free(self, p: LightParameters) -> np.ndarray:
         fixed = (*self.settings.fixed, *(() if self._sees_heights else ("height",)))
@@ -206,8 +193,7 @@ class DirectFit:
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts: LEDs in the case, lobes in [1, 15], fitted heights in ``HEIGHTS``, none
-        negative."""
+        """Every parameter moved to what a sensor accepts: LEDs in the case, fitted heights in ``HEIGHTS``, none negative."""
         p, half = state.p, 5e2 * np.array(self.sensor.case.size)
         leds, response = p.leds.copy(), p.response.copy()
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
@@ -223,8 +209,6 @@ class DirectFit:
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
-
-    # ------------------------------------------------------------------ least squares
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Levels by which the presses' pixels (M, 3) and the image at rest (K, 3) are off, not weighted."""
@@ -245,13 +229,11 @@ class DirectFit:
         return float(images + priors)
 
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Slopes of the presses' pixels (3M, G) and of the image at rest (3K, G) by the vector, of the first by their own press's circle
-        (3M, 3), and the two images."""
+        """(presses by the vector (3M, G), image at rest by it (3K, G), presses by their own circles (3M, 3), the two images)."""
         p, seen = state.p, self.geometry(state)
         geometries = (seen, self.flat_geometry, self.rest_geometry)
         leds = [[led_light(g, led, REFERENCE_DISTANCE) for led in p.leds] for g in geometries]
-        light = Light(*(self._led_layers(p, g, [one.light for one in part]) for g, part in zip(geometries, leds, strict=True)))
-        whole = self._with_extra(p, light)
+        whole = self._with_extra(p, Light(*(self._led_layers(p, g, part) for g, part in zip(geometries, leds, strict=True))))
         total = _summed(p, whole)
         image, rest = self.images(p, total)
         gains = self._gains(p, image, rest, total)
@@ -308,10 +290,7 @@ class DirectFit:
     def _gains(
         self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slopes of levels by light pressed, by light at rest (negated), and of the rest image.
-
-        The light at rest is that in the same pixels.
-        """
+        """Slopes of levels by light pressed, by light at rest in the same pixels (negated), and of the rest image."""
         gamma, *stray, _, _ = p.response
         black = np.array(stray) * self.darkest**gamma
 

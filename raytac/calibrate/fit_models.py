@@ -68,11 +68,7 @@ def check_fit(
     starts: int = 1,
     rounds: int = 0,
 ) -> None:
-    """Refuse arguments of ``fit_models`` that it could not use, at once and not after a fit.
-
-    Raises:
-        InputError: an unknown mode, strength of priors, block of parameters, source of shadows or device, no start, or rounds below 0.
-    """
+    """Raise InputError for arguments that ``fit_models`` could not use, at once and not after a fit."""
     for name, values, rule, choices in (
         ("modes", modes, "must be known modes", MODES),
         ("prior", () if prior is None else (prior,), "must be a known strength, or None to choose it", tuple(STRENGTHS)),
@@ -110,34 +106,20 @@ def fit_models(
     tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
-    """Fit ``modes`` to the presses of ``shots``.
+    """Fit ``modes`` to the presses of ``shots``, all with the imprint and the circles that the lights were fitted with.
 
-    All use the imprint and the circles that the lights were fitted with.
-
-    ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``.
-    ``shadow_table``: one of ``SHADOW_TABLES``.
-    ``settle``: all modes have the image at rest of ``Photographs.settled``, and not the one photograph of it.
-
-    Raises as ``check_fit`` and ``fit_lights``.
+    ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``. ``shadow_table``: one of ``SHADOW_TABLES``. ``settle``: all
+    modes have the image at rest of ``Photographs.settled``, and not the one photograph of it. Raises as ``check_fit`` and ``fit_lights``.
     """
     tracing = RayTraced() if tracing is None else tracing
     settings = FitSettings() if settings is None else settings
-    check_fit(
-        modes=modes,
-        prior=prior,
-        fixed=settings.fixed,
-        shadow_table=shadow_table,
-        device=device,
-        starts=starts,
-        rounds=rounds,
-    )
+    own = {"device": device, "starts": starts, "rounds": rounds}
+    check_fit(modes=modes, prior=prior, fixed=settings.fixed, shadow_table=shadow_table, **own)
     shots = shots.settled(sensor) if settle else shots
     if prior is None:
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
     settings = dataclasses.replace(settings, **STRENGTHS[prior])
-    fitted = fit_lights(
-        sensor, shots, settings=settings, device=device, seed=seed, starts=starts, rounds=rounds, tracing=tracing, tick=tick
-    )
+    fitted = fit_lights(sensor, shots, settings=settings, seed=seed, tracing=tracing, tick=tick, **own)
     state, background, built = fitted.state, shots.background, {}
 
     def count_rendered(images: int) -> None:

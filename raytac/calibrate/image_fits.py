@@ -21,7 +21,7 @@ from raytac.optics.image.config import Phong
 from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
 from raytac.optics.response import fit_log_gain
 from raytac.optics.taxim.bake.bake import PLAIN, bake_shadow
-from raytac.optics.taxim.bake.fit import BinSums
+from raytac.optics.taxim.bake.fit import BinSums, two_sheets
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.views import Calibration
 from raytac.optics.taxim.table import PolyTable, slope_bins
@@ -29,17 +29,7 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 
-__all__ = [
-    "MlpSettings",
-    "PressSamples",
-    "ShadingSettings",
-    "TableSettings",
-    "fit_mlp",
-    "fit_table",
-    "press_samples",
-    "with_cast_shadows",
-    "with_shading",
-]
+__all__ = ["PressSamples", "ShadingSettings", "fit_mlp", "fit_table", "press_samples", "with_cast_shadows", "with_shading"]
 
 
 @dataclass(frozen=True)
@@ -88,19 +78,18 @@ class ShadingSettings:
 
 @dataclass(frozen=True)
 class PressSamples:
-    """One row a displaced pixel, K in all.
-
-    ``press``, ``row``, ``column``, the slopes of the displacement, and ``touched`` (the ball touches), each (K,). ``difference`` from the
-    background [levels], (K, 3).
-    """
+    """One row a displaced pixel, K in all; each (K,) but for the last."""
 
     press: np.ndarray
     row: np.ndarray
     column: np.ndarray
     slope_x: np.ndarray
+    """∂/∂x of the displacement."""
     slope_y: np.ndarray
     touched: np.ndarray
+    """True where the ball touches."""
     difference: np.ndarray
+    """Difference from the background [levels], (K, 3)."""
 
 
 def press_samples(
@@ -144,27 +133,20 @@ def press_samples(
 def fit_table(
     sensor: SensorSpec, background: np.ndarray, samples: PressSamples, settings: TableSettings = TableSettings()
 ) -> PolyTable:
-    """Taxim table of ``samples`` over the real ``background`` (H, W, 3) [levels].
+    """Taxim table of ``samples`` over the real ``background`` (H, W, 3) [levels], with the sheets of ``two_sheets``.
 
-    It has one sheet for touched pixels and one for those around. For readers that know a single sheet (``PolyTable.one_sheet``) it has one
-    of all samples. It has no shadows: photographs of balls say too little about them.
+    It has no shadows: photographs of balls say too little about them.
     """
     height, width = background.shape[:2]
     i, j = slope_bins(samples.slope_x, samples.slope_y, settings.n_bins)
     touched, around = (BinSums(settings.n_bins, (width, height)) for _ in range(2))
     for sums, own in ((touched, samples.touched), (around, ~samples.touched)):
         sums.add(i[own], j[own], samples.column[own], samples.row[own], samples.difference[own].astype(np.float32))
-    contact, surround, together = (
-        sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in (touched, around, touched.plus(around))
-    )
+    _, sheets = two_sheets(touched, around, neighbours=settings.neighbours, ridge=settings.ridge)
     return PolyTable(
-        gradients=contact.gradients,
-        covered=contact.covered,
-        surround=surround.gradients,
-        one_sheet=together.gradients,
+        **sheets,
         background=background.astype(np.float32),
         pixel_pitch=sensor.camera.pitch_at((width, height)),
-        slopes_of="displacement",
         rest_image=np.clip(np.rint(background), 0, 255).astype(np.uint8),
         constants=PLAIN,
         provenance={"source": "real presses of balls", "sensor": sensor.name, "presses": str(len(np.unique(samples.press)))},
@@ -182,8 +164,8 @@ def with_cast_shadows(
 ) -> PolyTable:
     """``table`` with a shadow table of pins and balls, rendered by the ray tracer under the fitted lights of ``lit``.
 
-    Its images have the table's background as flat field. Both tables are then differences in levels from the same image by the same
-    response. ``tick`` is called with the number of images rendered so far.
+    The table's background is their flat field, so that both tables are differences in levels from one image by one response. ``tick`` is
+    called with the number of images rendered so far.
     """
     height, width = table.background.shape[:2]
     field = np.clip(np.rint(table.background), 0, 255).astype(np.uint8)
@@ -208,10 +190,7 @@ def fit_mlp(
     settings: MlpSettings = MlpSettings(),
     tick: Callable[[int], None] | None = None,
 ) -> MlpWeights:
-    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels]. The same seed gives the same network.
-
-    ``tick`` is called with the number of passes done so far.
-    """
+    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels]; ``tick`` is called with the number of passes done so far."""
     rng = np.random.default_rng(seed)
     height, width = background.shape[:2]
     chosen = rng.permutation(len(samples.row))[: settings.samples]
@@ -220,17 +199,15 @@ def fit_mlp(
     row = np.concatenate([samples.row[chosen], rng.integers(height, size=flat)])
     features = (samples.slope_x, samples.slope_y, samples.touched.astype(float))
     slope_x, slope_y, touched = (np.concatenate([f[chosen], np.zeros(flat)]) for f in features)
-    target = np.concatenate([samples.difference[chosen], np.zeros((flat, 3))]) / LEVELS
+    target = (np.concatenate([samples.difference[chosen], np.zeros((flat, 3))]) / LEVELS).astype(np.float32)
     u, v = (column + 0.5) * (2 / width) - 1, (row + 0.5) * (2 / height) - 1
     x = np.stack(inputs(np, slope_x, slope_y, touched, u, v, view_slope(sensor)), axis=1).astype(np.float32)
-    target = target.astype(np.float32)
     sizes = (INPUTS, *settings.hidden, 3)
     matrices: list[np.ndarray] = [rng.normal(0, np.sqrt(2 / a), (b, a)).astype(np.float32) for a, b in itertools.pairwise(sizes)]
     matrices[-1] *= 0.1
     values: list[np.ndarray] = matrices + [np.zeros(b, np.float32) for b in sizes[1:]]
     count, step = len(matrices), 0
-    first: list[np.ndarray] = [0 * w for w in values]
-    second: list[np.ndarray] = [0 * w for w in values]
+    first, second = ([0 * w for w in values] for _ in range(2))
     steps = settings.epochs * -(-len(x) // settings.batch)
     for epoch in range(settings.epochs):
         order = rng.permutation(len(x))
@@ -276,13 +253,9 @@ def with_shading(
 ) -> SensorSpec:
     """The sensor with the colour shading that brings its image at rest to ``background`` (H, W, 3) [levels].
 
-    ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels of
-    the image to first order. ``tracing``: how rays are traced.
-
-    Raises:
-        InputError: more than half of a channel of ``background`` is not brighter than the sensor's black level, or no light reaches a
-            pixel at rest.
-        BackendError: the ray tracer cannot run on ``device``.
+    ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels
+    of the image to first order. ``tracing``: how rays are traced. Raises InputError: more than half of a channel of ``background`` is not
+    brighter than the sensor's black level, or no light reaches a pixel at rest; BackendError: the ray tracer cannot run on ``device``.
     """
     height, width = background.shape[:2]
     bare = sensor.response.unshaded

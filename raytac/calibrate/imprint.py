@@ -1,6 +1,4 @@
-"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle.
-
-All presses share it.
+"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle, shared by all presses.
 
 Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
@@ -90,19 +88,10 @@ def pixel_geometry(
     (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
     flat_x, flat_y = (u - cx) * px, (v - cy) * py
     pressed = press >= 0
-    if len(circles):
-        on_pad = circles_on_pad(sensor, circles, ball_radius)
-        share = on_pad[:, 2] / ball_radius
-        heights, own = _heights(slopes, share), np.where(pressed, press, 0)
-        at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
-    else:
-        heights, own, at, a, a_share = (
-            np.zeros((1, len(_TABLE))),
-            np.zeros(len(u), int),
-            np.zeros((len(u), 2)),
-            np.ones(len(u)),
-            np.zeros(len(u)),
-        )
+    on_pad = circles_on_pad(sensor, circles, ball_radius) if len(circles) else np.array([[0.0, 0.0, 1.0]])
+    share = on_pad[:, 2] / ball_radius if len(circles) else np.zeros(1)
+    heights, own = _heights(slopes, share), np.where(pressed, press, 0)
+    at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
     z = np.zeros(len(u))
     x, y, dx, dy, t = flat_x, flat_y, z, z, z
     for _ in range(6):
@@ -127,8 +116,7 @@ def press_surface(
 ) -> GelSurface:
     """The pad under every ball as a batch of surfaces on ``grid``; arguments as for ``pixel_geometry``.
 
-    Raises:
-        InputError: a contact circle as wide as its ball.
+    Raises InputError: a contact circle as wide as its ball.
     """
     on_pad = circles_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius

@@ -1,6 +1,4 @@
-"""Parameters of a fit of lights, and ties between LEDs of one side.
-
-Every LED has a place, aim, lobe, height and power. The case has an even glow, and the camera a response.
+"""Parameters of a fit of lights: place, aim, lobe, height and power of every LED, glow of the case, response; and ties between LEDs.
 
 A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
 nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
@@ -22,11 +20,9 @@ from raytac.specs.sensor_check import led_corners
 
 __all__ = [
     "CEILING",
-    "CHANNELS",
     "HEIGHT",
     "HEIGHTS",
     "LightParameters",
-    "Ties",
     "darkest",
     "leds_at_walls",
     "leds_split",
@@ -68,20 +64,15 @@ class LightParameters:
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
-        """Those of a sensor, whose image at rest is ``background`` [levels].
-
-        Raises:
-            InputError: a layer that is no camera channel.
-        """
+        """Those of a sensor, whose image at rest is ``background`` [levels]; InputError for a layer that is no camera channel."""
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
                 rule = "must be a camera channel, the LED's colour"
                 raise InputError("led.layer", value=led.layer, rule=rule, choices=CHANNELS)
             x, y, z = led.axis
-            leds.append(
-                [*(1e3 * c for c in led.position), np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1)), led.lobe, 1e3 * led.size[1]]
-            )
+            aim = np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1))
+            leds.append([*(1e3 * c for c in led.position), *aim, led.lobe, 1e3 * led.size[1]])
             power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
         stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
@@ -125,8 +116,7 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
-    """The sensor with fitted lights and response, without colour shading; ``background`` [levels] as for ``LightParameters.of``. Not
-    checked."""
+    """The sensor with fitted lights and response, without colour shading, not checked; ``background`` as of ``LightParameters.of``."""
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
     black_level = tuple(map(float, black))
@@ -140,14 +130,9 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
-    """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
+    """Start of a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
 
-    They stand side by side over ``SPREAD`` times its width.
-
-    What would stick out of the case's walls is moved inside.
-
-    Raises:
-        InputError: no whole number >= 1.
+    What would stick out of the case's walls is moved inside. Raises InputError unless ``count`` is a whole number >= 1.
     """
     count = check_whole("split", count)
     if count == 1:
@@ -174,8 +159,7 @@ def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
 def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
     """A start for a fit: LEDs along the walls, near the gel's height, aimed across the pad and towards the camera.
 
-    Raises:
-        InputError: other than three whole numbers >= 1 joined by commas.
+    Raises InputError unless ``sides`` is three whole numbers >= 1 joined by commas.
     """
     counts = sides.split(",")
     if len(counts) != 3 or not all(count.strip().isdecimal() and int(count) for count in counts):
@@ -223,9 +207,7 @@ class Ties:
 
 
 def side_ties(p: LightParameters, size: int) -> Ties:
-    """Ties of the LEDs of every layer, which stand on one side of the pad.
-
-    They are mirrored about the line from the pad's middle to theirs.
+    """Ties of the LEDs of every layer, which stand on one side of the pad, mirrored about the line from the pad's middle to theirs.
 
     An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
     whose first entries are ``p.leds`` and ``p.power``.
@@ -260,17 +242,13 @@ def side_ties(p: LightParameters, size: int) -> Ties:
                 turn, total = 2 * float(np.arctan2(out[1], out[0])), float(p.leds[a, 3] + p.leds[b, 3])
                 tie(AIM, turn + 2 * np.pi * round((total - turn) / (2 * np.pi)), (wide * a + 3, 1), (wide * b + 3, 1))
                 if a < b:
-                    tie(
-                        PLACE,
-                        0.0,
-                        *((wide * led + axis, float(sign * out[axis])) for led, sign in ((a, 1), (b, -1)) for axis in (0, 1)),
-                    )
+                    signs = ((a, 1), (b, -1))
+                    tie(PLACE, 0.0, *((wide * led + axis, float(sign * out[axis])) for led, sign in signs for axis in (0, 1)))
                     tie(PLACE, 0.0, (wide * a + 2, 1), (wide * b + 2, -1))
                     tie(AIM, 0.0, (wide * a + 4, 1), (wide * b + 4, -1))
         for a, b in itertools.pairwise(own):
             tie(LOBE, 0.0, (wide * a + 5, 1), (wide * b + 5, -1))
             tie(TALL, 0.0, (wide * a + HEIGHT, 1), (wide * b + HEIGHT, -1))
-            for c in range(3):
-                first = p.leds.size + c
-                tie(POWER, 0.0, (first + 3 * a, 1), (first + 3 * b, -1))
+            for power in range(p.leds.size, p.leds.size + 3):
+                tie(POWER, 0.0, (power + 3 * a, 1), (power + 3 * b, -1))
     return Ties(np.array(rows).reshape(len(rows), size), np.array(offsets))

@@ -20,13 +20,16 @@ FAR = 3.0
 
 @dataclass(frozen=True)
 class Photographs:
-    """Images in 8-bit levels, as floats: ``background`` (H, W, 3), ``presses`` (N, H, W, 3); ``circles`` (N, 3): x, y, radius [px] at the
-    sensor's resolution; ``radius`` (N,): of the balls [m]."""
+    """Images in 8-bit levels, as floats."""
 
     background: np.ndarray
+    """(H, W, 3)."""
     presses: np.ndarray
+    """(N, H, W, 3)."""
     circles: np.ndarray
+    """x, y, radius [px] at the sensor's resolution, (N, 3)."""
     radius: np.ndarray
+    """Those of the balls [m], (N,)."""
 
     def take(self, index: np.ndarray) -> Photographs:
         return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
@@ -70,8 +73,7 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
     """The fully visible presses, at the sensor's own resolution.
 
-    Raises:
-        InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
+    Raises InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
     """
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
@@ -90,10 +92,5 @@ def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
 
 
 def read_photographs(data: Path, sensor: SensorSpec) -> Photographs:
-    """``photographs_of`` the presses of a data set that labels its circles.
-
-    Raises:
-        InputError: no such data set, or as ``photographs_of``.
-        CalibrationError: a missing or malformed file.
-    """
+    """``photographs_of`` the presses of a data set that labels its circles; raises as that and ``read_presses``."""
     return photographs_of(read_presses(data), sensor)

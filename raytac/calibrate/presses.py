@@ -114,14 +114,11 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
     return presses
 
 
-# ------------------------------------------------------------------------------------------------------------ layouts
-
-
 def _read_labels(path: Path) -> RealPresses:
     rows = _rows(path, ("diameter", "index", "cx_px", "cy_px", "r_px"))
     files, radii, circles = [], [], []
     for number, row in enumerate(rows, start=2):
-        diameter = row["diameter"]
+        diameter, centre = row["diameter"], [_number(path, number, key, row[key]) for key in ("cx_px", "cy_px")]
         radii.append(_number(path, number, "diameter", diameter.removesuffix("mm"), positive=True) / 2e3)
         index = _number(path, number, "index", row["index"])
         if index != int(index) or index < 0:
@@ -142,8 +139,9 @@ def _read_catalog(path: Path) -> RealPresses:
 
 
 def _read_pack(path: Path, ball_radius: float) -> RealPresses:
-    pack = npz_arrays(path, ("f0", "imgs", "touch_center", "touch_radius"))
-    background, images = pack["f0"], pack["imgs"]
+    keys = ("f0", "imgs", "touch_center", "touch_radius")
+    pack = npz_arrays(path, keys)
+    background, images, centre, radius = (pack[key] for key in keys)
     if background.ndim != 3 or background.shape[2] != 3 or background.dtype != np.uint8:
         rule = "must be one uint8 image, (H, W, 3)"
         raise CalibrationError(rule, file=path, key="f0", value=f"{background.dtype} {background.shape}")
@@ -151,7 +149,6 @@ def _read_pack(path: Path, ball_radius: float) -> RealPresses:
         rule = f"must be uint8 images of the size of f0, (N, {background.shape[0]}, {background.shape[1]}, 3)"
         raise CalibrationError(rule, file=path, key="imgs", value=f"{images.dtype} {images.shape}")
     count = len(images)
-    centre, radius = pack["touch_center"], pack["touch_radius"]
     for key, array, shape in (("touch_center", centre, (count, 2)), ("touch_radius", radius, (count,))):
         if array.shape != shape or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
             raise CalibrationError(f"must be finite numbers {shape}", file=path, key=key, value=f"{array.dtype} {array.shape}")
@@ -160,9 +157,6 @@ def _read_pack(path: Path, ball_radius: float) -> RealPresses:
     circles = np.column_stack([centre, radius]).astype(float)
     names = tuple(f"{k:02d}" for k in range(count))
     return RealPresses(background[..., ::-1].copy(), images[..., ::-1].copy(), np.full(count, ball_radius), circles, names)
-
-
-# ------------------------------------------------------------------------------------------------------------ files
 
 
 def _rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
@@ -221,14 +215,9 @@ Split = tuple[np.ndarray, np.ndarray]
 
 
 def by_press(count: int, folds: int) -> list[Split]:
-    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th.
+    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th, so that neighbours of a scan are apart.
 
-    Neighbours of a scan are thus in different folds.
-
-    ``folds = count`` leaves one out.
-
-    Raises:
-        InputError: fewer than two folds, or more folds than presses.
+    ``folds = count`` leaves one out. Raises InputError for fewer than two folds, or more folds than presses.
     """
     if int(folds) != folds or not 2 <= folds <= count:
         raise InputError("folds", value=folds, rule=f"must be a whole number from 2 to the number of presses, {count}")
@@ -237,12 +226,9 @@ def by_press(count: int, folds: int) -> list[Split]:
 
 
 def by_half(presses: RealPresses) -> list[Split]:
-    """Splits from the left half of the pad to the right one, and the reverse.
+    """Splits from the left half of the pad to the right one, and the reverse, by the circles' centres.
 
-    A press belongs to the half that its circle's centre lies in.
-
-    Raises:
-        InputError: a half without a press.
+    Raises InputError for a half without a press.
     """
     in_left_half = _known(presses)[:, 0] < presses.resolution[0] / 2
     if in_left_half.all() or not in_left_half.any():
@@ -252,12 +238,9 @@ def by_half(presses: RealPresses) -> list[Split]:
 
 
 def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
-    """Split from the shallower ``share`` of the presses to the deeper ones.
+    """Split from the shallower ``share`` of the presses to the deeper ones: depth over the ball's radius grows with the circle over it.
 
-    Depth over the ball's radius grows with the circle over the ball.
-
-    Raises:
-        InputError: a share that leaves one side empty.
+    Raises InputError for a share that leaves one side empty.
     """
     relative = _known(presses)[:, 2] / presses.ball_radius
     order, cut = np.argsort(relative, kind="stable"), round(share * len(presses))

@@ -52,11 +52,7 @@ def choose_strength(
 ) -> tuple[str, dict[str, float]]:
     """Name of the candidate chosen, and the error of each: mean absolute residual [levels] in contacts of other halves.
 
-    That is the one with the least error, or ``USUAL`` if it is among the candidates and not worse by more than the standard error of the
-    difference.
-
-    Raises:
-        InputError: too few presses to halve.
+    Raises InputError for too few presses to halve.
     """
     if len(shots.circles) < 2 * FEWEST:
         rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or name one with --prior"

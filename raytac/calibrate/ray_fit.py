@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
@@ -99,7 +99,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
 def extra_light(
     problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
-    """The defect with its slopes by the LEDs' places and heights, where shadows are cast (``slopes``: and wanted).
+    """The defect with its slopes by the LEDs' places and heights, where shadows are cast and ``slopes`` asked for.
 
     Every LED has a layer of its own, so that all move in one rendering: eight more give all slopes, by central differences and without
     inter-reflection, which changes slowly.
@@ -135,14 +135,10 @@ def fit_lights(
 ) -> Fitted:
     """Fit ``sensor``'s LEDs, glow, response, imprint and the circles of ``shots``.
 
-    ``start``: where the fit begins; None is the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles.
-    ``rounds`` of defect correction follow the fit of direct light; 0 leaves it at that. Direct light is fitted from ``starts`` places, the
-    given one and others about it, and the best goes on. ``seed`` chooses pixels and places. ``tracing``: how rays are
-    traced. ``tick`` is called with the stage and the cost after every step.
-
-    Raises:
-        InputError: refraction, LEDs of no colour, or fewer values than parameters.
-        BackendError: the ray tracer cannot run on ``device``.
+    ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
+    at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
+    pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, LEDs of no colour,
+    or fewer values than parameters; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":
@@ -197,10 +193,7 @@ def refine_circles(
     seed: int = 0,
     tracing: RayTraced | None = None,
 ) -> np.ndarray:
-    """Circles (N, 3) [px] of presses that the lights were not fitted to.
-
-    They are fitted from their labels, with the finished lights fixed.
-    """
+    """Circles (N, 3) [px] of presses that the lights were not fitted to, from their labels and with the finished lights fixed."""
     all_fixed = FitSettings(fixed=tuple(SIGMA))
     own = FitState(state.p, state.slopes, shots.circles.copy())
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)

@@ -113,11 +113,9 @@ class OpticsConfig(Generic[Mode]):
         """The mode for one sensor.
 
         Args:
-            spec: the sensor.
             resolution: (width, height) [px]; None is the sensor's own.
             outputs: some of the class's own.
             device: ``auto``, ``cpu`` or ``cuda``.
-            seed: of every random number.
 
         Raises:
             InputError: a value out of its choices.

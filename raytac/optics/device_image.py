@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from raytac.checks import check_methods
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.device_mode import Float, UInt8
+from raytac.optics.device_mode import Float, UInt8, upload
 from raytac.optics.runtime import no_collection
 
 __all__ = ["DeviceImage", "ImageCut"]
@@ -43,8 +42,7 @@ class DeviceImage:
             cut: what is kept.
             difference: give (255 + image − image at rest) // 2 instead of the image.
 
-        Raises:
-            InputError: a mode that has no images on the device, or a cut beyond the rendered image.
+        Raises InputError: a mode that has no images on the device, or a cut beyond the rendered image.
         """
         what = "a mode that renders on the device, such as taxim, phong or raytrace with the integrator fast"
         check_methods("optics", mode, ("prepare", "render_device"), ("mi", "camera", "outputs"), what)
@@ -67,10 +65,7 @@ class DeviceImage:
 
     def upload(self, surface: GelSurface) -> tuple[Float, UInt8]:
         """Heights (B·Ny·Nx) and contact of a surface on the device; heights must be finite."""
-        heights = self.mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
-        contact = self.mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
-        dr.eval(heights, contact)
-        return heights, contact
+        return upload(self.mi, surface)
 
     def __call__(self, heights: Float, contact: UInt8 | None = None) -> Any:
         """Images (B, height, width, 3), uint8, a Dr.Jit tensor that DLPack hands on without a copy; they are there when this returns.
@@ -79,8 +74,7 @@ class DeviceImage:
             heights: [m], B·Ny·Nx of them on this device, finite, which is not checked: a Dr.Jit array, or a float32 PyTorch tensor.
             contact: where the object touches, as many bytes; only for modes that need it.
 
-        Raises:
-            InputError: no whole number of grids, or contact missing.
+        Raises InputError: no whole number of grids, or contact missing.
         """
         mi = self.mi
         heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))

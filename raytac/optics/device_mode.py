@@ -19,7 +19,7 @@ from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
 from raytac.optics.ink import checked_ink
 from raytac.optics.refraction import Slab
-from raytac.optics.runtime import check_batch, largest_batch, load_mitsuba, no_collection
+from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.sensor import SensorSpec
 
 __all__ = ["DeviceFrame", "DeviceMode", "Float", "FrameInputs", "UInt8"]
@@ -29,6 +29,8 @@ UInt8 = Any  # Dr.Jit array of bytes
 
 ROUNDING = 2
 """Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
+_LONGEST_ARRAY = 2**32 - 1
+"""Dr.Jit indexes with 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -96,22 +98,26 @@ class DeviceMode(ABC):
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._at_rest: OpticsImages | None = None
         """Images of one untouched pad, which every environment at rest shows."""
+        self._set_up()
 
-    # ---------------------------------------------------------------- what a mode gives
+    def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
+        """Last part of the constructor: what a mode needs beyond that, and checks of its configuration."""
 
     @abstractmethod
     def _build(self, grid: PadGrid) -> Any:
-        """Device arrays that a frame reads besides the surface, a frozen dataclass; called once, for the first grid."""
+        """Device arrays that a frame reads besides the surface; called once, for the first grid."""
 
     def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
         """Fields of ``DeviceFrame``, from heights (B·Ny·Nx) [m]."""
         raise NotImplementedError
 
+    def _other_images(self, frame: DeviceFrame, failed: np.ndarray) -> dict[str, Any]:
+        """Fields of ``OpticsImages`` besides ``rgb`` that show light; ``failed`` (B,) marks environments."""
+        return {}
+
     def _bytes_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment's image takes [byte], before Dr.Jit's rounding."""
         return 0
-
-    # ---------------------------------------------------------------- grid and memory
 
     def prepare(self, grid: PadGrid) -> None:
         """Build what depends on the pad's grid; done at the first frame and kept.
@@ -144,15 +150,15 @@ class DeviceMode(ABC):
         """Largest number of environments that one call may render on ``grid``; a path tracer's images are made one by one."""
         width, height = self.camera.resolution
         longest = max(4 * grid.rest.size, self._longest_row * width * height)
-        return largest_batch(self._memory, max(self.memory_per_env(grid), 1), longest)
+        return min(self._memory // max(self.memory_per_env(grid), 1), _LONGEST_ARRAY // longest)
 
     def _check_batch(self, envs: int, grid: PadGrid) -> None:
-        each = self.memory_per_env(grid)
-        if each == 0:
-            return
-        check_batch(envs, self.largest_batch(grid), per_env=each, memory=self._memory, device=self.device)
-
-    # ---------------------------------------------------------------- images
+        """Raise InputError for a batch that would not fit, before Dr.Jit ends the process over it."""
+        each, most = self.memory_per_env(grid), self.largest_batch(grid)
+        if each and envs > most:
+            rule = f"must be at most {most}: an environment takes {each / 1e6:.1f} MB, this {self.device} has "
+            rule += f"{self._memory / 1e9:.1f} GB and an array at most 2^32 values; render in parts"
+            raise InputError("number of environments", value=envs, rule=rule)
 
     @property
     def _lit(self) -> bool:
@@ -196,9 +202,7 @@ class DeviceMode(ABC):
         return self._images(surface, heights, failed, self._lit_images(surface, heights, failed) if self._lit else {})
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
-        """Images on the device, of device arrays; nothing leaves it.
-
-        Dr.Jit records the kernels at the first call of a batch size and replays them afterwards.
+        """Images on the device, of device arrays; recorded at the first call of a batch size and replayed afterwards.
 
         Args:
             heights: of the coat [m], B·Ny·Nx; must be finite, which is not checked here.
@@ -217,8 +221,9 @@ class DeviceMode(ABC):
 
     def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
         """Fields of ``OpticsImages`` that show light, of heights (B, Ny, Nx) that are safe to trace."""
-        device = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
-        return {"rgb": np.array(device.rgb).reshape(*self._shape(len(heights)), 3)}
+        frame = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
+        images = {"rgb": np.array(frame.rgb).reshape(*self._shape(len(heights)), 3)} if "rgb" in self.outputs else {}
+        return images | self._other_images(frame, failed)
 
     def _images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray, images: dict[str, Any]) -> OpticsImages:
         """``images`` and those of the geometry, with the failed environments marked."""
@@ -245,12 +250,17 @@ class DeviceMode(ABC):
         seen = see(self.mi, field, self.camera, dr.width(heights) // (self.layout.nx * self.layout.ny))
         return seen.p, seen.n
 
-    # ---------------------------------------------------------------- from host to device
-
     def _shape(self, envs: int) -> tuple[int, int, int]:
         """(B, H, W)."""
         width, height = self.camera.resolution
         return envs, height, width
+
+    def _check_image(self, name: str, image: object) -> None:
+        """Raise InputError unless ``image`` is an 8-bit image at this resolution."""
+        kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        wanted = (*self._shape(1)[1:], 3)
+        if kind != f"uint8 {wanted}":
+            raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {wanted}")
 
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
@@ -301,13 +311,21 @@ def _spread(rest: OpticsImages, images: OpticsImages | None, envs: list[int], ba
     return OpticsImages(**merged)
 
 
+def upload(mi: Any, surface: GelSurface) -> tuple[Float, UInt8]:
+    """Heights and contact of a surface on the device, each B·Ny·Nx."""
+    heights = mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
+    contact = mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+    dr.eval(heights, contact)
+    return heights, contact
+
+
 def device_envs(nodes: int, heights: Float, **others: Any) -> int:
     """Number of environments B in device heights (B·``nodes``); raise InputError unless each of ``others`` has one value a node too."""
     width = dr.width(heights)
     if width == 0 or width % nodes:
         raise InputError("heights", value=width, rule=f"must hold a whole number of grids of {nodes} nodes")
     for name, array in others.items():
-        if array is None or dr.width(array) != width:
-            value = None if array is None else dr.width(array)
-            raise InputError(name, value=value, rule=f"must have one value a node, {width} here")
+        own = None if array is None else dr.width(array)
+        if own != width:
+            raise InputError(name, value=own, rule=f"must have one value a node, {width} here")
     return width // nodes

@@ -27,9 +27,15 @@ LOOK_UP_Z = -1.0e-3
 """Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
 
 
+def bilinear(corners: Sequence[Any], wx: Any, wy: Any) -> Any:
+    """Bilinear mean of a cell's ``corners`` (``NodeGrid.corners``) at the shares ``wx`` and ``wy`` of its sides."""
+    a, b, c, d = corners
+    return dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+
+
 @dataclass(frozen=True)
-class CoatLayout:
-    """Constants of all frames: the grid, its rest surface and the tiling."""
+class NodeGrid:
+    """Nodes over the pad, row by row: their numbers, the place of the first and the spacing [m]. Device arrays hold B of them in turn."""
 
     nx: int
     ny: int
@@ -37,6 +43,32 @@ class CoatLayout:
     y0: float
     dx: float
     dy: float
+
+    def cell(self, mi: Any, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Index of the first corner of the cell under (x, y) [m], and the shares of its sides at which that lies."""
+        fx = dr.clip((x - self.x0) / self.dx, 0, self.nx - 1.001)
+        fy = dr.clip((y - self.y0) / self.dy, 0, self.ny - 1.001)
+        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
+        return (env * self.ny + iy) * self.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
+
+    def corners(self, kind: Any, values: Any, i: Any) -> list[Any]:
+        """``values``, packets of the type ``kind``, at the four corners of the cells that start at ``i``."""
+        return [dr.gather(kind, values, i + offset) for offset in (0, 1, self.nx, self.nx + 1)]
+
+    def slopes(self, mi: Any, z: Any, i: Any, ix: Any, iy: Any) -> tuple[Any, Any]:
+        """(∂z/∂x, ∂z/∂y) at node ``i``, of column ``ix`` and row ``iy``; central differences, one-sided on the rim."""
+        nx = self.nx
+        x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < nx - 1, i + 1, i)
+        y_minus, y_plus = dr.select(iy > 0, i - nx, i), dr.select(iy < self.ny - 1, i + nx, i)
+        zx = (dr.gather(mi.Float, z, x_plus) - dr.gather(mi.Float, z, x_minus)) / (mi.Float(x_plus - x_minus) * self.dx)
+        rise = dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)
+        return zx, rise / (mi.Float((y_plus - y_minus) // nx) * self.dy)
+
+
+@dataclass(frozen=True)
+class CoatLayout(NodeGrid):
+    """Constants of all frames: the pad's grid and its tiling."""
+
     tile_x: int
     tile_y: int
     tiles_x: int
@@ -44,36 +76,23 @@ class CoatLayout:
 
     @classmethod
     def from_grid(cls, grid: PadGrid) -> CoatLayout:
-        ny, nx = grid.shape
-        dx, dy = grid.pitch
+        (ny, nx), (dx, dy) = grid.shape, grid.pitch
         tile_x, tile_y = max(1, round(TILE / dx)), max(1, round(TILE / dy))
-        return cls(
-            nx=nx,
-            ny=ny,
-            x0=float(grid.x[0]),
-            y0=float(grid.y[0]),
-            dx=dx,
-            dy=dy,
-            tile_x=tile_x,
-            tile_y=tile_y,
-            tiles_x=-(-nx // tile_x),
-            tiles_y=-(-ny // tile_y),
-        )
+        tiles = -(-nx // tile_x), -(-ny // tile_y)
+        return cls(nx, ny, float(grid.x[0]), float(grid.y[0]), dx, dy, tile_x, tile_y, *tiles)
 
 
 class CoatField:
     """B coat surfaces as device arrays, computed each frame from heights.
 
-    ``nodes`` holds (z, n_x, n_y, n_z) a node: one packet gather brings the normal (z fills the packet up), ``cells`` the heights at the
-    four corners of a cell, for the walks; the normal points to the
-    camera side (n_z < 0) and comes from central differences, as the vertex normals of the reference's mesh do.
+    ``nodes`` holds (z, n_x, n_y, n_z) a node, so that one packet gather brings the normal, and ``cells`` the heights at the four corners
+    of a cell, for the walks. Normals point to the camera side (n_z < 0), as the vertex normals of the reference's mesh do.
     """
 
     def __init__(self, mi: Any, layout: CoatLayout, rest: Any, height: Any) -> None:
-        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx) are device Floats [m]."""
+        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx): device Floats [m]."""
         self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
-        nodes = pack_nodes(mi, layout, height)
-        self.nodes, self.cells = dr.ravel(nodes), dr.ravel(pack_cells(mi, layout, height))
+        self.nodes, self.cells = dr.ravel(pack_nodes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
         dr.eval(self.nodes, self.cells)
         self.lowest, self.highest, self.deepest = bounds_map(mi, layout, rest, height)
         self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
@@ -85,26 +104,17 @@ class CoatField:
         g = layout
         return 32 * g.nx * g.ny + 12 * g.ny * g.tiles_x + 24 * g.tiles_x * g.tiles_y
 
-    def _cell(self, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        mi, g = self.mi, self.layout
-        fx = dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001)
-        fy = dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)
-        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
-        return (env * g.ny + iy) * g.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
-
     def z(self, env: Any, x: Any, y: Any, active: Any = True) -> Any:
         """Bilinear height [m] at (x, y) [m]."""
-        i, wx, wy = self._cell(env, x, y)
+        i, wx, wy = self.layout.cell(self.mi, env, x, y)
         c = dr.gather(self.mi.Vector4f, self.cells, i, active)
-        return dr.lerp(dr.lerp(c.x, c.y, wx), dr.lerp(c.z, c.w, wx), wy)
+        return bilinear((c.x, c.y, c.z, c.w), wx, wy)
 
     def normal(self, env: Any, x: Any, y: Any) -> Any:
         """The unit normal at (x, y) [m], interpolated between nodes."""
-        mi, nx = self.mi, self.layout.nx
-        i, wx, wy = self._cell(env, x, y)
-        a, b = dr.gather(mi.Vector4f, self.nodes, i), dr.gather(mi.Vector4f, self.nodes, i + 1)
-        c, d = dr.gather(mi.Vector4f, self.nodes, i + nx), dr.gather(mi.Vector4f, self.nodes, i + nx + 1)
-        node = dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+        mi, g = self.mi, self.layout
+        i, wx, wy = g.cell(mi, env, x, y)
+        node = bilinear(g.corners(mi.Vector4f, self.nodes, i), wx, wy)
         return dr.normalize(mi.Normal3f(node.y, node.z, node.w))
 
     def tile(self, env: Any, x: Any, y: Any) -> Any:
@@ -196,13 +206,7 @@ class CoatField:
 def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
     """(z, n_x, n_y, n_z) at every node of ``height`` (B·Ny·Nx); central differences, one-sided on the pad's rim."""
     i = dr.arange(mi.UInt32, dr.width(height))
-    ix, iy = i % g.nx, (i // g.nx) % g.ny
-    x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < g.nx - 1, i + 1, i)
-    y_minus, y_plus = dr.select(iy > 0, i - g.nx, i), dr.select(iy < g.ny - 1, i + g.nx, i)
-    zx = (dr.gather(mi.Float, height, x_plus) - dr.gather(mi.Float, height, x_minus)) / (mi.Float(x_plus - x_minus) * g.dx)
-    zy = (dr.gather(mi.Float, height, y_plus) - dr.gather(mi.Float, height, y_minus)) / (
-        mi.Float((y_plus - y_minus) // g.nx) * g.dy
-    )
+    zx, zy = g.slopes(mi, height, i, i % g.nx, (i // g.nx) % g.ny)
     inv = dr.rsqrt(zx * zx + zy * zy + 1)
     return mi.Vector4f(height, zx * inv, zy * inv, -inv)
 
@@ -252,10 +256,7 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Hit of one camera ray per pixel, in the pad frame.
-
-    Environment index, point, normal and direction to the camera.
-    """
+    """Hit of one camera ray per pixel, in the pad frame: environment, point, normal, direction to the camera."""
 
     env: Any
     p: Any
@@ -283,10 +284,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
 
 
 def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-    """Contact, and what ``outputs`` name of normals with positions and of camera depth, by the fields of ``OpticsImages``.
-
-    ``p`` and ``n``: points and normals that the pixels of all environments see, on the device.
-    """
+    """Contact, and as ``outputs`` say normals with positions, and depth, of the seen points ``p`` and normals ``n`` on the device."""
     width, height = camera.resolution
     shape, grid = (surface.batch, height, width), surface.grid
     points = np.array(p).T.reshape(*shape, 3)

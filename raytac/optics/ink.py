@@ -9,7 +9,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics.geometry import CoatLayout
+from raytac.optics.geometry import CoatLayout, bilinear
 from raytac.specs.sensor import SensorSpec
 
 SPECULAR = 0.57
@@ -23,8 +23,7 @@ __all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
 def checked_ink(surface: GelSurface) -> np.ndarray | None:
     """The surface's ink, (B, Ny, Nx) float32; None if it has none.
 
-    Raises:
-        InputError: another shape than the heights', or values outside [0, 1].
+    Raises InputError: another shape than the heights', or values outside [0, 1].
     """
     if surface.ink is None:
         return None
@@ -38,12 +37,8 @@ def checked_ink(surface: GelSurface) -> np.ndarray | None:
 
 def ink_at(mi: Any, layout: CoatLayout, ink: Any, env: Any, x: Any, y: Any) -> Any:
     """Share of ink at the points (x, y) [m] of environments ``env``, bilinear; ``ink`` is (B·Ny·Nx) on the device."""
-    g = layout
-    fx, fy = dr.clip((x - g.x0) / g.dx, 0, g.nx - 1.001), dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)
-    ix, iy = mi.UInt32(fx), mi.UInt32(fy)
-    wx, wy, k = fx - mi.Float(ix), fy - mi.Float(iy), (env * g.ny + iy) * g.nx + ix
-    a, b, c, d = (dr.gather(mi.Float, ink, k + offset) for offset in (0, 1, g.nx, g.nx + 1))
-    return dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
+    i, wx, wy = layout.cell(mi, env, x, y)
+    return bilinear(layout.corners(mi.Float, ink, i), wx, wy)
 
 
 def inked_albedo(sensor: SensorSpec, ink: Any) -> list[Any]:
@@ -57,8 +52,7 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
     coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat.
     """
-    coat, response = sensor.coat, sensor.response
-    s = coat.specular
+    coat, response, s = sensor.coat, sensor.response, sensor.coat.specular
 
     def inked(*levels: Any) -> tuple[Any, ...]:
         result = []

@@ -52,10 +52,7 @@ class Slab:
 
     @classmethod
     def from_spec(cls, sensor: SensorSpec, unit: float = 1.0) -> Slab | None:
-        """The slab of ``sensor`` in a world of ``unit`` length units per metre; None where its refraction is ``"none"``.
-
-        Raises SpecError unless the camera and all of every LED lie in the air below it (a sensor made in code may break that).
-        """
+        """The slab in a world of ``unit`` length units per metre; None without refraction; SpecError unless camera and LEDs lie below."""
         if sensor.refraction.model == "none":
             return None
         check_slab(sensor)
@@ -64,8 +61,6 @@ class Slab:
     def inside(self, p: Any) -> Any:
         """True if point ``p`` is in the gel or plate."""
         return p.z > self.z
-
-    # ---------------------------------------------------------------- angles
 
     def bend(self, tx: Any, ty: Any) -> tuple[Any, Any]:
         """Slopes (dx/dz, dy/dz) in the gel of a ray of these slopes in air; NumPy or Dr.Jit."""
@@ -84,8 +79,6 @@ class Slab:
         # The outer normal is −z, so a positive cosine of the incident side means air.
         reflectance, cos_t, _, eta_ti = mi.fresnel(d.z, self.ior)
         return dr.normalize(mi.Vector3f(d.x * eta_ti, d.y * eta_ti, -cos_t)), reflectance
-
-    # ---------------------------------------------------------------- joining two points
 
     def meet(self, rho: Any, h1: Any, h2: Any) -> Any:
         """t = tan θ₁ of the ray that covers the horizontal distance ``rho`` over the heights ``h1`` in air and ``h2`` in the gel.
@@ -132,8 +125,7 @@ class Slab:
         h1, h2 = self.z - light.z, p.z - self.z
         t = self.meet(rho, h1, h2)
         cos1, cos2, slide, gain = self.spread(t, h1, h2)
-        sin1 = t * cos1
-        sin2 = sin1 / self.ior
+        sin1, sin2 = t * cos1, t * cos1 / self.ior
         w = mi.Vector3f(ux * sin2, uy * sin2, -cos2)
         out = mi.Vector3f(-ux * sin1, -uy * sin1, cos1)
         reach = sin2 / cos2 * h2

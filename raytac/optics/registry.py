@@ -25,8 +25,7 @@ register = OPTICS.register
 def chosen_optics(choice: str | OpticsConfig[Any] | OpticalMode) -> OpticsConfig[Any]:
     """Configuration of a name, the configuration itself, or one that holds a mode that is built already.
 
-    Raises:
-        InputError: an unknown name, or an object of another kind.
+    Raises InputError: an unknown name, or an object of another kind.
     """
     config = OPTICS.config(choice)  # type: ignore[arg-type]
     if isinstance(config, OpticsConfig):

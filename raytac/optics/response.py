@@ -40,8 +40,7 @@ class Response:
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
         """From now on turn the radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8), in linear light.
 
-        Raises:
-            InputError: a pixel that no light reaches at rest.
+        Raises InputError: a pixel that no light reaches at rest.
         """
         dark = int((at_rest <= 0).sum())
         if dark:
@@ -82,8 +81,7 @@ def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
         sensor: its response gives γ and the black level b, and names the file of an error.
         signal: s, the linear image at rest with vignette, shading and white balance at exposure 1, (H, W, 3).
 
-    Raises:
-        SpecError: no exposure makes mid-grey, since half of the image or more is dark, or since the black level alone is brighter.
+    Raises SpecError: no exposure makes mid-grey, since half of the image or more is dark, or since the black level alone is brighter.
     """
     black, gamma = np.asarray(sensor.response.black_level), sensor.response.gamma
 

@@ -11,10 +11,9 @@ from typing import Any
 import drjit as dr
 
 from raytac.device import llvm_library, resolve_device
-from raytac.errors import BackendError, InputError
+from raytac.errors import BackendError
 
-__all__ = ["VARIANTS", "check_batch", "largest_batch", "load_mitsuba", "no_collection", "peak_bytes"]
-
+__all__ = ["VARIANTS", "load_mitsuba", "no_collection", "peak_bytes"]
 
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
 
@@ -111,32 +110,6 @@ def no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-_LARGEST_ARRAY = 2**32 - 1
-"""Dr.Jit indexes with 32 bits."""
-
-
-def largest_batch(memory: int, per_env: int, values_per_env: int) -> int:
-    """Most environments that one call may render.
-
-    ``memory`` of the device and ``per_env`` that an environment takes at most [byte]; ``values_per_env``: length of its longest array.
-    """
-    return min(memory // per_env, _LARGEST_ARRAY // values_per_env)
-
-
-def check_batch(envs: int, most: int, *, per_env: int, memory: int, device: str) -> None:
-    """Refuse a batch that would not fit, before Dr.Jit ends the process over it.
-
-    Raises:
-        InputError: more than ``most`` environments; the message gives ``per_env`` and ``memory`` [byte].
-    """
-    if envs > most:
-        rule = (
-            f"must be at most {most}: an environment takes {per_env / 1e6:.1f} MB, this {device} has {memory / 1e9:.1f} GB "
-            "and an array at most 2^32 values; render in parts"
-        )
-        raise InputError("number of environments", value=envs, rule=rule)
 
 
 def peak_bytes(call: Callable[[], object], device: str) -> int:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.led_layers import ExtraLight, Light
 from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,11 +46,11 @@ def baker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tupl
     monkeypatch.setenv("RAYTAC_CACHE", str(tmp_path / "cache"))
     calls: list[dict[str, Any]] = []
 
-    def fake(sensor: SensorSpec, **arguments: Any) -> PolyTable:
+    def fake(sensor: SensorSpec, **arguments: Any) -> SimpleNamespace:
         calls.append(arguments)
-        return made_up(len(calls))
+        return SimpleNamespace(table=made_up(len(calls)))
 
-    monkeypatch.setattr(bake, "bake_table", fake)
+    monkeypatch.setattr(bake, "bake", fake)
 
     def call(spec: SensorSpec = SPEC, **arguments: Any) -> tuple[PolyTable, int]:
         return bake.baked_table(spec, progress=False, **arguments), len(calls)
@@ -186,6 +187,7 @@ def test_an_interrupt_leaves_nothing(baker: Callable[..., Any], tmp_path: Path, 
 _WRITER = """
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from raytac.optics.taxim.cache import keep
 from tests.optics.test_table_cache import made_up
 for k in range(40):

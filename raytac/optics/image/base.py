@@ -15,12 +15,10 @@ import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.optics.base import OpticsConfig
 from raytac.optics.camera import Pinhole
 from raytac.optics.device_mode import DeviceMode, Float, FrameInputs, UInt8
-from raytac.optics.geometry import CoatLayout
+from raytac.optics.geometry import CoatLayout, bilinear
 from raytac.optics.ink import darkened, ink_at
-from raytac.specs.sensor import SensorSpec
 
 __all__ = ["ImageHeights", "ImageMode", "see_heights"]
 
@@ -86,61 +84,40 @@ def see_heights(
     envs = dr.width(heights) // (g.nx * g.ny)
     i = dr.arange(mi.UInt32, envs * width * height)
     env, p = i // (width * height), i % (width * height)
-    origin, (tx, ty) = camera.ray(mi.Float(p % width) + 0.5, mi.Float(p // width) + 0.5)
-    ox, oy, oz = origin
+    (ox, oy, oz), (tx, ty) = camera.ray(mi.Float(p % width) + 0.5, mi.Float(p // width) + 0.5)
 
     def cell(z: Any) -> tuple[Any, Any, Any]:
-        fx = dr.clip((ox + (z - oz) * tx - g.x0) / g.dx, 0, g.nx - 1.001)
-        fy = dr.clip((oy + (z - oz) * ty - g.y0) / g.dy, 0, g.ny - 1.001)
-        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
-        return iy * g.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
-
-    def corners(of: Any, k: Any) -> list[Any]:
-        return [dr.gather(mi.Float, of, k + offset) for offset in (0, 1, g.nx, g.nx + 1)]
+        return g.cell(mi, 0, ox + (z - oz) * tx, oy + (z - oz) * ty)
 
     first = env * (g.nx * g.ny)
     z = mi.Float(0)
     for _ in range(2):
         k, wx, wy = cell(z)
-        a, b, c, d = corners(heights, first + k)
+        a, b, c, d = g.corners(mi.Float, heights, first + k)
         top, bottom = dr.lerp(a, b, wx), dr.lerp(c, d, wx)
         along = dr.lerp(b - a, d - c, wy) / g.dx * tx + (bottom - top) / g.dy * ty
         z += (dr.lerp(top, bottom, wy) - z) / dr.maximum(1 - along, 0.5)
     k, wx, wy = cell(z)
-    now, before = corners(heights, first + k), corners(rest, k)
-
-    def blend(v: list[Any]) -> Any:
-        return dr.lerp(dr.lerp(v[0], v[1], wx), dr.lerp(v[2], v[3], wx), wy) * (1 / pitch[0])
-
-    # Differences first, so that a coat at rest has displacement by exactly nothing.
-    displacement = blend([r - n for r, n in zip(before, now, strict=True)])
+    now, before = g.corners(mi.Float, heights, first + k), g.corners(mi.Float, rest, k)
+    # Differences first, so that the displacement of a coat at rest is exactly 0.
+    displacement = bilinear([r - n for r, n in zip(before, now, strict=True)], wx, wy) * (1 / pitch[0])
+    height = -(bilinear(now, wx, wy) * (1 / pitch[0]))
     touched = None
     if contact is not None:
         nearest = k + dr.select(wx > 0.5, 1, 0) + dr.select(wy > 0.5, g.nx, 0)
         touched = dr.gather(mi.UInt8, contact, first + nearest)
     dots = None if ink is None else ink_at(mi, g, ink, env, ox + (z - oz) * tx, oy + (z - oz) * ty)
-    return ImageHeights(-blend(now), displacement, touched, envs, (width, height), pitch[0] / pitch[1], dots)
+    return ImageHeights(height, displacement, touched, envs, camera.resolution, pitch[0] / pitch[1], dots)
 
 
 class ImageMode(DeviceMode):
-    """Base of the modes that shade height images: they give ``_levels`` and ``_floats_per_pixel``."""
+    """Base of the modes that shade height images: they give ``_levels`` and ``_floats_per_pixel``. Nothing is random."""
 
     _smallest_side = 3
     _longest_row = 4
 
-    def __init__(
-        self,
-        sensor: SensorSpec,
-        config: OpticsConfig[Any],
-        *,
-        resolution: tuple[int, int] | None = None,
-        outputs: tuple[str, ...] = ("rgb",),
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        """As ``OpticsConfig.build``; nothing is random."""
-        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
-        self.pitch = sensor.camera.pitch_at(self.camera.resolution)
+    def _set_up(self) -> None:
+        self.pitch = self.sensor.camera.pitch_at(self.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
 
     @abstractmethod
@@ -151,20 +128,11 @@ class ImageMode(DeviceMode):
     def _floats_per_pixel(self) -> float:
         """Device memory that ``_levels`` holds at its peak, in floats a pixel."""
 
-    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
-        """Share of the contact pixels with an uncovered bin, from the flags of ``_levels``; a mode without coverage has none."""
-        return None
-
     def _bytes_per_env(self, grid: PadGrid) -> int:
         width, height = self.camera.resolution
         nodes = grid.rest.size * (9 if self.needs_contact else 8)  # height, ink and contact
         # Heights, displacement and ink, what the mode holds; contact and flags; three channels and their bytes.
         return self._lit * (nodes + round(width * height * (4 * (3 + self._floats_per_pixel()) + 2 + 15)))
-
-    def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
-        device = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
-        rgb = np.array(device.rgb).reshape(*self._shape(len(heights)), 3)
-        return {"rgb": rgb, "uncovered": self._uncovered(np.array(device.flags), failed)}
 
     def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
         mi = self.mi

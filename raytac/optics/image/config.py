@@ -63,9 +63,7 @@ class Phong(OpticsConfig[Any]):
     def __post_init__(self) -> None:
         if isinstance(self.lights, str) and self.lights not in PHONG_LIGHTS:
             raise InputError("lights", value=self.lights, rule="must be a known set of lights", choices=PHONG_LIGHTS)
-        if not isinstance(self.lights, (str, tuple, list)):
-            raise InputError("lights", value=self.lights, rule="must be a name or PhongLights", choices=PHONG_LIGHTS)
-        for light in self.light_list:
+        for light in self.light_list if isinstance(self.lights, (str, tuple, list)) else [self.lights]:
             if not isinstance(light, PhongLight):
                 raise InputError("lights", value=light, rule="must be a name or PhongLights", choices=PHONG_LIGHTS)
             numbers = (*light.direction, *light.colour, light.diffuse, light.specular)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,8 +13,7 @@ from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.image.config import Mlp
 from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
-from raytac.optics.taxim.mode import resized
-from raytac.specs.sensor import SensorSpec
+from raytac.optics.taxim.mode import padded, resized
 
 __all__ = ["MlpMode"]
 
@@ -23,75 +21,53 @@ _VIEW_TOLERANCE = 0.01
 """By which share the view may differ from that of the sensor that a network was fitted to."""
 
 
-@dataclass(frozen=True)
-class MlpArrays:
-    """Device arrays of a frame: the image at rest less what the network says of it, 4 floats a pixel."""
-
-    rest: Float
-
-
 class MlpMode(ImageMode):
     """The optical mode ``mlp``: one sensor, one network, one resolution; batches of surfaces in, images out."""
 
     needs_contact = True
 
-    def __init__(
-        self,
-        sensor: SensorSpec,
-        config: Mlp,
-        *,
-        resolution: tuple[int, int] | None = None,
-        outputs: tuple[str, ...] = ("rgb",),
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        """As ``OpticsConfig.build``; the network is loaded now, kernels are compiled at the first image.
+    config: Mlp
 
-        Raises:
-            InputError: a network of a sensor that sees another piece of its pad.
-        """
-        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
-        weights = config.weights
+    def _set_up(self) -> None:
+        super()._set_up()
+        weights = self.config.weights
         assert weights is not None
         self.weights = weights if isinstance(weights, MlpWeights) else load_mlp(weights)
-        _check_view(self.weights, sensor)
-        self._view = view_slope(sensor)
+        self._check_view()
+        self._view = view_slope(self.sensor)
+
+    def _check_view(self) -> None:
+        """Raise InputError if the network is of another view: places are among its inputs."""
+        own, fitted = view_size(self.sensor), self.weights.view
+        if fitted is None or max(abs(a / b - 1) for a, b in zip(own, fitted, strict=True)) <= _VIEW_TOLERANCE:
+            return
+        theirs, mine = (f"{1e3 * w:.2f} mm x {1e3 * h:.2f} mm" for w, h in (fitted, own))
+        name = self.weights.provenance.get("sensor", "unknown")
+        rule = f"was fitted to the sensor {name!r}, which sees {theirs}"
+        rule += f": {self.sensor.name!r} sees {mine} and needs a network of its own"
+        raise InputError("weights", value="mlp", rule=rule)
 
     def _place(self, ops: Any, column: Any, row: Any) -> tuple[Any, Any]:
         width, height = self.camera.resolution
         return (column + 0.5) * (2 / width) - 1, (row + 0.5) * (2 / height) - 1
 
-    def _build(self, grid: PadGrid) -> MlpArrays:
+    def _build(self, grid: PadGrid) -> Float:
+        """The image at rest less what the network says of it, 4 floats a pixel."""
         width, height = self.camera.resolution
         row, column = np.mgrid[:height, :width].astype(np.float32)
         u, v = self._place(np, column, row)
         flat = forward(np, self.weights, inputs(np, 0 * u, 0 * u, 0 * u, u, v, self._view))
         rest = resized(self.weights.background, (width, height)) - LEVELS * np.stack(flat, axis=-1)
-        padded = np.concatenate([rest, np.zeros_like(rest[..., :1])], axis=-1).astype(np.float32)
-        return MlpArrays(self.mi.Float(np.ascontiguousarray(padded).ravel()))
+        return self.mi.Float(padded(rest))
 
-    def _levels(self, seen: ImageHeights, arrays: MlpArrays) -> tuple[list[Float], UInt8]:
+    def _levels(self, seen: ImageHeights, arrays: Float) -> tuple[list[Float], UInt8]:
         mi = self.mi
         sx, sy, _ = seen.slopes(mi, seen.displacement)
         _, p, column, row = seen.pixel(mi)
         u, v = self._place(dr, mi.Float(column), mi.Float(row))
         change = forward(dr, self.weights, inputs(dr, sx, sy, mi.Float(seen.contact), u, v, self._view))
-        rest = dr.gather(mi.Vector4f, arrays.rest, p)
+        rest = dr.gather(mi.Vector4f, arrays, p)
         return [LEVELS * c + rest[k] for k, c in enumerate(change)], mi.UInt8(0)
 
     def _floats_per_pixel(self) -> float:
         return 4
-
-
-def _check_view(weights: MlpWeights, sensor: SensorSpec) -> None:
-    """Places are inputs of a network, so it holds for its own view alone."""
-    if weights.view is None:
-        return
-    own = view_size(sensor)
-    if max(abs(a / b - 1) for a, b in zip(own, weights.view, strict=True)) > _VIEW_TOLERANCE:
-        theirs, mine = (f"{1e3 * w:.2f} mm x {1e3 * h:.2f} mm" for w, h in (weights.view, own))
-        name = weights.provenance.get("sensor", "unknown")
-        rule = (
-            f"was fitted to the sensor {name!r}, which sees {theirs}: {sensor.name!r} sees {mine} and needs a network of its own"
-        )
-        raise InputError("weights", value="mlp", rule=rule)

@@ -24,19 +24,7 @@ from raytac.errors import CalibrationError
 from raytac.optics.taxim.restricted_pickle import check_file_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
-__all__ = [
-    "FORMAT",
-    "INPUTS",
-    "LEVELS",
-    "VERSION",
-    "MlpWeights",
-    "forward",
-    "inputs",
-    "load_mlp",
-    "save_mlp",
-    "view_size",
-    "view_slope",
-]
+__all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_size", "view_slope"]
 
 FORMAT, VERSION = "raytac mlp", 1
 """Format and version in a file. The version goes up whenever inputs, arithmetic or arrays change their meaning."""
@@ -105,8 +93,7 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
 def load_mlp(path: str | Path) -> MlpWeights:
     """A network that ``save_mlp`` wrote; ``path`` may be the folder of ``raytac calibrate``, with ``mlp.npz`` in it.
 
-    Raises:
-        CalibrationError: a file that is missing, damaged, of another version, or holds other arrays.
+    Raises CalibrationError for a file that is missing, damaged, of another version, or holds other arrays.
     """
     path = Path(path)
     path = path / "mlp.npz" if path.is_dir() else path
@@ -136,9 +123,7 @@ def load_mlp(path: str | Path) -> MlpWeights:
 def _check_version(path: Path) -> None:
     names = npz_names(path)
     arrays = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
-    header = {
-        name: str(array.reshape(())) if array.size == 1 else f"{array.dtype} {array.shape}" for name, array in arrays.items()
-    }
+    header = {name: str(a.reshape(())) if a.size == 1 else f"{a.dtype} {a.shape}" for name, a in arrays.items()}
     if not header and "matrix_0" in names:
         header = {"format": FORMAT, "version": "0, of before files said it"}
     for key, expected in (("format", FORMAT), ("version", str(VERSION))):

@@ -12,20 +12,17 @@ l are not normalised. All this is kept. Their smoothing of the gel and its noise
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.image.config import Phong
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.sampled_tracer import ray_tracer
-from raytac.specs.sensor import SensorSpec
 
 __all__ = ["PhongMode"]
 
@@ -38,53 +35,35 @@ _BLUR = (0.2960964, 0.4078072)
 """Outer and central tap of the last blur: a Gaussian of σ = 1 px on a row of three pixels, mirrored at its ends."""
 
 
-@dataclass(frozen=True)
-class PhongArrays:
-    """Device arrays of a frame: the dimmed image at rest, three channels of H·W."""
-
-    ambient: list[Float]
-
-
 class PhongMode(ImageMode):
     """The optical mode ``phong``: one sensor, one set of lights, one resolution; batches of surfaces in, images out."""
 
-    def __init__(
-        self,
-        sensor: SensorSpec,
-        config: Phong,
-        *,
-        resolution: tuple[int, int] | None = None,
-        outputs: tuple[str, ...] = ("rgb",),
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        """As ``OpticsConfig.build``; kernels are compiled at the first image."""
-        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
-        self.lights, self._background = config.light_list, config.background
-        if self._background is not None:
-            image, wanted = self._background, (*self._shape(1)[1:], 3)
-            kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-            if kind != f"uint8 {wanted}":
-                raise InputError("background", value=kind, rule=f"must be a uint8 array of shape {wanted}")
+    config: Phong
 
-    def _build(self, grid: PadGrid) -> PhongArrays:
-        image = self._background
+    def _set_up(self) -> None:
+        super()._set_up()
+        if self.config.background is not None:
+            self._check_image("background", self.config.background)
+
+    def _build(self, grid: PadGrid) -> list[Float]:
+        """The dimmed image at rest, three channels of H·W."""
+        image = self.config.background
         if image is None:
             tracer = ray_tracer(self.sensor, RayTraced(), resolution=self.camera.resolution, device=self.device)
             image = tracer.render(GelSurface.at_rest(grid)).rgb
             assert image is not None
         dimmed = AMBIENT * image.reshape(-1, 3).astype(np.float32)
-        return PhongArrays([self.mi.Float(np.ascontiguousarray(dimmed[:, c])) for c in range(3)])
+        return [self.mi.Float(np.ascontiguousarray(dimmed[:, c])) for c in range(3)]
 
-    def _levels(self, seen: ImageHeights, arrays: PhongArrays) -> tuple[list[Float], UInt8]:
+    def _levels(self, seen: ImageHeights, arrays: list[Float]) -> tuple[list[Float], UInt8]:
         mi = self.mi
         sx, sy, _ = seen.slopes(mi, seen.height)
         _, p, _, _ = seen.pixel(mi)
         nz = dr.rsqrt(sx * sx + sy * sy + 1)
         nx, ny = sx * nz, sy * nz
         pressed = dr.clip(seen.displacement * (self.pitch[0] / THICKNESS), 0, 1)
-        out = [self._overlay(dr.gather(mi.Float, channel, p), pressed, 0.0) for channel in arrays.ambient]
-        for light in self.lights:
+        out = [self._overlay(dr.gather(mi.Float, channel, p), pressed, 0.0) for channel in arrays]
+        for light in self.config.light_list:
             lx, ly, lz = light.direction
             dot = nx * lx + ny * ly + nz * lz
             mirrored = 2 * dot * nz - lz

@@ -58,10 +58,10 @@ def cached(folder: Path | None) -> PolyTable | None:
 
 
 def keep(table: PolyTable, folder: Path | None) -> bool:
-    """Write the table to ``folder`` as a whole: it is written beside it, synchronised, and renamed, in place of a damaged one.
+    """Write the table beside ``folder``, synchronise and rename it, in place of a damaged one; True if the table is there.
 
-    A whole table that is there already stays, so that a reader never finds half of it: under one digest all are the same. Returns
-    whether the table is there; where the cache cannot be written it is not, with a warning.
+    A whole table that is there already stays, so that a reader never finds half of it: under one digest all are the same. Where the
+    cache cannot be written there is none, with a warning.
     """
     work = None
     try:
@@ -70,9 +70,11 @@ def keep(table: PolyTable, folder: Path | None) -> bool:
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=PARTIAL, dir=folder.parent))
         if os.path.lexists(folder):
-            if _is_whole(folder):
+            try:
+                _load(folder)
                 return True
-            os.replace(folder, work / "damaged")
+            except (OSError, ValueError):
+                os.replace(folder, work / "damaged")
         _save(table, work / folder.name)
         try:
             os.replace(work / folder.name, folder)
@@ -112,11 +114,3 @@ def _load(folder: Path) -> PolyTable:
         if hashlib.sha256(read_regular(folder / name)).hexdigest() != digest:
             raise ValueError(f"{name} differs from its checksum")
     return load_calibration(folder)
-
-
-def _is_whole(folder: Path) -> bool:
-    try:
-        _load(folder)
-    except (OSError, ValueError):
-        return False
-    return True

@@ -44,18 +44,12 @@ _BGR = ("b", "g", "r")
 """Upstream's names of the channels red, green, blue."""
 
 
-# -------------------------------------------------------------------- reading
-
-
 def load_calibration(folder: str | Path, pixel_pitch: float | None = None) -> PolyTable:
     """Table of a calibration folder: upstream's, or one that ``save_calibration`` wrote.
 
     ``pixel_pitch`` [m] stands in for ``params.json``, which the folders of the first release lack. Of ``simulator``, the settings of
-    background and shadow rays are read; the two blur widths are not, since the package's files have them swapped (docs).
-
-    Raises:
-        CalibrationError: a file is missing, damaged, or of the wrong kind, shape or range.
-        InputError: ``pixel_pitch`` is not positive.
+    background and shadow rays are read; the two blur widths are not, since the package's files have them swapped (docs). Raises
+    CalibrationError for a file that is missing, damaged, or of the wrong kind, shape or range.
     """
     folder = Path(folder)
     absent = [name for name in ("polycalib.npz", "dataPack.npz") if not (folder / name).is_file()]
@@ -185,13 +179,9 @@ def _shadow(path: Path, settings: dict[str, Any]) -> ShadowTable:
     values = np.zeros((*lists.shape, max(1, int(lengths.max()))), dtype=np.float32)
     for place, row in rows.items():
         values[place][: len(row)] = row
+    values, lengths = (np.ascontiguousarray(array[::-1]) for array in (values, lengths))
     try:
-        return ShadowTable(
-            directions=directions.astype(np.float64),
-            values=np.ascontiguousarray(values[::-1]),
-            lengths=np.ascontiguousarray(lengths[::-1]),
-            **settings,
-        )
+        return ShadowTable(directions.astype(np.float64), values, lengths, **settings)
     except InputError as error:
         raise CalibrationError(str(error), file=path) from error
 
@@ -200,8 +190,8 @@ def _numbers(path: Path, place: tuple[int, ...], row: Any) -> np.ndarray:
     key = f"shadowTable[{', '.join(map(str, place))}]"
     try:
         array = np.asarray(row, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise CalibrationError("must be a list of numbers", file=path, key=key, value=row) from error
+    except (TypeError, ValueError):
+        array = np.zeros(())
     if array.ndim != 1 or not isinstance(row, (list, tuple, np.ndarray)):
         raise CalibrationError("must be a list of numbers", file=path, key=key, value=row)
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6:
@@ -209,25 +199,15 @@ def _numbers(path: Path, place: tuple[int, ...], row: Any) -> np.ndarray:
     return array
 
 
-# -------------------------------------------------------------------- writing
-
-
 def save_calibration(table: PolyTable, folder: str | Path) -> None:
-    """Write ``table`` as a calibration folder that ``load_calibration`` gives back and that the package ``taxim`` reads.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    height, width = table.background.shape[:2]
-    rest = table.rest_image
-    if rest is None:
-        rest = np.clip(np.rint(table.background), 0, 255).astype(np.uint8)
+    """Write ``table`` as a calibration folder that ``load_calibration`` gives back and that the package ``taxim`` reads."""
+    rest = np.clip(np.rint(table.background), 0, 255).astype(np.uint8) if table.rest_image is None else table.rest_image
     with result_folder(Path(folder), CALIBRATION_FILES) as work:
         for_one = table.gradients if table.one_sheet is None else table.one_sheet
         gradients: dict[str, Any] = {f"grad_{c}": for_one[k] for k, c in enumerate(_BGR)}
         np.savez(work / "polycalib.npz", bins=np.int64(table.n_bins), **gradients)
         np.savez(work / "dataPack.npz", f0=rest[..., ::-1], img_size=np.array(rest.shape))
-        (work / "gelmap.npy").write_bytes(npy_bytes(np.zeros((height, width)) if table.gel_map is None else table.gel_map))
+        (work / "gelmap.npy").write_bytes(npy_bytes(np.zeros(rest.shape[:2]) if table.gel_map is None else table.gel_map))
         names = ("covered", "surround") if table.one_sheet is None else ("covered", "surround", "gradients")
         own: dict[str, Any] = {name: getattr(table, name) for name in names if getattr(table, name) is not None}
         np.savez(work / "raytac.npz", background=table.background.astype(np.float32), **own)

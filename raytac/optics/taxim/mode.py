@@ -16,7 +16,7 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.optics.base import casts_shadows
-from raytac.optics.device_mode import Float, UInt8
+from raytac.optics.device_mode import DeviceFrame, Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.response import SATURATED, saturated_share
 from raytac.optics.taxim.config import Taxim
@@ -61,7 +61,7 @@ class TableShader:
             self._caster = ShadowCaster(mi, table.shadow, table.constants, resolution, self.scale, pitch)
             arrays = self._caster.arrays()
             background = self._caster.blur_background(background)
-        self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(_padded(background)), arrays)
+        self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(padded(background)), arrays)
 
     def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Float], UInt8]:
         """Three channels of B·H·W levels, and flags of every pixel (UInt8): 1 in contact, ``_UNCOVERED`` more in an uncovered bin.
@@ -110,25 +110,17 @@ class TableShader:
 
 
 class TaximMode(ImageMode):
-    """The optical mode ``taxim``: one sensor, one table, one resolution; batches of surfaces in, images out."""
+    """The optical mode ``taxim``: one sensor, one table, one resolution; batches of surfaces in, images out.
 
-    def __init__(
-        self,
-        sensor: SensorSpec,
-        config: Taxim,
-        *,
-        resolution: tuple[int, int] | None = None,
-        outputs: tuple[str, ...] = ("rgb",),
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        """As ``OpticsConfig.build``; the table is loaded or baked now, kernels are compiled at the first image.
+    The table is loaded or baked by the constructor, which refuses a resolution of another shape than the table's image.
+    """
 
-        Raises:
-            InputError: an image of another shape than the table's.
-        """
-        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
-        calibration, shadows, casts = config.calibration, config.shadows, casts_shadows(sensor, config.shadows)
+    config: Taxim
+
+    def _set_up(self) -> None:
+        super()._set_up()
+        sensor, calibration, shadows = self.sensor, self.config.calibration, self.config.shadows
+        casts = casts_shadows(sensor, shadows)
         # Without being asked, a table without shadows casts none; one that is asked to is baked with them, whatever the sensor says.
         baked_of = replace(sensor, optics=replace(sensor.optics, shadows=sensor.optics.shadows or casts))
         self.table, self._is_own = _table(calibration, baked_of, self.device), calibration is None
@@ -162,14 +154,16 @@ class TaximMode(ImageMode):
         # With shadows: least values (3), the packed image before and after each of four blurs (20), the contact grown by rows (1/4).
         return 23.25 if self.shadows else 0
 
-    def _uncovered(self, flags: np.ndarray, failed: np.ndarray) -> np.ndarray | None:
+    def _other_images(self, frame: DeviceFrame, failed: np.ndarray) -> dict[str, Any]:
+        """Share of the contact pixels with an uncovered bin, where the table knows its coverage."""
         if self.table.covered is None:
-            return None
+            return {}
         # Image by image: counting along an axis takes ten times as long.
-        per_image = flags.reshape(len(failed), -1)
-        touched = np.array([np.count_nonzero(one) for one in per_image != 0], float)
-        uncovered = np.array([np.count_nonzero(one) for one in per_image >= _UNCOVERED])
-        return np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=(touched > 0) & ~failed)
+        flags = np.array(frame.flags).reshape(len(failed), -1)
+        touched = np.array([np.count_nonzero(one) for one in flags != 0], float)
+        uncovered = np.array([np.count_nonzero(one) for one in flags >= _UNCOVERED])
+        share = np.divide(uncovered, touched, out=np.full(len(touched), np.nan), where=(touched > 0) & ~failed)
+        return {"uncovered": share}
 
 
 def resized(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
@@ -207,5 +201,6 @@ def _packed_bins(table: PolyTable) -> np.ndarray:
     return packed.ravel()
 
 
-def _padded(image: np.ndarray) -> np.ndarray:
+def padded(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) as 4 floats a pixel, flat, the last 0: a packet that one gather brings."""
     return np.pad(np.asarray(image, dtype=np.float32), ((0, 0), (0, 0), (0, 1))).ravel()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from raytac.checks import is_number, is_whole
 from raytac.errors import CalibrationError
 from raytac.gel.pyramid import CONTACT_SCALE, PYRAMID_SIGMAS
 from raytac.optics.taxim.restricted_pickle import file_bytes
@@ -46,8 +47,8 @@ _OWN: dict[str, Callable[[Any], bool]] = {
     "depth_of": lambda v: isinstance(v, str),
     "pixmm_y": lambda v: _is_number(v) and v > 0,
     "first_depth": lambda v: _is_number(v),
-    "depth_offset": lambda v: isinstance(v, int) and not isinstance(v, bool) and abs(v) < 10**6,
-    "ring_dilations": lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 1000,
+    "depth_offset": lambda v: is_whole(v) and abs(v) < 10**6,
+    "ring_dilations": lambda v: is_whole(v) and 0 < v < 1000,
     "shadow_sigma": lambda v: _is_number(v) and 0 <= v < 1000,
     "final_sigma": lambda v: _is_number(v) and 0 <= v < 1000,
     "provenance": lambda v: isinstance(v, dict) and all(isinstance(one, str) for one in v.values()),
@@ -57,10 +58,8 @@ _OWN: dict[str, Callable[[Any], bool]] = {
 def read_params(path: Path, pixel_pitch: float | None, n_bins: int, shape: tuple[int, ...]) -> CalibrationParams:
     """Settings of ``params.json``, or upstream's own with ``pixel_pitch`` [m] where there is no such file.
 
-    ``n_bins`` and ``shape`` (H, W, 3) are those of the arrays, which the file must agree with.
-
-    Raises:
-        CalibrationError: the file is missing, no JSON, or breaks a rule.
+    ``n_bins`` and ``shape`` (H, W, 3) are those of the arrays, which the file must agree with. Raises CalibrationError for a file that
+    is missing, no JSON, or breaks a rule.
     """
     if not path.exists() and pixel_pitch is not None:
         content: Any = {"sensor": {"pixmm": 1e3 * pixel_pitch, "num_bins": n_bins, "h": shape[0], "w": shape[1]}}
@@ -101,21 +100,19 @@ def read_params(path: Path, pixel_pitch: float | None, n_bins: int, shape: tuple
                 "must be a known setting of the right kind", file=path, key=f"raytac.{key}", value=value, choices=_OWN
             )
     own = parts["raytac"]
-    chosen = {key: own[key] for key in ("ring_dilations", "shadow_sigma", "final_sigma") if key in own}
-    shadow = {key: settings[key] for key in ("shadow_step", "fan_angle", "fan_precision")}
     return CalibrationParams(
         pixel_pitch=(1e-3 * sensor["pixmm"], 1e-3 * own.get("pixmm_y", sensor["pixmm"])),
         constants=TaximConstants(
             background_sigma=settings["background_sigma"],
             background_share=settings["frame_mixing_percentage"],
             background_threshold=settings["diff_threshold"],
-            **chosen,
+            **{key: own[key] for key in ("ring_dilations", "shadow_sigma", "final_sigma") if key in own},
         ),
         shadow={
-            "step": shadow.pop("shadow_step"),
+            "step": settings["shadow_step"],
             "depth_precision": 1e-3 * settings["height_precision"],
             "direction_precision": settings["discretize_precision"],
-            **shadow,
+            **{key: settings[key] for key in ("fan_angle", "fan_precision")},
             **{key: own[key] for key in ("first_depth", "depth_offset", "depth_of") if key in own},
         },
         slopes_of=own.get("slopes_of", "height"),
@@ -123,14 +120,13 @@ def read_params(path: Path, pixel_pitch: float | None, n_bins: int, shape: tuple
     )
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:
     # Compared, since math.isfinite cannot take an integer beyond the range of float.
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+    return is_number(value) and abs(value) < 1e300
 
 
 def params_of(table: PolyTable) -> dict[str, Any]:
-    """Content of ``params.json`` for a table; the package ``taxim`` then blurs as the first release does, which it
-    does not with its own files (their two widths are swapped)."""
+    """Content of ``params.json``: with it the package ``taxim`` blurs as the first release does (its own files have two widths swapped)."""
     width, height = table.resolution
     constants = table.constants
     shadow = table.shadow or ShadowTable(np.zeros(1), np.zeros((3, 1, 1, 1), np.float32), np.zeros((3, 1, 1), np.int32))

@@ -44,9 +44,8 @@ _OPCODES = frozenset(
 def load_restricted(data: bytes) -> Any:
     """Object of the pickle ``data``: numbers, lists, tuples, and NumPy arrays and scalars of them.
 
-    Raises:
-        pickle.UnpicklingError: it names or holds anything else, asks for far more memory than its own size, or is cut short or damaged.
-            Nothing that it names has run.
+    Raises UnpicklingError, before anything that it names has run, if it names or holds anything else, asks for far more memory than its
+    own size, or is cut short or damaged.
     """
     try:
         _check_program(data)

@@ -89,10 +89,7 @@ class ShadowCaster:
         return packed, np.stack(counts)
 
     def cast(self, seen: ImageHeights, of: Any, direction: Any, change: list[Any], arrays: ShadowArrays) -> list[Any]:
-        """``change`` (three channels of B·H·W levels) with shadows, blurred for the shadow and for the image.
-
-        ``of`` is the height image [px], ``direction`` the slope's [rad].
-        """
+        """``change`` (three channels of B·H·W levels) with shadows, blurred; ``of``: heights [px], ``direction`` of their slope [rad]."""
         mi, t = self.mi, self.table
         width, height = self.resolution
         _, n_dir, n_depth, length = t.values.shape
@@ -117,9 +114,6 @@ class ShadowCaster:
         # Integers, since not every device has an atomic minimum of floats.
         least = dr.full(mi.Int32, int(ordered(np.array([_NOTHING]))[0]), 3 * dr.width(i))
 
-        def unfinished(k: Any) -> Any:
-            return k < end
-
         def march(k: Any) -> tuple[Any]:
             place = dr.gather(mi.Vector4i, arrays.ways, a * places + k)
             x, y = x0 + place.x, y0 + place.y
@@ -138,7 +132,7 @@ class ShadowCaster:
                 dr.scatter_reduce(dr.ReduceOp.Min, least, value[c], at * 3 + c, shaded, mode=dr.ReduceMode.Direct)
             return (k + 1,)
 
-        dr.while_loop((mi.UInt32(0),), unfinished, march, label="table shadow")
+        dr.while_loop((mi.UInt32(0),), lambda k: k < end, march, label="table shadow")
         dark = [dr.minimum(change[c], unordered(mi, dr.gather(mi.Int32, least, i * 3 + c))) for c in range(3)]
         packed = dr.ravel(mi.Vector4f(*dark, 0))
         for axis, taps in enumerate(self._shadow_taps):

@@ -79,7 +79,7 @@ class ShadowTable:
     """Angle between the rays of a fan [rad]."""
     depth_of: str = "origin"
     """``"origin"``: the depth bin is that of the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: that of how
-    much less than the ring pixel the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
+    much less the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
 
     def __post_init__(self) -> None:
         n_dir = len(self.directions)
@@ -143,8 +143,7 @@ class PolyTable:
     """Coefficients where the object does not touch, as ``gradients``, which then hold for touched pixels alone: the apex of a press and the
     skirt around it have slopes alike but not colours. None: one sheet serves both (upstream)."""
     one_sheet: np.ndarray | None = None
-    """Beside ``surround``: coefficients as ``gradients`` for all pixels alike. Not used here; a folder gives them to readers that know one
-    sheet (``calib_folder``). None: such readers get ``gradients``."""
+    """Beside ``surround``: coefficients for all pixels alike, which a folder gives to readers that know one sheet; None: ``gradients``."""
     constants: TaximConstants = TaximConstants()
     provenance: dict[str, str] = field(default_factory=dict)
     """Origin of the table, text by name: ``source``, ``sensor``, ``fill``, …"""
@@ -166,9 +165,8 @@ class PolyTable:
             raise InputError("covered", value=value, rule=f"must be bool of shape {shape[1:3]}, or None")
         image = self.background
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape) < 3 or not np.isfinite(image).all():
-            raise InputError(
-                "background", value=image.shape, rule="must be a finite image of shape (H, W, 3), at least 3 x 3 pixels"
-            )
+            rule = "must be a finite image of shape (H, W, 3), at least 3 x 3 pixels"
+            raise InputError("background", value=image.shape, rule=rule)
         for name in ("rest_image", "gel_map"):
             array, expected = getattr(self, name), image.shape if name == "rest_image" else image.shape[:2]
             if array is not None and array.shape != expected:
@@ -196,9 +194,8 @@ def slope_bins(slope_x: np.ndarray, slope_y: np.ndarray, n_bins: int) -> tuple[n
     """
     magnitude = np.arctan(np.hypot(slope_x, slope_y))
     direction = np.arctan2(slope_y, slope_x)
-    i = np.floor(magnitude / (0.5 * np.pi / (n_bins - 1))).astype(np.int64)
-    j = np.floor((direction + np.pi) / (2 * np.pi / (n_bins - 1))).astype(np.int64)
-    return i, j
+    i, j = magnitude / (0.5 * np.pi / (n_bins - 1)), (direction + np.pi) / (2 * np.pi / (n_bins - 1))
+    return np.floor(i).astype(np.int64), np.floor(j).astype(np.int64)
 
 
 def polynomial_basis(x: np.ndarray, y: np.ndarray) -> np.ndarray:

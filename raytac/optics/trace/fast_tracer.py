@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
 from raytac.optics.base import casts_shadows
-from raytac.optics.device_mode import Float, FrameInputs, UInt8
+from raytac.optics.device_mode import DeviceFrame, Float, FrameInputs, UInt8
 from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, see
 from raytac.optics.ink import ink_at, inked_albedo
 from raytac.optics.response import mid_grey_exposure
@@ -27,11 +28,13 @@ __all__ = ["FastTracer", "with_exposure"]
 
 @dataclass(frozen=True)
 class FastArrays:
-    """Device arrays of a frame: LEDs, the grid of indirect light (None without inter-reflection), the response's gain by channel."""
+    """Device arrays of a frame."""
 
     lamps: list[Lamp]
     bounce: BounceField | None
+    """Grid of indirect light; None without inter-reflection."""
     scale: list[Float]
+    """The response's gain by channel."""
 
 
 class FastTracer(Tracer):
@@ -66,16 +69,8 @@ class FastTracer(Tracer):
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 
-    # ---------------------------------------------------------------- images
-
-    def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
-        device = self.render_device(self._upload(heights), None, self._upload_ink(surface))
-        images: dict[str, Any] = {}
-        if "rgb" in self.outputs:
-            images["rgb"] = np.array(device.rgb).reshape(*self._shape(len(heights)), 3)
-        if "layers" in self.outputs:
-            images["layers"] = self._to_numpy_layers(device.layers, len(heights))
-        return images
+    def _other_images(self, frame: DeviceFrame, failed: np.ndarray) -> dict[str, Any]:
+        return {"layers": self._to_numpy_layers(frame.layers, len(failed))} if "layers" in self.outputs else {}
 
     def _layers(self, heights: np.ndarray, ink: np.ndarray | None = None) -> dict[str, np.ndarray]:
         inputs = FrameInputs(self._rest, self._arrays, None if ink is None else self._upload(ink))
@@ -90,8 +85,7 @@ class FastTracer(Tracer):
 
     def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
         mi, channels = self.mi, self._linear(heights, inputs)
-        groups = range(len(channels) // 3)
-        linear = [sum((channels[3 * g + c] for g in groups), mi.Float(0)) for c in range(3)]
+        linear = [sum(channels[c::3], mi.Float(0)) for c in range(3)]
         rgb = self.response.encode(mi, linear, inputs.own.scale) if "rgb" in self.outputs else mi.UInt8(0)
         return rgb, channels if "layers" in self.outputs else [], mi.UInt8(0)
 
@@ -100,7 +94,8 @@ class FastTracer(Tracer):
         mi, layout = self.mi, self.layout
         envs = dr.width(heights) // (layout.nx * layout.ny)
         field = CoatField(mi, layout, inputs.rest, heights)
-        grids = inputs.own.bounce.gather_light(mi, field, self._radiosity(field, inputs), envs) if inputs.own.bounce else None
+        bounce, radiosity = inputs.own.bounce, partial(self._radiosity, field, inputs)
+        grids = None if bounce is None else bounce.gather_light(mi, field, radiosity, envs)
         sums: list[Any] = []
         for a in range(self.config.rays):
             for b in range(self.config.rays):
@@ -128,30 +123,22 @@ class FastTracer(Tracer):
             return list(self.sensor.coat.reflectance)
         return inked_albedo(self.sensor, ink_at(self.mi, self.layout, inputs.ink, seen.env, seen.p.x, seen.p.y))
 
-    def _radiosity(self, field: CoatField, inputs: FrameInputs) -> Any:
+    def _radiosity(self, field: CoatField, inputs: FrameInputs, seen: PixelSample) -> list[Any]:
         """Direct radiosity B of the coat at a sample, a channel each, for the coat's own inter-reflection."""
-        mi, coat = self.mi, self.sensor.coat
-
-        def radiosity(seen: PixelSample) -> list[Any]:
-            albedo = self._albedo(seen, inputs)
-            out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
-            for lamp, group in zip(inputs.own.lamps, self.groups, strict=True):
-                diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False, slab=self.slab)
-                for c in range(3):
-                    out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * albedo[c] + coat.specular)
-            return out
-
-        return radiosity
+        mi, coat, albedo = self.mi, self.sensor.coat, self._albedo(seen, inputs)
+        out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
+        for lamp, group in zip(inputs.own.lamps, self.groups, strict=True):
+            diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False, slab=self.slab)
+            for c in range(3):
+                out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * albedo[c] + coat.specular)
+        return out
 
 
 def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
     """``sensor`` with a number in place of an exposure of ``AUTO``: ``mid_grey_exposure`` of its image at rest by ``fast``.
 
     That image has the sensor's own resolution and one ray a pixel, whatever else is rendered, so that every mode finds the same number.
-
-    Raises:
-        SpecError: no exposure makes that image mid-grey.
-        BackendError: Mitsuba cannot run on ``device``.
+    Raises SpecError: no exposure makes that image mid-grey; BackendError: Mitsuba cannot run on ``device``.
     """
     if sensor.response.exposure != AUTO:
         return sensor

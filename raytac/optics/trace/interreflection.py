@@ -15,7 +15,6 @@ the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.optics.geometry import CoatField, CoatLayout, PixelSample
+from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
 from raytac.optics.trace.scene import UNIT, SensorScene
@@ -92,10 +91,11 @@ class CaseLight:
         return np.einsum("nm,cmk->cnk", monomials, self.coefficients).astype(np.float32)
 
 
-def patch_counts(layout: CoatLayout) -> tuple[int, int]:
-    """Nodes along x and y of the coarse grid over the pad."""
+def patches_of(layout: CoatLayout) -> NodeGrid:
+    """The coarse grid over the pad."""
     nx, ny = (max(2, round((n - 1) * d / PATCH) + 1) for n, d in ((layout.nx, layout.dx), (layout.ny, layout.dy)))
-    return nx, ny
+    dx, dy = (layout.nx - 1) * layout.dx / (nx - 1), (layout.ny - 1) * layout.dy / (ny - 1)
+    return NodeGrid(nx, ny, layout.x0, layout.y0, dx, dy)
 
 
 @dataclass(frozen=True)
@@ -105,100 +105,71 @@ class BounceField:
     (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal.
     """
 
-    layout: CoatLayout
-    nx: int
-    ny: int
-    dx: float
-    dy: float
+    patches: NodeGrid
     case: list[Any]
     """Packed (e, v_x, v_y, v_z) of every node, one array a channel."""
     offset_x: Any
     offset_y: Any
+    """Columns and rows from a patch to those of its neighbourhood."""
 
     @classmethod
     def build(cls, mi: Any, layout: CoatLayout, case: CaseLight) -> BounceField:
         """Lay the grid over the pad and evaluate the case's light on it."""
-        nx, ny = patch_counts(layout)
-        dx, dy = (layout.nx - 1) * layout.dx / (nx - 1), (layout.ny - 1) * layout.dy / (ny - 1)
-        x, y = np.meshgrid(layout.x0 + dx * np.arange(nx), layout.y0 + dy * np.arange(ny))
+        g = patches_of(layout)
+        x, y = np.meshgrid(g.x0 + g.dx * np.arange(g.nx), g.y0 + g.dy * np.arange(g.ny))
         k = np.arange(-REACH, REACH + 1)
         ox, oy = (a.ravel() for a in np.meshgrid(k, k))
         near = (ox**2 + oy**2 <= REACH**2) & ((ox != 0) | (oy != 0))
-        return cls(
-            layout=layout,
-            nx=nx,
-            ny=ny,
-            dx=dx,
-            dy=dy,
-            case=[mi.Float(c.ravel()) for c in case.on(x.ravel(), y.ravel())],
-            offset_x=mi.Int32(ox[near].astype(np.int32)),
-            offset_y=mi.Int32(oy[near].astype(np.int32)),
-        )
+        offsets = (mi.Int32(o[near].astype(np.int32)) for o in (ox, oy))
+        return cls(g, [mi.Float(c.ravel()) for c in case.on(x.ravel(), y.ravel())], *offsets)
 
     @staticmethod
     def memory_per_env(layout: CoatLayout, channels: int) -> int:
         """Bytes that the grid takes while it is filled: packed results of each channel, patches, their light by layer, heights."""
-        return math.prod(patch_counts(layout)) * (16 * channels + 16 + 16 * (channels // 3) + 4)
-
-    def _node(self, i: Any) -> tuple[Any, Any, Any]:
-        """(env, ix, iy) of patch index ``i``."""
-        return i // (self.nx * self.ny), i % self.nx, (i // self.nx) % self.ny
+        g = patches_of(layout)
+        return g.nx * g.ny * (16 * channels + 16 + 16 * (channels // 3) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """Fill the grid for the coat ``field``: ``radiosity`` gives B [radiance · sr] of each channel at a sample of the coat.
-
-        Returns one packed (e, v_x, v_y, v_z) array a channel, length 4 · B · nodes.
-        """
-        channels, offsets = len(self.case), dr.width(self.offset_x)
-        i = dr.arange(mi.UInt32, envs * (self.nx * self.ny))
-        env, ix, iy = self._node(i)
-        x, y = self.layout.x0 + self.dx * mi.Float(ix), self.layout.y0 + self.dy * mi.Float(iy)
+        """Packed (e, v_x, v_y, v_z) for the coat ``field``, an array a channel; ``radiosity``: B [radiance · sr] of each at a sample."""
+        g, channels, offsets = self.patches, len(self.case), dr.width(self.offset_x)
+        i = dr.arange(mi.UInt32, envs * (g.nx * g.ny))
+        env, ix, iy = i // (g.nx * g.ny), i % g.nx, (i // g.nx) % g.ny
+        x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
         z = mi.Float(0)
         for a in (-1, 0, 1):
             for b in (-1, 0, 1):
-                z += field.z(env, x + a * self.dx / 3, y + b * self.dy / 3) / 9
+                z += field.z(env, x + a * g.dx / 3, y + b * g.dy / 3) / 9
         dr.eval(z)
-        x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < self.nx - 1, i + 1, i)
-        y_minus, y_plus = dr.select(iy > 0, i - self.nx, i), dr.select(iy < self.ny - 1, i + self.nx, i)
-        zx = (dr.gather(mi.Float, z, x_plus) - dr.gather(mi.Float, z, x_minus)) / (mi.Float(x_plus - x_minus) * self.dx)
-        zy = (dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)) / (
-            mi.Float((y_plus - y_minus) // self.nx) * self.dy
-        )
-        n = dr.normalize(mi.Normal3f(zx, zy, -1))
-        p = mi.Point3f(x, y, z)
-        to_camera = mi.Vector3f(0, 0, -1)
-        b = radiosity(PixelSample(env, p, n, to_camera))
+        n = dr.normalize(mi.Normal3f(*g.slopes(mi, z, i, ix, iy), -1))
+        b = radiosity(PixelSample(env, mi.Point3f(x, y, z), n, mi.Vector3f(0, 0, -1)))
         patches = dr.ravel(mi.Vector4f(z, n.x, n.y, n.z))
         # Four channels a packet, so that one gather brings the colours of a layer.
         packets = [dr.ravel(mi.Vector4f(*b[k : k + 3], 0)) for k in range(0, channels, 3)]
         dr.eval(patches, packets)
-        area = self.dx * self.dy / np.pi
-
-        def more(k: Any, v: list[Any]) -> Any:
-            return k < offsets
+        area = g.dx * g.dy / np.pi
 
         def add(k: Any, v: list[Any]) -> tuple[Any, list[Any]]:
             ox, oy = dr.gather(mi.Int32, self.offset_x, k), dr.gather(mi.Int32, self.offset_y, k)
             jx, jy = mi.Int32(ix) + ox, mi.Int32(iy) + oy
-            ok = (jx >= 0) & (jx < self.nx) & (jy >= 0) & (jy < self.ny)
-            j = mi.UInt32((mi.Int32(env) * self.ny + jy) * self.nx + jx)
+            ok = (jx >= 0) & (jx < g.nx) & (jy >= 0) & (jy < g.ny)
+            j = mi.UInt32((mi.Int32(env) * g.ny + jy) * g.nx + jx)
             q = dr.gather(mi.Vector4f, patches, j, ok)
-            d = mi.Vector3f(mi.Float(ox) * self.dx, mi.Float(oy) * self.dy, q.x - z)
+            d = mi.Vector3f(mi.Float(ox) * g.dx, mi.Float(oy) * g.dy, q.x - z)
             r2 = dr.maximum(dr.squared_norm(d), 1e-12)
             cos_i = dr.dot(n, d)
             cos_j = -(q.y * d.x + q.z * d.y + q.w * d.z)
             # ΔA_j is the patch's area on the slope: its footprint over |n_z|.
             weight = dr.select(ok & (cos_i > 0) & (cos_j > 0), area * cos_j / (-q.w * r2 * r2), 0)
             out = list(v)
-            for g, packet in enumerate(packets):
+            for layer, packet in enumerate(packets):
                 light = dr.gather(mi.Vector4f, packet, j, ok)
                 for c in range(3):
-                    out[3 * g + c] = out[3 * g + c] + d * (weight * light[c])
+                    out[3 * layer + c] = out[3 * layer + c] + d * (weight * light[c])
             return k + 1, out
 
         start = (mi.UInt32(0), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in range(channels)])
-        _, gathered = dr.while_loop(start, more, add, label="coat bounce")
-        node = i - env * (self.nx * self.ny)
+        _, gathered = dr.while_loop(start, lambda k, v: k < offsets, add, label="coat bounce")
+        node = i - env * (g.nx * g.ny)
         result = []
         for base, v in zip(self.case, gathered, strict=True):
             e = dr.gather(mi.Vector4f, base, node)
@@ -208,16 +179,7 @@ class BounceField:
 
     def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample) -> list[Any]:
         """E [radiance · sr] of every channel at the points and normals of ``seen``."""
-        p, n = seen.p, seen.n
-        fx = dr.clip((p.x - self.layout.x0) / self.dx, 0, self.nx - 1.001)
-        fy = dr.clip((p.y - self.layout.y0) / self.dy, 0, self.ny - 1.001)
-        ix, iy = mi.UInt32(fx), mi.UInt32(fy)
-        wx, wy = fx - mi.Float(ix), fy - mi.Float(iy)
-        i = (seen.env * self.ny + iy) * self.nx + ix
-        out = []
-        for grid in grids:
-            a, b = dr.gather(mi.Vector4f, grid, i), dr.gather(mi.Vector4f, grid, i + 1)
-            c, d = dr.gather(mi.Vector4f, grid, i + self.nx), dr.gather(mi.Vector4f, grid, i + self.nx + 1)
-            e = dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
-            out.append(dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0))
-        return out
+        n, g = seen.n, self.patches
+        i, wx, wy = g.cell(mi, seen.env, seen.p.x, seen.p.y)
+        fields = (bilinear(g.corners(mi.Vector4f, grid, i), wx, wy) for grid in grids)
+        return [dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0) for e in fields]

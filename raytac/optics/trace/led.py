@@ -23,9 +23,9 @@ LEAST_COSINE = 1e-6
 
 
 def lobe_gain(ops: Any, cos_theta: Any, exponent: Any, least: float = LEAST_COSINE) -> Any:
-    """cosⁿ θ of an LED's lobe: n is ``lobe`` for the intensity and ``lobe`` − 1 for the radiance; the caller leaves out what lies behind.
+    """cosⁿ θ of a lobe; ``ops`` is NumPy or Dr.Jit, as the arrays are. The caller leaves out what lies behind the LED.
 
-    ``ops``: ``numpy`` or ``drjit``, whichever the arrays are of.
+    n is ``lobe`` for the intensity and ``lobe`` − 1 for the radiance.
     """
     return ops.power(ops.maximum(cos_theta, least), exponent)
 
@@ -83,6 +83,10 @@ class Lamp:
         return dr.abs(dr.dot(direction, self.half_u)) + dr.abs(dr.dot(direction, self.half_v))
 
 
+_PICKED = ("centre", "axis", "half_u", "half_v", "lobe", "power")
+"""Fields of ``Lamp`` that a path needs of an LED that it picks."""
+
+
 @dataclass(frozen=True)
 class LampTable:
     """All LEDs of a sensor in one array a quantity, so that a path can pick one by index."""
@@ -94,31 +98,18 @@ class LampTable:
 
     @classmethod
     def of(cls, mi: Any, lamps: list[Lamp], groups: list[int]) -> LampTable:
-        def column(kind: Any, name: str) -> Any:
-            return kind(np.concatenate([np.array(getattr(lamp, name)).reshape(-1, 1) for lamp in lamps], axis=1))
-
-        table = Lamp(
-            centre=column(mi.Point3f, "centre"),
-            axis=column(mi.Vector3f, "axis"),
-            half_u=column(mi.Vector3f, "half_u"),
-            half_v=column(mi.Vector3f, "half_v"),
-            lobe=mi.Float(np.array([np.array(lamp.lobe).item() for lamp in lamps], dtype=np.float32)),
-            power=column(mi.Color3f, "power"),
-        )
-        return cls(table, mi.UInt32(np.asarray(groups, dtype=np.uint32)))
+        columns = {}
+        for name in _PICKED:
+            values = np.concatenate([np.array(getattr(lamp, name)).reshape(-1, 1) for lamp in lamps], axis=1)
+            columns[name] = type(getattr(lamps[0], name))(values if len(values) > 1 else values[0])
+        return cls(Lamp(**columns), mi.UInt32(np.asarray(groups, dtype=np.uint32)))
 
     def pick(self, mi: Any, u: Any) -> tuple[Lamp, Any]:
         """One LED chosen uniformly by ``u`` in [0, 1), and its group."""
-        t, count = self.lamps, dr.width(self.group)
+        count = dr.width(self.group)
         index = dr.minimum(mi.UInt32(u * count), count - 1)
-        lamp = Lamp(
-            centre=dr.gather(mi.Point3f, t.centre, index),
-            axis=dr.gather(mi.Vector3f, t.axis, index),
-            half_u=dr.gather(mi.Vector3f, t.half_u, index),
-            half_v=dr.gather(mi.Vector3f, t.half_v, index),
-            lobe=dr.gather(mi.Float, t.lobe, index),
-            power=dr.gather(mi.Color3f, t.power, index),
-        )
+        columns = {name: getattr(self.lamps, name) for name in _PICKED}
+        lamp = Lamp(**{name: dr.gather(type(column), column, index) for name, column in columns.items()})
         return lamp, dr.gather(mi.UInt32, self.group, index)
 
 

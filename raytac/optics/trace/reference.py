@@ -17,6 +17,7 @@ noise away; both converge to one image (a test checks it).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -38,15 +39,18 @@ LAUNCH = 1 << 22
 """Most paths in one kernel launch; keeps memory flat and the progress bar alive."""
 
 
+@dataclass(frozen=True)
 class ReferenceIntegrator:
-    """Path tracer for one sensor scene and camera; ``render`` returns the layers of the scene as it stands."""
+    """Path tracer for one sensor scene and camera."""
 
-    def __init__(self, scene: SensorScene, camera: Pinhole, *, max_depth: int = -1, progress: bool = False) -> None:
-        """``max_depth`` counts reflections by coat or case, not by the slab's face: 1 is direct light only, −1 has no limit."""
-        self.scene, self.camera, self.max_depth, self.progress = scene, camera, max_depth, progress
+    scene: SensorScene
+    camera: Pinhole
+    max_depth: int = -1
+    """Number of reflections by coat or case, not by the slab's face: 1 is direct light only, −1 has no limit."""
+    progress: bool = False
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
-        """Mean radiance (G, H, W, 3), float32; ``groups`` gives for each lamp the layer in 0 … G−1 that it lights.
+        """Mean radiance (G, H, W, 3) of the scene as it stands; ``groups`` gives for each lamp the layer in 0 … G−1 that it lights.
 
         Samples are uniform in each pixel's square (box filter); ``spp`` samples a pixel, ``seed`` fixes them.
         """
@@ -57,22 +61,18 @@ class ReferenceIntegrator:
         return accumulate(self.scene.mi, self.camera, radiance, spp, seed, self.progress)
 
 
-class StockPathIntegrator:
+class StockPathIntegrator(ReferenceIntegrator):
     """Mitsuba's own ``path`` over the same scene: an independent check of ``reference``, and the peer to measure speed against."""
-
-    def __init__(self, scene: SensorScene, camera: Pinhole, *, max_depth: int = -1, progress: bool = False) -> None:
-        """``max_depth`` as in ``ReferenceIntegrator`` (Mitsuba itself counts the camera's edge too)."""
-        self.scene, self.camera, self.progress = scene, camera, progress
-        depth = -1 if max_depth < 0 else max_depth + 1
-        self.integrator = scene.mi.load_dict({"type": "path", "max_depth": depth})
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
         """As ``ReferenceIntegrator.render``; one run a layer, with the other layers' LEDs dark."""
         names = [led.name for led in self.scene.sensor.lights.leds]
+        depth = -1 if self.max_depth < 0 else self.max_depth + 1  # Mitsuba counts the camera's edge too
+        integrator = self.scene.mi.load_dict({"type": "path", "max_depth": depth})
         layers = []
 
         def radiance(sampler: Any, ray: Any) -> list[Any]:
-            colour, valid, _ = self.integrator.sample(self.scene.scene, sampler, self.scene.mi.RayDifferential3f(ray))
+            colour, valid, _ = integrator.sample(self.scene.scene, sampler, self.scene.mi.RayDifferential3f(ray))
             return [dr.select(valid, c, 0) for c in colour]
 
         for group in range(max(groups) + 1):
@@ -88,8 +88,7 @@ def accumulate(
     width, height = camera.resolution
     per_launch = max(1, min(spp, LAUNCH // (width * height)))
     template = mi.load_dict({"type": "independent"})
-    total: np.ndarray | None = None
-    done = 0
+    total, done = np.zeros(()), 0
     with Progress(total=spp, unit="spp", desc="path tracing", show=progress, leave=False) as bar:
         while done < spp:
             count = min(per_launch, spp - done)
@@ -105,11 +104,9 @@ def accumulate(
             dr.eval(channels)
             sums = [dr.block_sum(c, count) for c in channels]
             dr.eval(sums)
-            launch = np.stack([np.array(c) for c in sums]).astype(np.float64)
-            total = launch if total is None else total + launch
+            total = total + np.stack([np.array(c) for c in sums]).astype(np.float64)
             done += count
             bar.update(count)
-    assert total is not None
     image = (total / spp).reshape(-1, 3, height, width)
     return np.ascontiguousarray(image.transpose(0, 2, 3, 1), dtype=np.float32)
 
@@ -119,8 +116,8 @@ def trace(
 ) -> list[Any]:
     """Radiance along ``ray``: a list of 3 · G Floats, R, G, B of each group in turn.
 
-    ``seen=False`` treats the first vertex like a later one, for light that arrives at the ray's origin from the case or the coat: the
-    case's own direct light is then left to ``connect`` at the origin.
+    ``seen=False`` treats the first vertex like a later one, for light that arrives at the ray's origin from the case or the coat; the
+    case's own direct light is then for ``connect`` at the origin.
     """
     n = dr.width(ray.o)
     layers = max(groups) + 1
@@ -204,9 +201,6 @@ def trace(
             beta, active = dr.select(ghost, gbeta, beta / (1 - GHOST)), dr.select(ghost, gactive, active)
         depth = 1
 
-    def alive(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> Any:
-        return active
-
     def bounce(sampler: Any, ray: Any, beta: Any, radiance: list[Any], depth: Any, active: Any) -> tuple[Any, ...]:
         si, scale, mirrored = advance(mi, scene, sampler, ray, active)
         if scale is not None:
@@ -221,7 +215,7 @@ def trace(
 
     # The sampler is part of the state: its random numbers must differ from turn to turn.
     state = (sampler, ray, beta, radiance, dr.full(mi.UInt32, depth, n), active)
-    return dr.while_loop(state, alive, bounce, label="path")[3]
+    return dr.while_loop(state, lambda *state: state[-1], bounce, label="path")[3]
 
 
 def enter(mi: Any, slab: Slab, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:

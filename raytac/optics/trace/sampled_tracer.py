@@ -35,8 +35,8 @@ def image_seed(seed: int, env: int) -> int:
 class SampledTracer(Tracer):
     """The integrators ``reference`` and ``path``."""
 
-    def __init__(self, sensor: SensorSpec, *args: Any, **settings: Any) -> None:
-        super().__init__(sensor, *args, **settings)
+    def _set_up(self) -> None:
+        super()._set_up()
         self.scene: SensorScene | None = None
         self._denoiser = make_denoiser(self.mi, self.device, self.camera.resolution) if self.config.denoise else None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import PadGrid
@@ -22,7 +23,7 @@ UNIT = 1e3
 than a pixel on the pad, so the scene is built in millimetres."""
 
 PLATES = ("wall_left", "wall_right", "wall_top", "wall_bottom", "floor")
-"""The rectangles of the case."""
+"""The rectangles of the case: its walls at −x, x, −y and y, and its floor."""
 
 __all__ = ["PLATES", "UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
 
@@ -53,14 +54,11 @@ class SensorScene:
     """One sensor's geometry and lights in Mitsuba; ``set_surface`` and ``set_layers`` are all that changes."""
 
     def __init__(self, mi: Any, sensor: SensorSpec, grid: PadGrid, *, glass: bool = False) -> None:
-        """``grid`` gives the nodes of the coat mesh [m]; the mesh starts at rest.
+        """``grid``: nodes of the coat mesh [m], which starts at rest.
 
-        ``glass`` puts the slab's face into the scene as a dielectric rectangle over the case's cross-section, for Mitsuba's own
-        integrators; ours take it as a plane, ``slab``, in formulas.
+        ``glass`` puts the slab's face into the scene as a dielectric rectangle, for Mitsuba's integrators; ours take it in formulas.
         """
-        import drjit
-
-        self.mi, self.dr, self.sensor, self.grid = mi, drjit, sensor, grid
+        self.mi, self.sensor, self.grid = mi, sensor, grid
         ny, nx = grid.shape
         self._dotted = sensor.markers.rows > 0
         x, y = np.meshgrid(grid.x, grid.y)
@@ -81,7 +79,7 @@ class SensorScene:
         self._coat_bsdf = shapes["coat"].bsdf()
         self._leds = [mi.ShapePtr(shapes[f"led_{k}"]) for k in range(len(sensor.lights.leds))]
         # Opaque, or their addresses become constants of the kernels, which then compile again for every scene.
-        drjit.make_opaque(self._coat, *self._leds)
+        dr.make_opaque(self._coat, *self._leds)
         self._context = mi.BSDFContext()
         self.set_surface(grid.rest)
 
@@ -114,14 +112,9 @@ class SensorScene:
                 rectangle["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": self._glow(None)}}
             return rectangle
 
-        z = -depth / 2
-        return {
-            "wall_left": plate((-hx, 0, z), (1, 0, 0), (hy, depth / 2), (0, 0, 1)),
-            "wall_right": plate((hx, 0, z), (-1, 0, 0), (hy, depth / 2), (0, 0, 1)),
-            "wall_top": plate((0, -hy, z), (0, 1, 0), (hx, depth / 2), (0, 0, 1)),
-            "wall_bottom": plate((0, hy, z), (0, -1, 0), (hx, depth / 2), (0, 0, 1)),
-            "floor": plate((0, 0, -depth), (0, 0, 1), (hx, hy), (0, 1, 0)),
-        }
+        walls = (((-1, 0), hy), ((1, 0), hy), ((0, -1), hx), ((0, 1), hx))
+        plates = [plate((x * hx, y * hy, -depth / 2), (-x, -y, 0), (half, depth / 2), (0, 0, 1)) for (x, y), half in walls]
+        return dict(zip(PLATES, [*plates, plate((0, 0, -depth), (0, 0, 1), (hx, hy), (0, 1, 0))], strict=True))
 
     def _glass(self, slab: Slab) -> dict[str, Any]:
         """The slab's face; its normal points to the air, −z, so that the gel is the interior."""
@@ -160,10 +153,7 @@ class SensorScene:
         return np.stack(inked_albedo(self.sensor, share), axis=-1).astype(np.float32).ravel()
 
     def set_surface(self, height: np.ndarray, ink: np.ndarray | None = None) -> None:
-        """Move the coat's nodes to ``height`` (Ny, Nx) [m]; Mitsuba rebuilds its normals and acceleration structure.
-
-        ``ink`` (Ny, Nx): share of marker dots at each node; a sensor without markers has none.
-        """
+        """Move the coat's nodes to ``height`` (Ny, Nx) [m], with the share ``ink`` of dots; Mitsuba rebuilds what depends on them."""
         self.params["coat.vertex_positions"] = self.mi.Float(self._vertices(height))
         if self._dotted:
             self.params["coat.vertex_albedo"] = self.mi.Float(self._albedo(ink))
@@ -174,7 +164,7 @@ class SensorScene:
         mi = self.mi
         below = -UNIT * self.sensor.gelpad.thickness
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(x, y, below), mi.Vector3f(0, 0, 1)))
-        return self.dr.select(hit.is_valid(), below + hit.t, 0)
+        return dr.select(hit.is_valid(), below + hit.t, 0)
 
     def set_layers(self, leds: Sequence[str] | None = None) -> None:
         """Light only the LEDs of these names (None: all)."""
@@ -188,18 +178,15 @@ class SensorScene:
         self.params.update()
 
     def reflect(self, si: Any, wo: Any) -> Any:
-        """f(wi, wo) cos θ_o (RGB) of whatever was hit; the coat's Mitsuba BSDF, or the walls' albedo / π, or 0 for an LED.
-
-        Calling the two materials directly instead of through Mitsuba's virtual calls makes the reference several times faster.
-        """
-        mi, dr = self.mi, self.dr
+        """f(wi, wo) cos θ_o (RGB) of whatever was hit: coat, wall, or 0 for an LED; far faster than through Mitsuba's virtual calls."""
+        mi = self.mi
         coat = self._coat_bsdf.eval(self._context, si, wo)
         wall = mi.Color3f(self.case_albedo(si) / dr.pi * dr.maximum(wo.z, 0))
         return dr.select(si.shape == self._coat, coat, dr.select(si.wi.z > 0, wall, 0))
 
     def sample_reflection(self, si: Any, choice: Any, square: Any) -> tuple[Any, Any]:
         """Direction ``wo`` (local) sampled from the hit material and its weight f cos θ / pdf (RGB)."""
-        mi, dr = self.mi, self.dr
+        mi = self.mi
         sample, weight = self._coat_bsdf.sample(self._context, si, choice, square)
         cosine = mi.warp.square_to_cosine_hemisphere(square)
         wall = mi.Color3f(dr.select(si.wi.z > 0, self.case_albedo(si), 0))
@@ -208,10 +195,10 @@ class SensorScene:
 
     def led_radiance(self, si: Any, index: int, lamp: Lamp) -> Any:
         """Radiance (RGB) that LED ``index``, given as ``lamp`` in scene units, sends back along the ray that hit ``si``; 0 elsewhere."""
-        area = 4 * self.dr.norm(lamp.half_u) * self.dr.norm(lamp.half_v)
+        area = 4 * dr.norm(lamp.half_u) * dr.norm(lamp.half_v)
         front = (si.shape == self._leds[index]) & (si.wi.z > 0)
-        lobe = lobe_gain(self.dr, si.wi.z, lamp.lobe - 1)
-        return lamp.power * self.dr.select(front, lobe / area, 0)
+        lobe = lobe_gain(dr, si.wi.z, lamp.lobe - 1)
+        return lamp.power * dr.select(front, lobe / area, 0)
 
     def on_coat(self, si: Any) -> Any:
         return si.shape == self._coat
@@ -227,5 +214,5 @@ class SensorScene:
         """Albedo of wall or floor at ``si``; 0 on the coat and on LEDs."""
         albedo = self.mi.Float(self.sensor.case.reflectance)
         for other in (self._coat, *self._leds):
-            albedo = self.dr.select(si.shape == other, 0, albedo)
+            albedo = dr.select(si.shape == other, 0, albedo)
         return albedo

@@ -17,7 +17,7 @@ from raytac.optics.response import SATURATED, Response, mid_grey_exposure, satur
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.scene import UNIT
-from raytac.specs.sensor import AUTO, SensorSpec
+from raytac.specs.sensor import AUTO
 
 __all__ = ["Tracer", "total"]
 
@@ -28,27 +28,13 @@ def total(layers: dict[str, np.ndarray]) -> np.ndarray:
 
 
 class Tracer(DeviceMode):
-    """Base of the ray tracers: one sensor, one resolution, one scene."""
+    """Base of the ray tracers: one sensor, one resolution, one scene. ``seed`` is of path tracing and of the fit of the case's light."""
 
     config: RayTraced
 
-    def __init__(
-        self,
-        sensor: SensorSpec,
-        config: RayTraced,
-        *,
-        resolution: tuple[int, int] | None = None,
-        outputs: tuple[str, ...] = ("rgb",),
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        """As ``OpticsConfig.build``; ``seed`` is of path tracing and of the fit of the case's light.
-
-        Raises:
-            SpecError: with ``refraction.model = "slab"``, a camera or LED that is not below the slab.
-        """
-        check_seed("seed", seed)
-        super().__init__(sensor, config, resolution=resolution, outputs=outputs, device=device, seed=seed)
+    def _set_up(self) -> None:
+        check_seed("seed", self.seed)
+        sensor, config = self.sensor, self.config
         leds = sensor.lights.leds
         by_colour = config.layers == "colour"
         self.layer_names = sensor.lights.layers if by_colour else tuple(led.name for led in leds)
@@ -58,12 +44,7 @@ class Tracer(DeviceMode):
         unlit = replace(sensor.response, exposure=1.0)
         self.response = Response(unlit if sensor.response.exposure == AUTO else sensor.response, self.camera)
         if config.flat_field is not None:
-            image, (_, height, width) = config.flat_field, self._shape(1)
-            if image.shape != (height, width, 3) or image.dtype != np.uint8:
-                rule = f"must be a uint8 image of shape ({height}, {width}, 3)"
-                raise InputError("flat_field", value=f"{image.dtype} {image.shape}", rule=rule)
-
-    # ---------------------------------------------------------------- what a tracer gives
+            self._check_image("flat_field", config.flat_field)
 
     @property
     @abstractmethod
@@ -81,8 +62,6 @@ class Tracer(DeviceMode):
     def _rest_light(self, rest: np.ndarray) -> np.ndarray:
         """Linear image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx)."""
         return total(self._layers(rest))[0]
-
-    # ---------------------------------------------------------------- shared
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
@@ -122,8 +101,7 @@ class Tracer(DeviceMode):
     def _warn_if_saturated(self, grid: PadGrid) -> None:
         """Warn of an image at rest that is white over a large part, and name the exposure that would make it mid-grey."""
         rest = grid.rest[None].astype(np.float32)
-        share = saturated_share(self._rest_image(rest))
-        if share <= SATURATED:
+        if (share := saturated_share(self._rest_image(rest))) <= SATURATED:
             return
         response, advice = self.sensor.response, "the light is too uneven for any exposure"
         try:

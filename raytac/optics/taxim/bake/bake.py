@@ -9,15 +9,14 @@ from the ray tracer*).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
 
-from raytac.gel.surface import GelSurface
 from raytac.io.progress import Progress
-from raytac.optics.taxim.bake.fit import BinFit, BinSums
+from raytac.optics.taxim.bake.fit import BinFit, BinSums, two_sheets
 from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.shadow import ShadowSums
@@ -26,7 +25,7 @@ from raytac.optics.taxim.cache import cached, keep, table_folder
 from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["PLAIN", "Baked", "bake", "bake_shadow", "bake_table", "baked_table", "calibrate"]
+__all__ = ["PLAIN", "Baked", "bake", "bake_shadow", "baked_table", "calibrate"]
 
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
@@ -47,19 +46,6 @@ class Baked:
     """The ray tracer that it was baked from, and its images at rest."""
 
 
-def bake_table(
-    sensor: SensorSpec,
-    *,
-    device: str = "auto",
-    seed: int = 0,
-    resolution: tuple[int, int] | None = None,
-    settings: BakeSettings | None = None,
-    progress: bool = False,
-) -> PolyTable:
-    """Calibrate a table on the ray tracer; ``bake`` says how the bins were sampled, ``baked_table`` keeps the result on disk."""
-    return bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress).table
-
-
 def baked_table(
     sensor: SensorSpec,
     *,
@@ -69,15 +55,11 @@ def baked_table(
     settings: BakeSettings | None = None,
     progress: bool = True,
 ) -> PolyTable:
-    """The table of ``bake_table``, baked once and kept on disk under a digest of sensor, lights, settings and code.
+    """The table of ``bake``, with its arguments and errors, baked once and kept under a digest of sensor, lights, settings and code.
 
     It is kept in the user's cache, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
     nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may come from the
     other device, whose images differ by rounding.
-
-    Raises:
-        InputError: a value out of its choices.
-        BackendError: the table is not cached, and the ray tracer cannot run on ``device``.
     """
     settings = BakeSettings() if settings is None else settings
     folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
@@ -86,7 +68,7 @@ def baked_table(
         if progress:
             where = "" if folder is None else f" and kept in {folder.parent}"
             print(f"raytac: no table of {sensor.name} yet, so it is baked once{where}", file=sys.stderr)
-        table = bake_table(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress)
+        table = bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress).table
         if keep(table, folder):
             table = cached(folder) or table  # what later processes will read, to the last bit
     return table
@@ -103,19 +85,9 @@ def bake(
 ) -> Baked:
     """Calibrate a table on the ray tracer ``fast`` with this sensor's own optics.
 
-    The same arguments give the same table on one device.
-
-    Args:
-        sensor: geometry, lights and camera.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        seed: where the sequence of presses starts, and of the fit of the case's light.
-        resolution: (width, height) of the calibration images [px]; None is the sensor's own.
-        settings: numbers and ranges of presses; None is the default.
-        progress: show a progress bar.
-
-    Raises:
-        InputError: a value out of its choices.
-        BackendError: the ray tracer cannot run on ``device``.
+    The same arguments give the same table on one device. ``resolution`` (width, height) [px] is that of the calibration images, None the
+    sensor's own. ``seed``: where the sequence of presses starts, and of the fit of the case's light. Raises InputError: a value out of
+    its choices; BackendError: the ray tracer cannot run on ``device``.
     """
     return calibrate(
         Calibration(sensor, device=device, resolution=resolution, seed=seed), settings=settings, seed=seed, progress=progress
@@ -134,20 +106,14 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
             add_samples(touched, views, at.rest_image, views.contact)
             add_samples(around, views, at.rest_image, ~views.contact)
             bar.update(len(views.rgb))
-        fit, surround, together = (
-            sums.solve(neighbours=settings.neighbours, ridge=settings.ridge) for sums in (touched, around, touched.plus(around))
-        )
+        fit, sheets = two_sheets(touched, around, neighbours=settings.neighbours, ridge=settings.ridge)
         shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if pins else None
     width, height = camera.resolution
     table = PolyTable(
-        gradients=fit.gradients,
-        covered=fit.covered,
-        surround=surround.gradients,
-        one_sheet=together.gradients,
+        **sheets,
         background=at.rest_image.astype(np.float32),
         pixel_pitch=at.pitch,
         shadow=shadow,
-        slopes_of="displacement",
         rest_image=at.rest_image,
         constants=PLAIN,
         provenance={
@@ -173,19 +139,15 @@ def bake_shadow(
 ) -> ShadowTable:
     """The shadow table alone, in the levels of ``at``'s images; ``tick`` is called with the number of rendered images, six a pin in all."""
     settings = BakeSettings() if settings is None else settings
-    _, deepest = settings.depth_range(at.sensor.gelpad.thickness)
-    shades = ShadowSums(2 * PLAIN.ring_dilations, deepest, at.tracer.camera.resolution)
-    for views, cast in at.shadow_views(_shadow_presses(at, settings, seed)):
+    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
+    shades = ShadowSums(2 * PLAIN.ring_dilations, settings.depth_range(pad.thickness)[1], camera.resolution)
+    # Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little.
+    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
+    presses = chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
+    for views, cast in at.shadow_views(presses):
         shades.add(views, cast, at.rest_image)
         tick(3 * len(views.rgb))
     return shades.table()
-
-
-def _shadow_presses(at: Calibration, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little."""
-    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
-    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
-    return chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
 
 
 def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray) -> None:

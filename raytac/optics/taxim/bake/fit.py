@@ -8,14 +8,16 @@ Positions are scaled to [−1, 1] inside and the coefficients rewritten for pixe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from raytac.optics.taxim.table import polynomial_basis
 
-__all__ = ["BinFit", "BinSums"]
+__all__ = ["BinFit", "BinSums", "two_sheets"]
 
-_CONSTANT, _LINEAR, _QUADRATIC = [5], [3, 4, 5], [0, 1, 2, 3, 4, 5]
+_TERMS = [5], [3, 4, 5], [0, 1, 2, 3, 4, 5]
+"""Monomials of a polynomial of degree 0, 1 and 2."""
 _MIN_COUNT = {1: 15.0, 2: 60.0}
 """Samples that a polynomial of degree 1 and 2 needs at least: five a coefficient and ten a coefficient."""
 _MIN_SPREAD = 0.02
@@ -90,10 +92,10 @@ class BinSums:
         solution = np.zeros((n * m, 6, 3))
         own = counts > 0
         degree[own] = 0
-        for step, terms in ((1, _LINEAR), (2, _QUADRATIC)):
+        for step in (1, 2):
             able = np.flatnonzero(own & (gram[:, 5, 5] >= _MIN_COUNT[step]))
-            degree[able[_spread(gram[able], terms, self._uniform()) >= _MIN_SPREAD]] = step
-        for step, terms in ((0, _CONSTANT), (1, _LINEAR), (2, _QUADRATIC)):
+            degree[able[_spread(gram[able], _TERMS[step], self._uniform()) >= _MIN_SPREAD]] = step
+        for step, terms in enumerate(_TERMS):
             chosen = np.flatnonzero(degree == step)
             pull = np.diag([1.0] * (len(terms) - 1) + [0.0])
             least = terms[0]  # a degree's terms are the last ones
@@ -101,12 +103,7 @@ class BinSums:
             solution[chosen, least:] = np.linalg.solve(lhs, moment[chosen, least:])
         source = _fill_from(own.reshape(n, m))
         pixels = np.einsum("ab,nac->cnb", self._pixels_from_scaled(), solution[source.ravel()]).reshape(3, n, m, 6)
-        return BinFit(
-            *(
-                _close(array, axis)
-                for array, axis in ((pixels, 2), (own.reshape(n, m), 1), (counts.reshape(n, m), 1), (degree.reshape(n, m), 1))
-            )
-        )
+        return BinFit(_close(pixels, 2), *(_close(array.reshape(n, m), 1) for array in (own, counts, degree)))
 
     def _scaled(self, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (width, height), scale = self.resolution, max(self.resolution) / 2
@@ -134,10 +131,18 @@ class BinSums:
         return a.T @ a / len(a)
 
 
-def _spread(gram: np.ndarray, terms: list[int], uniform: np.ndarray) -> np.ndarray:
-    """Spread of the samples, (N,).
+def two_sheets(touched: BinSums, around: BinSums, *, neighbours: float, ridge: float) -> tuple[BinFit, dict[str, Any]]:
+    """Fit of the touched pixels, and the fields of a ``PolyTable`` of two sheets; for readers that know one it has that of all samples."""
+    contact, surround, together = (
+        sums.solve(neighbours=neighbours, ridge=ridge) for sums in (touched, around, touched.plus(around))
+    )
+    sheets = {"gradients": contact.gradients, "surround": surround.gradients, "one_sheet": together.gradients}
+    return contact, sheets | {"covered": contact.covered}
 
-    Smallest eigenvalue of the covariance of their monomials, relative to samples all over the image.
+
+def _spread(gram: np.ndarray, terms: list[int], uniform: np.ndarray) -> np.ndarray:
+    """Smallest eigenvalue (N,) of the covariance of the samples' monomials, relative to samples all over the image.
+
     1: as wide as the whole image in every direction of the model; 0: some combination of the terms is as good as constant.
     """
     varying = terms[:-1]

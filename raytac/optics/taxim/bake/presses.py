@@ -81,18 +81,19 @@ def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: B
             if any(np.hypot(*(centre - other)) < reach + size + _GAP for other, size in balls):
                 continue
             balls.append((centre, reach))
-            parts.append(_ball(gelpad, centre, radius, depth))
+            parts.append(_placed("sphere", (radius,), gelpad, centre, depth))
             bare = u[4]
             if len(balls) == settings.balls:
                 break
         yield pressed(grid, parts, None if bare < settings.bare_share else surround)
 
 
-def _ball(gelpad: GelpadSpec, centre: np.ndarray, radius: float, depth: float) -> Part:
+def _placed(kind: str, size: tuple[float, ...], gelpad: GelpadSpec, centre: np.ndarray, depth: float) -> Part:
+    """A primitive, half as high as the last of ``size``, whose end is ``depth`` [m] below the resting surface at ``centre``."""
     place = np.eye(4)
     place[:2, 3] = centre
-    place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + radius - depth
-    return primitive("sphere", (radius,), place)
+    place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + size[-1] - depth
+    return primitive(kind, size, place)
 
 
 def pin_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
@@ -108,7 +109,4 @@ def pin_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: Ba
         u = next(points)
         radius, depth = thin * (thick / thin) ** u[2], deep * (k + 1) / settings.pins
         centre = (2 * u[:2] - 1) * np.maximum(half - radius, 0.0)
-        place = np.eye(4)
-        place[:2, 3] = centre
-        place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + _PIN_HALF_LENGTH - depth
-        yield pressed(grid, [primitive("cylinder", (radius, _PIN_HALF_LENGTH), place)], surround)
+        yield pressed(grid, [_placed("cylinder", (radius, _PIN_HALF_LENGTH), gelpad, centre, depth)], surround)

@@ -47,22 +47,15 @@ class ShadowSums:
     def add(self, views: Views, cast: np.ndarray, rest: np.ndarray) -> None:
         """Presses, what cast shadows add to them [levels], (B, H, W, 3), and the image at rest, (H, W, 3) uint8."""
         for b in range(len(views.rgb)):
-            change = views.rgb[b].astype(np.float32) - rest
-            self._add_one(views.contact[b], views.slope_x[b], views.slope_y[b], views.moved[b], change, cast[b])
+            self._add_one(views, b, views.rgb[b].astype(np.float32) - rest, cast[b])
 
-    def _add_one(
-        self,
-        contact: np.ndarray,
-        slope_x: np.ndarray,
-        slope_y: np.ndarray,
-        moved: np.ndarray,
-        change: np.ndarray,
-        cast: np.ndarray,
-    ) -> None:
+    def _add_one(self, views: Views, b: int, change: np.ndarray, cast: np.ndarray) -> None:
+        contact, moved = views.contact[b], views.moved[b]
         height, width = contact.shape
         n_dir, n_depth, steps = self.shape
         row, column = np.nonzero(dilated(contact, self._ring) & ~contact)
-        a = np.floor((np.arctan2(slope_y[row, column], slope_x[row, column]) + np.pi) / DIRECTION_PRECISION).astype(int)
+        slope_x, slope_y = views.slope_x[b, row, column], views.slope_y[b, row, column]
+        a = np.floor((np.arctan2(slope_y, slope_x) + np.pi) / DIRECTION_PRECISION).astype(int)
         a = np.minimum(a, n_dir - 1)
         distance = STEP * np.arange(steps)
         x = np.floor(column[:, None] + distance * np.cos(self.directions[a])[:, None]).astype(int)
@@ -90,17 +83,8 @@ class ShadowSums:
         lengths = np.where(shaded, np.arange(self.shape[2]) + 1, 0).max(axis=-1).astype(np.int32)
         values = values[..., : max(2, int(lengths.max()))]
         values[np.arange(values.shape[-1]) >= lengths[..., None]] = 0
-        return ShadowTable(
-            directions=self.directions,
-            values=values,
-            lengths=lengths,
-            first_depth=0.0,
-            depth_precision=DEPTH_PRECISION,
-            depth_offset=0,
-            direction_precision=DIRECTION_PRECISION,
-            step=STEP,
-            depth_of="drop",
-        )
+        bins = {"first_depth": 0.0, "depth_precision": DEPTH_PRECISION, "depth_offset": 0, "depth_of": "drop"}
+        return ShadowTable(self.directions, values, lengths, direction_precision=DIRECTION_PRECISION, step=STEP, **bins)
 
 
 def dilated(mask: np.ndarray, pixels: int) -> np.ndarray:

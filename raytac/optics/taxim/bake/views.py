@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
+from raytac.optics.device_mode import upload
 from raytac.optics.image.base import see_heights
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.sampled_tracer import ray_tracer
@@ -51,15 +52,8 @@ class Calibration:
         self.sensor = sensor
         self.tracer = ray_tracer(sensor, RayTraced(flat_field=flat_field), resolution=resolution, device=device, seed=seed)
         # Direct light alone, with and without cast shadows: their difference is shadow and nothing else.
-        self._direct = [
-            ray_tracer(
-                self.tracer.sensor,
-                RayTraced(flat_field=flat_field, bounce=False, shadows=shadows),
-                resolution=resolution,
-                device=device,
-            )
-            for shadows in (True, False)
-        ]
+        direct = (RayTraced(flat_field=flat_field, bounce=False, shadows=shadows) for shadows in (True, False))
+        self._direct = [ray_tracer(self.tracer.sensor, one, resolution=resolution, device=device) for one in direct]
         self.pitch = sensor.camera.pitch_at(self.tracer.camera.resolution)
         """Size of an image pixel on the plane z = 0 along x and y [m]."""
         self.grid: PadGrid = make_grid(sensor.gelpad, grid_pitch(self.pitch))
@@ -95,8 +89,7 @@ class Calibration:
         tracer, mi = self.tracer, self.tracer.mi
         rgb = tracer.render(surface).rgb
         assert rgb is not None
-        heights = mi.Float(np.ascontiguousarray(surface.height, dtype=np.float32).ravel())
-        contact = mi.UInt8(np.ascontiguousarray(surface.contact).view(np.uint8).ravel())
+        heights, contact = upload(mi, surface)
         seen = see_heights(mi, tracer.layout, tracer.camera, self.pitch, self._rest, heights, contact)
         dr.eval(seen.height, seen.displacement, seen.contact)
         slope_x, slope_y, _ = seen.slopes(mi, seen.displacement)
