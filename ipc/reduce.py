@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray2d, IntArray
+
 __all__ = ["BLOCK", "MAX", "MIN", "SUM", "Reducer", "chunks_of", "raise_if_any", "total_of"]
 
 wp.set_module_options({"enable_backward": False})
@@ -28,7 +30,7 @@ def chunks_of(n: int) -> int:
 
 
 @wp.func
-def total_of(partial: wp.array2d(dtype=wp.float64), env: wp.int32) -> wp.float64:
+def total_of(partial: FloatArray2d, env: wp.int32) -> wp.float64:
     """Sum of one row, in order."""
     total = wp.float64(0.0)
     for c in range(partial.shape[1]):
@@ -55,14 +57,7 @@ def neutral(kind: wp.int32) -> wp.float64:
 
 
 @wp.kernel
-def reduce_in_order(
-    values: wp.array2d(dtype=wp.float64),
-    count: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    kind: wp.int32,
-    # outputs
-    out: wp.array(dtype=wp.float64),
-):
+def reduce_in_order(values: FloatArray2d, count: IntArray, active: IntArray, kind: wp.int32, out: FloatArray):
     """One thread an environment: out ← out ∘ values[0] ∘ values[1] …"""
     env = wp.tid()
     if active[env] == 0:
@@ -74,14 +69,7 @@ def reduce_in_order(
 
 
 @wp.kernel
-def reduce_blocks(
-    values: wp.array2d(dtype=wp.float64),
-    count: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    kind: wp.int32,
-    # outputs
-    partial: wp.array2d(dtype=wp.float64),
-):
+def reduce_blocks(values: FloatArray2d, count: IntArray, active: IntArray, kind: wp.int32, partial: FloatArray2d):
     """One block a share of an environment's numbers."""
     env, c, lane = wp.tid()
     total = neutral(kind)
@@ -101,9 +89,7 @@ def reduce_blocks(
 
 
 @wp.kernel
-def reduce_partials(
-    partial: wp.array2d(dtype=wp.float64), active: wp.array(dtype=wp.int32), kind: wp.int32, out: wp.array(dtype=wp.float64)
-):
+def reduce_partials(partial: FloatArray2d, active: IntArray, kind: wp.int32, out: FloatArray):
     env = wp.tid()
     if active[env] == 0:
         return
@@ -114,7 +100,7 @@ def reduce_partials(
 
 
 @wp.kernel
-def raise_if_any(flags: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):
+def raise_if_any(flags: IntArray, flag: IntArray):
     """flag[0] = 1 if any of the flags is set; the caller has cleared it."""
     if flags[wp.tid()] != 0:
         flag[0] = 1

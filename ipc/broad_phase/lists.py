@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray3d, IntArray, IntArray2d, VecArray2d
+
 __all__ = [
     "Candidates",
     "Surface",
@@ -39,14 +41,14 @@ wp.set_module_options({"enable_backward": False})
 class Surface:
     """The surfaces of all bodies, which every environment shares."""
 
-    edges: wp.array2d(dtype=wp.int32)
-    faces: wp.array2d(dtype=wp.int32)
-    vert_area: wp.array(dtype=wp.float64)
-    edge_area: wp.array(dtype=wp.float64)
-    edge_rest2: wp.array(dtype=wp.float64)
-    plane_vert: wp.array(dtype=wp.int32)
-    plane_body: wp.array(dtype=wp.int32)
-    plane_pair: wp.array(dtype=wp.int32)
+    edges: IntArray2d
+    faces: IntArray2d
+    vert_area: FloatArray
+    edge_area: FloatArray
+    edge_rest2: FloatArray
+    plane_vert: IntArray
+    plane_body: IntArray
+    plane_pair: IntArray
     d_hat: wp.float64
 
 
@@ -56,8 +58,8 @@ class Candidates:
 
     pt: wp.array2d(dtype=wp.vec3i)
     ee: wp.array2d(dtype=wp.vec3i)
-    pt_count: wp.array(dtype=wp.int32)
-    ee_count: wp.array(dtype=wp.int32)
+    pt_count: IntArray
+    ee_count: IntArray
 
 
 @wp.func
@@ -87,14 +89,7 @@ def pair_vertices(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.vec4i:
 
 @wp.kernel
 def leaves_box(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    stale: wp.array(dtype=wp.int32),
-    any_stale: wp.array(dtype=wp.int32),
+    x: VecArray2d, dx: VecArray2d, low: VecArray2d, high: VecArray2d, active: IntArray, stale: IntArray, any_stale: IntArray
 ):
     """Marks environments in which x or x + dx lies outside its vertex's box."""
     env, v = wp.tid()
@@ -109,7 +104,7 @@ def leaves_box(
 
 
 @wp.kernel
-def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32)):
+def check_candidates(candidates: Candidates, overflow: IntArray):
     """Raises the flag if a list did not fit."""
     env = wp.tid()
     if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
@@ -117,15 +112,7 @@ def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32))
 
 
 @wp.kernel
-def vertex_boxes(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
-    margin: wp.float64,
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-):
+def vertex_boxes(x: VecArray2d, dx: VecArray2d, margin: wp.float64, stale: IntArray, low: VecArray2d, high: VecArray2d):
     """Boxes around [x, x + dx], widened by the margin."""
     env, v = wp.tid()
     if stale[env] == 0:
@@ -137,7 +124,7 @@ def vertex_boxes(
 
 
 @wp.kernel
-def clear_body_boxes(stale: wp.array(dtype=wp.int32), low: wp.array3d(dtype=wp.float64), high: wp.array3d(dtype=wp.float64)):
+def clear_body_boxes(stale: IntArray, low: FloatArray3d, high: FloatArray3d):
     """Empty boxes."""
     env, body = wp.tid()
     if stale[env] == 0:
@@ -149,13 +136,7 @@ def clear_body_boxes(stale: wp.array(dtype=wp.int32), low: wp.array3d(dtype=wp.f
 
 @wp.kernel
 def body_boxes(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    vert_body: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+    low: VecArray2d, high: VecArray2d, vert_body: IntArray, stale: IntArray, body_low: FloatArray3d, body_high: FloatArray3d
 ):
     """Unions of the vertices' boxes."""
     env, v = wp.tid()
@@ -168,7 +149,7 @@ def body_boxes(
 
 
 @wp.kernel
-def reset_lists(stale: wp.array(dtype=wp.int32), list_count: wp.array2d(dtype=wp.int32), candidates: Candidates):
+def reset_lists(stale: IntArray, list_count: IntArray2d, candidates: Candidates):
     """Empties the lists of the stale environments."""
     env = wp.tid()
     if stale[env] == 0:
@@ -180,7 +161,7 @@ def reset_lists(stale: wp.array(dtype=wp.int32), list_count: wp.array2d(dtype=wp
 
 
 @wp.func
-def prim_low(low: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
+def prim_low(low: VecArray2d, surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
     """Lower corner of the box of vertex (kind 0), edge (1) or face (2) i."""
     if kind == 0:
         return low[env, i]
@@ -190,7 +171,7 @@ def prim_low(low: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, k
 
 
 @wp.func
-def prim_high(high: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
+def prim_high(high: VecArray2d, surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
     if kind == 0:
         return high[env, i]
     if kind == 1:
@@ -212,8 +193,8 @@ def overlap(lo: wp.vec3d, hi: wp.vec3d, lo2: wp.vec3d, hi2: wp.vec3d, reach: wp.
 
 @wp.func
 def add_point_triangle(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    low: VecArray2d,
+    high: VecArray2d,
     lo: wp.vec3d,
     hi: wp.vec3d,
     surface: Surface,
@@ -233,8 +214,8 @@ def add_point_triangle(
 
 @wp.func
 def add_edge_edge(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    low: VecArray2d,
+    high: VecArray2d,
     lo: wp.vec3d,
     hi: wp.vec3d,
     surface: Surface,
@@ -256,20 +237,20 @@ def add_edge_edge(
 
 @wp.kernel
 def select_prims(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+    low: VecArray2d,
+    high: VecArray2d,
+    body_low: FloatArray3d,
+    body_high: FloatArray3d,
     surface: Surface,
-    prim_kind: wp.array(dtype=wp.int32),
-    prim_index: wp.array(dtype=wp.int32),
-    prim_other: wp.array(dtype=wp.int32),
-    prim_list: wp.array(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
+    prim_kind: IntArray,
+    prim_index: IntArray,
+    prim_other: IntArray,
+    prim_list: IntArray,
+    list_start: IntArray,
+    stale: IntArray,
     # outputs
-    list_count: wp.array2d(dtype=wp.int32),
-    members: wp.array2d(dtype=wp.int32),
+    list_count: IntArray2d,
+    members: IntArray2d,
 ):
     """Keeps the primitives of each list that reach the box of the body they may touch."""
     env, i = wp.tid()
@@ -287,16 +268,16 @@ def select_prims(
 
 @wp.kernel
 def find_pt(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    low: VecArray2d,
+    high: VecArray2d,
     surface: Surface,
-    members: wp.array2d(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    list_count: wp.array2d(dtype=wp.int32),
+    members: IntArray2d,
+    list_start: IntArray,
+    list_count: IntArray2d,
     first: wp.int32,
     second: wp.int32,
     pair: wp.int32,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
@@ -313,16 +294,16 @@ def find_pt(
 
 @wp.kernel
 def find_ee(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    low: VecArray2d,
+    high: VecArray2d,
     surface: Surface,
-    members: wp.array2d(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    list_count: wp.array2d(dtype=wp.int32),
+    members: IntArray2d,
+    list_start: IntArray,
+    list_count: IntArray2d,
     first: wp.int32,
     second: wp.int32,
     pair: wp.int32,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
@@ -344,13 +325,7 @@ def comes_before(a: wp.vec3i, b: wp.vec3i) -> wp.bool:
 
 
 @wp.kernel
-def rank_candidates(
-    items: wp.array2d(dtype=wp.vec3i),
-    count: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    ordered: wp.array2d(dtype=wp.vec3i),
-):
+def rank_candidates(items: wp.array2d(dtype=wp.vec3i), count: IntArray, stale: IntArray, ordered: wp.array2d(dtype=wp.vec3i)):
     """Sorts the pairs, which are unique, so that their order does not depend on scheduling."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= count[env]:
@@ -363,13 +338,7 @@ def rank_candidates(
 
 
 @wp.kernel
-def put_back(
-    ordered: wp.array2d(dtype=wp.vec3i),
-    count: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    items: wp.array2d(dtype=wp.vec3i),
-):
+def put_back(ordered: wp.array2d(dtype=wp.vec3i), count: IntArray, stale: IntArray, items: wp.array2d(dtype=wp.vec3i)):
     env, i = wp.tid()
     if stale[env] != 0 and i < count[env]:
         items[env, i] = ordered[env, i]

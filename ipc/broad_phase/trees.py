@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ipc.arrays import FloatArray3d, IntArray, IntArray2d, VecArray2d
 from ipc.bodies.layout import Layout
 from ipc.broad_phase.lists import Candidates, Surface, add_edge_edge, add_point_triangle, overlap, prim_high, prim_low
 
@@ -72,22 +73,22 @@ class Tree:
     """A hierarchy over n primitives an environment; item env·n + k is primitive ``prim[k]``."""
 
     id: wp.uint64
-    prim: wp.array(dtype=wp.int32)  # (n,)
-    root: wp.array2d(dtype=wp.int32)  # node above all primitives of a body (B, bodies)
+    prim: IntArray  # (n,)
+    root: IntArray2d  # node above all primitives of a body (B, bodies)
 
 
 @wp.struct
 class Partners:
     """Queries of the primitives ``asking`` to each ``body`` from a body's ``start`` on."""
 
-    asking: wp.array(dtype=wp.int32)
-    start: wp.array(dtype=wp.int32)  # (bodies + 1,)
-    body: wp.array(dtype=wp.int32)
-    pair: wp.array(dtype=wp.int32)
+    asking: IntArray
+    start: IntArray  # (bodies + 1,)
+    body: IntArray
+    pair: IntArray
 
 
 @wp.kernel
-def find_roots(id: wp.uint64, group: wp.array(dtype=wp.int32), groups: wp.int32, root: wp.array2d(dtype=wp.int32)):
+def find_roots(id: wp.uint64, group: IntArray, groups: wp.int32, root: IntArray2d):
     env, body = wp.tid()
     if group[body] >= 0:
         root[env, body] = wp.bvh_get_group_root(id, env * groups + group[body])
@@ -95,12 +96,12 @@ def find_roots(id: wp.uint64, group: wp.array(dtype=wp.int32), groups: wp.int32,
 
 @wp.kernel
 def fill_boxes(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    low: VecArray2d,
+    high: VecArray2d,
     surface: Surface,
     kind: wp.int32,
     tree: Tree,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     lower: wp.array2d(dtype=wp.vec3),
     upper: wp.array2d(dtype=wp.vec3),
@@ -113,21 +114,21 @@ def fill_boxes(
 
 
 @wp.func
-def body_corner(corners: wp.array3d(dtype=wp.float64), env: wp.int32, body: wp.int32) -> wp.vec3d:
+def body_corner(corners: FloatArray3d, env: wp.int32, body: wp.int32) -> wp.vec3d:
     return wp.vec3d(corners[env, body, 0], corners[env, body, 1], corners[env, body, 2])
 
 
 @wp.kernel
 def query_faces(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+    low: VecArray2d,
+    high: VecArray2d,
+    body_low: FloatArray3d,
+    body_high: FloatArray3d,
     surface: Surface,
-    vert_body: wp.array(dtype=wp.int32),
+    vert_body: IntArray,
     tree: Tree,
     partners: Partners,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
@@ -153,15 +154,15 @@ def query_faces(
 
 @wp.kernel
 def query_edges(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+    low: VecArray2d,
+    high: VecArray2d,
+    body_low: FloatArray3d,
+    body_high: FloatArray3d,
     surface: Surface,
-    vert_body: wp.array(dtype=wp.int32),
+    vert_body: IntArray,
     tree: Tree,
     partners: Partners,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):

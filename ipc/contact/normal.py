@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
@@ -59,8 +60,8 @@ def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
 @wp.func
 def push_simple(
     out: Contacts,
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     env: wp.int32,
     verts: wp.vec4i,
     coef: wp.vec4d,
@@ -87,8 +88,8 @@ def push_simple(
 @wp.func
 def push_mollified(
     out: Contacts,
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     env: wp.int32,
     verts: wp.vec4i,
     coef: wp.vec4d,
@@ -160,15 +161,15 @@ def push_mollified(
 
 @wp.kernel
 def contact_pt(
-    x: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
     surface: Surface,
     candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     out: Contacts,
 ):
     """Point-triangle pairs."""
@@ -190,15 +191,15 @@ def contact_pt(
 
 @wp.kernel
 def contact_ee(
-    x: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
     surface: Surface,
     candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     out: Contacts,
 ):
     """Edge-edge pairs, mollified where they are nearly parallel."""
@@ -227,16 +228,16 @@ def contact_ee(
 
 @wp.kernel
 def contact_plane(
-    x: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    frame_R: MatArray2d,
+    frame_t: VecArray2d,
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     out: Contacts,
 ):
     """Points above half-spaces."""
@@ -256,7 +257,7 @@ def contact_plane(
 
 
 @wp.func
-def pair_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+def pair_energy(x: VecArray2d, surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
     """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
     v = pair_vertices(surface, ee, pair)
     x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
@@ -271,16 +272,16 @@ def pair_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, 
 
 @wp.kernel
 def energy_pairs(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
+    x0: VecArray2d,
+    x1: VecArray2d,
     surface: Surface,
     candidates: Candidates,
     ee: wp.bool,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    change: wp.array(dtype=wp.float64),
+    change: FloatArray,
 ):
     """Adds the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
     env, lane = wp.tid()
@@ -295,16 +296,16 @@ def energy_pairs(
 
 @wp.kernel
 def energy_plane(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
+    x0: VecArray2d,
+    x1: VecArray2d,
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    frame_R: MatArray2d,
+    frame_t: VecArray2d,
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    change: wp.array(dtype=wp.float64),
+    change: FloatArray,
 ):
     """Adds the change of the point-plane energy from x0 to x1 [J]."""
     env, lane = wp.tid()

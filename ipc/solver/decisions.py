@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, IntArray
 from ipc.solver.step_state import Decisions, Flags
 
 __all__ = [
@@ -128,13 +129,7 @@ def choose_advancing(d: Decisions, f: Flags):
 
 
 @wp.kernel
-def after_solve(
-    iterations: wp.array(dtype=wp.int32),
-    negative: wp.array(dtype=wp.int32),
-    mask: wp.array(dtype=wp.int32),
-    d: Decisions,
-    f: Flags,
-):
+def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Decisions, f: Flags):
     """Counts iterations and asks for a definite matrix after negative curvature."""
     env = wp.tid()
     again = 0
@@ -255,7 +250,7 @@ def start_limit(slack: wp.float64, d: Decisions, f: Flags):
 
 
 @wp.kernel
-def start_search(reach: wp.array(dtype=wp.float64), d: Decisions, f: Flags):
+def start_search(reach: FloatArray, d: Decisions, f: Flags):
     """Starts the line search, which allows for rounding of positions by force × size × 1e-15."""
     env = wp.tid()
     d.trials[env] = 0

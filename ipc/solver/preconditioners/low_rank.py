@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import IntArray, IntArray2d, MatArray2d, SingleArray2d, SingleArray3d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
 
@@ -51,13 +52,13 @@ class Rest:
     """
 
     inverse: wp.array(dtype=wp.float32)
-    start: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int32)
-    width: wp.array(dtype=wp.int32)
-    unknown: wp.array(dtype=wp.int32)
-    part: wp.array(dtype=wp.int32)
-    surface: wp.array(dtype=wp.int32)
-    surface_node: wp.array(dtype=wp.int32)
+    start: IntArray
+    first: IntArray
+    width: IntArray
+    unknown: IntArray
+    part: IntArray
+    surface: IntArray
+    surface_node: IntArray
 
 
 @wp.struct
@@ -70,16 +71,16 @@ class Small:
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
     """
 
-    touched: wp.array2d(dtype=wp.int32)
-    slot: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    node: wp.array2d(dtype=wp.int32)
+    touched: IntArray2d
+    slot: IntArray2d
+    count: IntArray
+    node: IntArray2d
     a: wp.array3d(dtype=wp.mat33d)
-    row: wp.array2d(dtype=wp.mat33d)
-    column: wp.array2d(dtype=wp.mat33d)
-    w: wp.array3d(dtype=wp.float32)
-    t: wp.array2d(dtype=wp.float32)
-    force: wp.array2d(dtype=wp.float32)
+    row: MatArray2d
+    column: MatArray2d
+    w: SingleArray3d
+    t: SingleArray2d
+    force: SingleArray2d
 
 
 @wp.func
@@ -95,7 +96,7 @@ def fits(small: Small, env: wp.int32) -> wp.bool:
 
 
 @wp.kernel
-def forget_contacts(active: wp.array(dtype=wp.int32), small: Small):
+def forget_contacts(active: IntArray, small: Small):
     env, s = wp.tid()
     if active[env] == 0:
         return
@@ -115,9 +116,7 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def mark_contacts(
-    system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
-):
+def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """Marks the surface nodes that the rows act on."""
     env, lane = wp.tid()
     if active[env] == 0:
@@ -131,7 +130,7 @@ def mark_contacts(
 
 
 @wp.kernel
-def place_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
+def place_contacts(rest: Rest, active: IntArray, small: Small):
     """Numbers the contact nodes in the order of the surface."""
     env, s = wp.tid()
     if active[env] == 0 or small.touched[env, s] == 0:
@@ -162,7 +161,7 @@ def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, res
 
 
 @wp.kernel
-def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """S = Σ q qᵀ."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -215,7 +214,7 @@ def compliance(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
 
 
 @wp.kernel
-def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """W from S, one block of threads an environment; leaves ``a`` zero for the next S."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -250,7 +249,7 @@ def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, 
 
 
 @wp.func
-def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) -> wp.float32:
+def sum_of_parts(y: SingleArray3d, env: wp.int32, u: wp.int32) -> wp.float32:
     total = wp.float32(0.0)
     for c in range(y.shape[0]):
         total += y[c, env, u]
@@ -258,7 +257,7 @@ def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) ->
 
 
 @wp.kernel
-def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def contact_forces(rest: Rest, y: SingleArray3d, running: IntArray, lanes: wp.int32, small: Small):
     """W J K_0⁻¹ r, one block of threads an environment."""
     env, lane = wp.tid()
     if running[env] == 0 or not fits(small, env):

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecArray2d
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
@@ -40,14 +41,14 @@ MAX_CONTACTS = 48
 
 @wp.kernel
 def multiply_vectors(
-    matrix: wp.array3d(dtype=wp.float32),
-    x: wp.array2d(dtype=wp.float32),
+    matrix: SingleArray3d,
+    x: SingleArray2d,
     x_first: wp.int32,
     y_first: wp.int32,
     length: wp.int32,
-    running: wp.array(dtype=wp.int32),
+    running: IntArray,
     # outputs
-    y: wp.array3d(dtype=wp.float32),
+    y: SingleArray3d,
 ):
     """y[c] = the share of ``length`` inputs in matrixᵀ x, patch by patch."""
     c, env, e = wp.tid()
@@ -65,13 +66,7 @@ def multiply_vectors(
 
 @wp.kernel
 def multiply_tiles(
-    matrix: wp.array3d(dtype=wp.float32),
-    x: wp.array2d(dtype=wp.float32),
-    x_first: wp.int32,
-    y_first: wp.int32,
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    y: wp.array2d(dtype=wp.float32),
+    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, running: IntArray, y: SingleArray2d
 ):
     """y = x · matrix in tiles, patch by patch, without those that have nothing running."""
     patch, i, j = wp.tid()
@@ -141,17 +136,15 @@ class Inside:
     ``twin_in`` where the second one reads x_Γ.
     """
 
-    unknown: wp.array(dtype=wp.int32)
-    patch_out: wp.array(dtype=wp.int32)
-    twin_start: wp.array(dtype=wp.int32)
-    twin_out: wp.array(dtype=wp.int32)
-    twin_in: wp.array(dtype=wp.int32)
+    unknown: IntArray
+    patch_out: IntArray
+    twin_start: IntArray
+    twin_out: IntArray
+    twin_in: IntArray
 
 
 @wp.kernel
-def gather_inside(
-    inside: Inside, r: wp.array2d(dtype=wp.vec3d), running: wp.array(dtype=wp.int32), x: wp.array2d(dtype=wp.float32)
-):
+def gather_inside(inside: Inside, r: VecArray2d, running: IntArray, x: SingleArray2d):
     """r_p of every patch, in single precision."""
     env, i = wp.tid()
     u = inside.unknown[i]
@@ -164,14 +157,14 @@ def gather_inside(
 def gather_interface(
     rest: Rest,
     inside: Inside,
-    r: wp.array2d(dtype=wp.vec3d),
-    y_inside: wp.array3d(dtype=wp.float32),
+    r: VecArray2d,
+    y_inside: SingleArray3d,
     small: Small,
-    jacobi: wp.array2d(dtype=wp.mat33d),
-    running: wp.array(dtype=wp.int32),
+    jacobi: MatArray2d,
+    running: IntArray,
     # outputs
-    x: wp.array2d(dtype=wp.float32),
-    z: wp.array2d(dtype=wp.vec3d),
+    x: SingleArray2d,
+    z: VecArray2d,
 ):
     """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi."""
     env, i = wp.tid()
@@ -192,14 +185,7 @@ def gather_interface(
 
 @wp.kernel
 def scatter_interface(
-    rest: Rest,
-    inside: Inside,
-    small: Small,
-    y: wp.array3d(dtype=wp.float32),
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    z: wp.array2d(dtype=wp.vec3d),
-    x_back: wp.array2d(dtype=wp.float32),
+    rest: Rest, inside: Inside, small: Small, y: SingleArray3d, running: IntArray, z: VecArray2d, x_back: SingleArray2d
 ):
     """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node."""
     env, i = wp.tid()
@@ -224,13 +210,7 @@ def scatter_interface(
 
 @wp.kernel
 def scatter_inside(
-    inside: Inside,
-    y_inside: wp.array3d(dtype=wp.float32),
-    y_back: wp.array3d(dtype=wp.float32),
-    small: Small,
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    z: wp.array2d(dtype=wp.vec3d),
+    inside: Inside, y_inside: SingleArray3d, y_back: SingleArray3d, small: Small, running: IntArray, z: VecArray2d
 ):
     """x_p = K_pp⁻¹ r_p − E_p x_Γ."""
     env, i = wp.tid()

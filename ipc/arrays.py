@@ -1,0 +1,11 @@
+"""Types of the arrays that kernels take: first their inputs, last what they write."""
+
+from __future__ import annotations
+
+import warp as wp
+
+IntArray, IntArray2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
+FloatArray, FloatArray2d, FloatArray3d = wp.array(dtype=wp.float64), wp.array2d(dtype=wp.float64), wp.array3d(dtype=wp.float64)
+SingleArray2d, SingleArray3d = wp.array2d(dtype=wp.float32), wp.array3d(dtype=wp.float32)
+VecArray, VecArray2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
+MatArray2d, QuatArray2d = wp.array2d(dtype=wp.mat33d), wp.array2d(dtype=wp.quatd)
