@@ -16,15 +16,14 @@ there is tested again in double precision, which makes the pairs the same as tho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.arrays import FloatArray3d, IntArray, IntArray2d, VecArray2d
+from ipc.arrays import IntArray, IntArray2d
 from ipc.bodies.layout import Layout
-from ipc.broad_phase.lists import Candidates, Surface, add_edge_edge, add_point_triangle, overlap, prim_high, prim_low
+from ipc.broad_phase.lists import Boxes, Candidates, Surface, add_pair, overlap, prim_box, prim_vertices
 
 __all__ = ["Trees", "trees_pay"]
 
@@ -96,8 +95,7 @@ def find_roots(id: wp.uint64, group: IntArray, groups: wp.int32, root: IntArray2
 
 @wp.kernel
 def fill_boxes(
-    low: VecArray2d,
-    high: VecArray2d,
+    boxes: Boxes,
     surface: Surface,
     kind: wp.int32,
     tree: Tree,
@@ -109,82 +107,45 @@ def fill_boxes(
     """Boxes of the edges (kind 1) or faces (2) of a tree, rounded outward."""
     env, k = wp.tid()
     if stale[env] != 0:
-        lower[env, k] = corner_down(prim_low(low, surface, env, kind, tree.prim[k]))
-        upper[env, k] = corner_up(prim_high(high, surface, env, kind, tree.prim[k]))
-
-
-@wp.func
-def body_corner(corners: FloatArray3d, env: wp.int32, body: wp.int32) -> wp.vec3d:
-    return wp.vec3d(corners[env, body, 0], corners[env, body, 1], corners[env, body, 2])
+        lo, hi = prim_box(boxes, surface, env, kind, tree.prim[k])
+        lower[env, k] = corner_down(lo)
+        upper[env, k] = corner_up(hi)
 
 
 @wp.kernel
-def query_faces(
-    low: VecArray2d,
-    high: VecArray2d,
-    body_low: FloatArray3d,
-    body_high: FloatArray3d,
+def query(
+    boxes: Boxes,
     surface: Surface,
     vert_body: IntArray,
+    ee: wp.bool,
     tree: Tree,
     partners: Partners,
     stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
-    """Vertices against the faces of the bodies that their body may touch."""
-    env, i = wp.tid()
-    if stale[env] == 0:
-        return
-    v = partners.asking[i]
-    own = vert_body[v]
-    lo, hi = low[env, v], high[env, v]
-    reach = WIDER * surface.d_hat
-    margin = wp.vec3d(reach, reach, reach)
-    lower, upper = corner_down(lo - margin), corner_up(hi + margin)
-    for k in range(partners.start[own], partners.start[own + 1]):
-        other = partners.body[k]
-        if overlap(lo, hi, body_corner(body_low, env, other), body_corner(body_high, env, other), surface.d_hat):
-            query = wp.bvh_query_aabb(tree.id, lower, upper, tree.root[env, other])
-            item = wp.int32(0)
-            while wp.bvh_query_next(query, item):
-                f = tree.prim[item - env * tree.prim.shape[0]]
-                add_point_triangle(low, high, lo, hi, surface, env, v, f, partners.pair[k], candidates)
+    """Vertices against faces, or edges against edges (``ee``), of the bodies that theirs may touch.
 
-
-@wp.kernel
-def query_edges(
-    low: VecArray2d,
-    high: VecArray2d,
-    body_low: FloatArray3d,
-    body_high: FloatArray3d,
-    surface: Surface,
-    vert_body: IntArray,
-    tree: Tree,
-    partners: Partners,
-    stale: IntArray,
-    # outputs
-    candidates: Candidates,
-):
-    """Edges against those of bodies that theirs may touch; within one body each pair once."""
+    Within one body each pair of edges is looked at once.
+    """
     env, i = wp.tid()
     if stale[env] == 0:
         return
     a = partners.asking[i]
-    own = vert_body[surface.edges[a, 0]]
-    lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
+    own = vert_body[prim_vertices(surface, wp.int32(ee), a)[0]]
+    lo, hi = prim_box(boxes, surface, env, wp.int32(ee), a)
     reach = WIDER * surface.d_hat
     margin = wp.vec3d(reach, reach, reach)
     lower, upper = corner_down(lo - margin), corner_up(hi + margin)
     for k in range(partners.start[own], partners.start[own + 1]):
         other = partners.body[k]
-        if overlap(lo, hi, body_corner(body_low, env, other), body_corner(body_high, env, other), surface.d_hat):
+        if overlap(lo, hi, boxes.body_low[env, other], boxes.body_high[env, other], surface.d_hat):
             query = wp.bvh_query_aabb(tree.id, lower, upper, tree.root[env, other])
             item = wp.int32(0)
             while wp.bvh_query_next(query, item):
                 b = tree.prim[item - env * tree.prim.shape[0]]
-                if other != own or a < b:
-                    add_edge_edge(low, high, lo, hi, surface, env, a, b, partners.pair[k], candidates)
+                if not ee or other != own or a < b:
+                    add_pair(boxes, lo, hi, surface, env, ee, wp.vec3i(a, b, partners.pair[k]), candidates)
 
 
 _EDGES, _FACES = 1, 2
@@ -264,9 +225,9 @@ class _Side:
             setattr(self.partners, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device))
         self.asking = len(asking)
 
-    def refit(self, low: wp.array, high: wp.array, surface: Surface, stale: wp.array) -> None:
-        inputs, outputs = [low, high, surface, self.kind, self.tree, stale], [self._lower, self._upper]
-        wp.launch(fill_boxes, dim=self.shape, inputs=inputs, outputs=outputs, device=low.device)
+    def refit(self, boxes: Boxes, surface: Surface, stale: wp.array) -> None:
+        inputs, outputs = [boxes, surface, self.kind, self.tree, stale], [self._lower, self._upper]
+        wp.launch(fill_boxes, dim=self.shape, inputs=inputs, outputs=outputs, device=stale.device)
         self._bvh.refit()
 
 
@@ -285,26 +246,18 @@ class Trees:
         self._faces = _Side(_FACES, layout, sorted(both), batch, device)
         self._edges = _Side(_EDGES, layout, [(a, b, i) for i, a, b in pairs], batch, device)
 
-    def find(
-        self,
-        boxes: tuple[wp.array, ...],
-        surface: Surface,
-        vert_body: wp.array,
-        stale: wp.array,
-        candidates: Candidates,
-    ) -> None:
+    def find(self, boxes: Boxes, surface: Surface, vert_body: wp.array, stale: wp.array, candidates: Candidates) -> None:
         """Add the pairs of the stale environments to ``candidates``, without allocation or wait.
 
         Args:
-            boxes: lower and upper corners of the vertices' boxes [m] (B, V), then those of the bodies' (B, bodies, 3).
+            boxes: of vertices and bodies.
             surface: edges, faces and d̂.
             vert_body: body of each vertex (V,).
             stale: mask (B,).
             candidates: where to add.
         """
-        searches: tuple[tuple[Any, _Side], ...] = ((query_faces, self._faces), (query_edges, self._edges))
-        for kernel, side in searches:
-            side.refit(*boxes[:2], surface, stale)
-            inputs = [*boxes, surface, vert_body, side.tree, side.partners, stale]
+        for side in (self._faces, self._edges):
+            side.refit(boxes, surface, stale)
+            inputs = [boxes, surface, vert_body, side.kind == _EDGES, side.tree, side.partners, stale]
             dim = (stale.shape[0], side.asking)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[candidates], device=stale.device)
+            wp.launch(query, dim=dim, inputs=inputs, outputs=[candidates], device=stale.device)

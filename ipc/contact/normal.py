@@ -21,12 +21,11 @@ from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
-from ipc.contact.distance import edge_edge_coefficients, pair_coefficients, point_triangle_coefficients, separation
+from ipc.contact.distance import pair_coefficients, separation
 
 __all__ = [
-    "contact_ee",
+    "contact_pairs",
     "contact_plane",
-    "contact_pt",
     "energy_pairs",
     "energy_plane",
 ]
@@ -47,8 +46,11 @@ def mollifier_threshold(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float6
 
 
 @wp.func
-def edge_weight(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float64:
-    return wp.float64(0.25) * (surface.edge_area[a] + surface.edge_area[b])
+def pair_weight(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+    """Area A [m²] of two edges (``ee``) or of a vertex and a face."""
+    if ee:
+        return wp.float64(0.25) * (surface.edge_area[pair[0]] + surface.edge_area[pair[1]])
+    return wp.float64(0.25) * surface.vert_area[pair[0]]
 
 
 @wp.func
@@ -160,10 +162,11 @@ def push_mollified(
 
 
 @wp.kernel
-def contact_pt(
+def contact_pairs(
     x: VecArray2d,
     surface: Surface,
     candidates: Candidates,
+    ee: wp.bool,
     kappa: FloatArray,
     active: IntArray,
     lanes: wp.int32,
@@ -172,58 +175,28 @@ def contact_pt(
     energy: FloatArray,
     out: Contacts,
 ):
-    """Point-triangle pairs."""
+    """Point-triangle or edge-edge (``ee``) pairs; edges are mollified where nearly parallel."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
-    for i in range(lane, pairs_of(candidates, False, env), lanes):
-        item = candidates.pt[env, i]
-        verts = pair_vertices(surface, False, item)
-        p, a, b, c = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        item = pair_at(candidates, ee, env, i)
+        verts = pair_vertices(surface, ee, item)
+        x0, x1, x2, x3 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
         Dh = surface.d_hat * surface.d_hat
-        coef = point_triangle_coefficients(p, a, b, c)
-        t = separation(coef, p, a, b, c)
-        D = wp.length_sq(t)
-        if Dh > D:
-            scale = wp.float64(0.25) * surface.vert_area[verts[0]] * scale_of(surface, kappa[env])
-            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
-
-
-@wp.kernel
-def contact_ee(
-    x: VecArray2d,
-    surface: Surface,
-    candidates: Candidates,
-    kappa: FloatArray,
-    active: IntArray,
-    lanes: wp.int32,
-    # outputs
-    gradient: VecArray2d,
-    energy: FloatArray,
-    out: Contacts,
-):
-    """Edge-edge pairs, mollified where they are nearly parallel."""
-    env, lane = wp.tid()
-    if active[env] == 0:
-        return
-    for i in range(lane, pairs_of(candidates, True, env), lanes):
-        item = candidates.ee[env, i]
-        ea, eb = item[0], item[1]
-        verts = pair_vertices(surface, True, item)
-        a0, a1, b0, b1 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
-        Dh = surface.d_hat * surface.d_hat
-        coef = edge_edge_coefficients(a0, a1, b0, b1)
-        t = separation(coef, a0, a1, b0, b1)
+        coef = pair_coefficients(ee, x0, x1, x2, x3)
+        t = separation(coef, x0, x1, x2, x3)
         D = wp.length_sq(t)
         if Dh <= D:
             continue
-        scale = edge_weight(surface, ea, eb) * scale_of(surface, kappa[env])
-        eps = mollifier_threshold(surface, ea, eb)
-        c = cross_squared(a0, a1, b0, b1)
+        scale = pair_weight(surface, ee, item) * scale_of(surface, kappa[env])
+        c, eps = wp.float64(0.0), wp.float64(0.0)
+        if ee:
+            c, eps = cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, item[0], item[1])
         if c >= eps:
             push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
         else:
-            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, a1 - a0, b1 - b0, c, eps, item[2])
+            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, x1 - x0, x3 - x2, c, eps, item[2])
 
 
 @wp.kernel
@@ -264,10 +237,10 @@ def pair_energy(x: VecArray2d, surface: Surface, env: wp.int32, ee: wp.bool, pai
     b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
     if b == wp.float64(0.0):
         return b
+    energy = pair_weight(surface, ee, pair) * b
     if ee:
-        m = mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
-        return edge_weight(surface, pair[0], pair[1]) * b * m
-    return wp.float64(0.25) * surface.vert_area[v[0]] * b
+        energy = energy * mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
+    return energy
 
 
 @wp.kernel
