@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["barrier", "barrier_first", "barrier_second", "mollifier", "mollifier_first", "mollifier_second"]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -21,8 +21,6 @@ from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.distance import pair_coefficients, separation
 
-__all__ = ["ccd_pairs", "ccd_plane"]
-
 wp.set_module_options({"enable_backward": False})
 
 SAFETY = wp.constant(wp.float64(0.9))

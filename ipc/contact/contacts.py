@@ -10,17 +10,6 @@ import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
 
-__all__ = [
-    "Contacts",
-    "check_contacts",
-    "clear",
-    "mat34d",
-    "push_contact",
-    "push_matrix",
-    "push_row",
-    "rows_of",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

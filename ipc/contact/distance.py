@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["edge_edge_coefficients", "pair_coefficients", "point_triangle_coefficients", "separation"]
-
 wp.set_module_options({"enable_backward": False})
 
 

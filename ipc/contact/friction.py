@@ -20,18 +20,6 @@ import warp as wp
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, push_row
 
-__all__ = [
-    "Lagged",
-    "clear_change",
-    "friction_change",
-    "friction_rows",
-    "keep_lagged",
-    "lag_contacts",
-    "lag_difference",
-    "share_of_change",
-    "size_of_change",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -23,13 +23,6 @@ from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifie
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
 from ipc.contact.distance import pair_coefficients, separation
 
-__all__ = [
-    "contact_pairs",
-    "contact_plane",
-    "energy_pairs",
-    "energy_plane",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -15,28 +15,6 @@ import warp as wp
 from ipc.arrays import FloatArray, IntArray
 from ipc.solver.step_state import Decisions, Flags
 
-__all__ = [
-    "after_lag",
-    "after_solve",
-    "choose_advancing",
-    "choose_good",
-    "choose_lagging",
-    "clear_det",
-    "conclude",
-    "conclude_advance",
-    "end_search",
-    "judge_advance",
-    "judge_direction",
-    "judge_energy",
-    "set_done",
-    "set_flags",
-    "start_advance",
-    "start_limit",
-    "start_search",
-    "start_step",
-    "try_advance",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 BAD = 1e100

@@ -17,23 +17,6 @@ import warp as wp
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, QuatArray2d, VecArray, VecArray2d
 from ipc.solver.frames import VertexMap
 
-__all__ = [
-    "Masses",
-    "advance_nodes",
-    "aim_bodies",
-    "difference",
-    "inertia_change",
-    "inertia_target",
-    "kinetic_energy",
-    "lengths",
-    "new_velocity",
-    "node_gradient",
-    "predict",
-    "restart",
-    "slope_of",
-    "take",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

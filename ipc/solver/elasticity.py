@@ -31,8 +31,6 @@ from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2
 from ipc.contact.barrier import barrier, barrier_first, barrier_second
 from ipc.solver.dynamics import Masses
 
-__all__ = ["Elements", "block_hessian", "element_energy_change", "element_state", "node_elastic_gradient"]
-
 wp.set_module_options({"enable_backward": False})
 
 

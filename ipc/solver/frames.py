@@ -13,17 +13,6 @@ import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, QuatArray2d, VecArray, VecArray2d
 
-__all__ = [
-    "VertexMap",
-    "compare_frames",
-    "frames_at",
-    "lift_grips",
-    "node_world",
-    "place_grips",
-    "vertex_motion",
-    "vertex_positions",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 
