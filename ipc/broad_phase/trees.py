@@ -9,8 +9,8 @@ Refitting neither allocates nor waits, so it may be part of a recorded step. Box
 there is tested again in double precision, which makes the pairs the same as those of the lists.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.arrays import IntArray, IntArray2d
+from ipc.arrays import IntArray, IntArray2d, filled
 from ipc.bodies.layout import Layout
 from ipc.broad_phase.lists import Boxes, Candidates, Surface, add_pair, overlap, prim_box, prim_vertices
 
@@ -170,10 +170,8 @@ class _Side:
 
     Args:
         kind: 1 for edges, 2 for faces.
-        layout: the flat arrays.
         asks: (asking body, asked body, body pair).
         batch: number of environments, B.
-        device: Warp device.
     """
 
     def __init__(self, kind: int, layout: Layout, asks: list[tuple[int, int, int]], batch: int, device: wp.Device) -> None:
@@ -196,11 +194,8 @@ class _Side:
             wp.array(np.broadcast_to(values, (batch, *values.shape)), dtype=wp.vec3, device=device) for values in (low, high)
         )
         everyone = (len(asked) * np.arange(batch)[:, None] + groups).ravel()
-        self._bvh = wp.Bvh(
-            self._lower.flatten(),
-            self._upper.flatten(),
-            groups=wp.array(everyone, dtype=wp.int32, device=device),
-        )
+        members = wp.array(everyone, dtype=wp.int32, device=device)
+        self._bvh = wp.Bvh(self._lower.flatten(), self._upper.flatten(), groups=members)
         self.tree = Tree()
         self.tree.id = self._bvh.id
         self.tree.prim = wp.array(np.concatenate([_span(start, body) for body in asked]), dtype=wp.int32, device=device)
@@ -215,14 +210,8 @@ class _Side:
         from_start = layout.edge_start if kind == _EDGES else layout.vert_start
         asking = np.concatenate([_span(from_start, body) for body in sorted({a for a, _, _ in asks})])
         counts = np.bincount([a for a, _, _ in order], minlength=bodies)
-        self.partners = Partners()
-        for name, values in {
-            "asking": asking,
-            "start": np.concatenate([[0], np.cumsum(counts)]),
-            "body": [b for _, b, _ in order],
-            "pair": [i for _, _, i in order],
-        }.items():
-            setattr(self.partners, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device))
+        starts, (_, body, pair) = np.concatenate([[0], np.cumsum(counts)]), zip(*order, strict=True)
+        self.partners = filled(Partners, device, {"asking": asking, "start": starts, "body": body, "pair": pair})
         self.asking = len(asking)
 
     def refit(self, boxes: Boxes, surface: Surface, stale: wp.array) -> None:
@@ -235,10 +224,8 @@ class Trees:
     """The hierarchies of a batch of environments and the searches in them.
 
     Args:
-        layout: the flat arrays.
         pairs: body pairs (index, a, b) to look at; a = b for a body that touches itself. At least one.
         batch: number of environments, B.
-        device: Warp device.
     """
 
     def __init__(self, layout: Layout, pairs: Sequence[tuple[int, int, int]], batch: int, device: wp.Device) -> None:
@@ -247,14 +234,9 @@ class Trees:
         self._edges = _Side(_EDGES, layout, [(a, b, i) for i, a, b in pairs], batch, device)
 
     def find(self, boxes: Boxes, surface: Surface, vert_body: wp.array, stale: wp.array, candidates: Candidates) -> None:
-        """Add the pairs of the stale environments to ``candidates``, without allocation or wait.
+        """Add the pairs of environments of the mask ``stale`` (B,), without allocation or wait.
 
-        Args:
-            boxes: of vertices and bodies.
-            surface: edges, faces and d̂.
-            vert_body: body of each vertex (V,).
-            stale: mask (B,).
-            candidates: where to add.
+        ``vert_body`` (V,) is the body of each vertex.
         """
         for side in (self._faces, self._edges):
             side.refit(boxes, surface, stale)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ipc.arrays import filled
 from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
@@ -26,12 +27,10 @@ class Collision:
     """Contact buffers of a batch of environments; every buffer grows when it is too small.
 
     Args:
-        layout: the flat arrays.
-        batch: number of environments.
+        batch: number of environments, B.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.
-        device: Warp device.
         broad_phase: search for pairs, as in :class:`ipc.settings.Settings`.
     """
 
@@ -66,16 +65,10 @@ class Collision:
         def ints(parts: list) -> wp.array:
             return wp.array(np.concatenate([np.zeros(0), *parts]).astype(np.int32), dtype=wp.int32, device=device)
 
-        self.surface = lists.Surface()
-        self.surface.edges = wp.array(layout.edges, dtype=wp.int32, device=device)
-        self.surface.faces = wp.array(layout.faces, dtype=wp.int32, device=device)
-        self.surface.vert_area = wp.array(layout.vert_area, dtype=wp.float64, device=device)
-        self.surface.edge_area = wp.array(layout.edge_area, dtype=wp.float64, device=device)
-        self.surface.edge_rest2 = wp.array(layout.edge_rest2, dtype=wp.float64, device=device)
-        self.surface.plane_vert, self.surface.plane_body, self.surface.plane_pair = (
-            ints(plane_vert),
-            ints(plane_body),
-            ints(plane_pair),
+        shapes = ("edges", "faces", "vert_area", "edge_area", "edge_rest2")
+        self.surface = filled(lists.Surface, device, {name: getattr(layout, name) for name in shapes})
+        self.surface.plane_vert, self.surface.plane_body, self.surface.plane_pair = map(
+            ints, (plane_vert, plane_body, plane_pair)
         )
         self.surface.d_hat = d_hat
         self.pair_mu = wp.array(layout.friction, dtype=wp.float64, device=device)
@@ -110,12 +103,7 @@ class Collision:
                 (False, vb, fa, index, len(members[vb])),
                 (True, ea, eb, index, len(members[ea])),
             ]
-        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = (
-            ints(kinds),
-            ints(members),
-            ints(others),
-            ints(numbers),
-        )
+        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = map(ints, (kinds, members, others, numbers))
         self._prims = starts[-1]
         self._list_start = wp.array(np.array(starts, np.int32), dtype=wp.int32, device=device)
         self._list_count = wp.zeros((batch, max(1, len(starts) - 1)), dtype=wp.int32, device=device)

@@ -9,8 +9,8 @@ The Hessian μ λ [(f1/y)(1 − û ûᵀ) + f1' û ûᵀ] has no negative eigenv
 under the tangential load r μ λ creeps at ε_v (1 − √(1 − r)).
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

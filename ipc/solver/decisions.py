@@ -4,8 +4,7 @@ Flags of one element say whether any environment needs a branch; they are the co
 ``halt`` is set (a buffer was too small) nothing is decided and no state changes, so that the iteration can be repeated.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

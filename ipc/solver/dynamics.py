@@ -4,8 +4,8 @@ Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n +
 in frame coordinates with ỹ = Rᵀ(x̃ − t): there are no fictitious forces, and a bonded vertex is a constant.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

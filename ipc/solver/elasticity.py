@@ -19,8 +19,8 @@ a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-defi
 the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

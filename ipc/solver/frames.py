@@ -3,8 +3,7 @@
 Nodes are unknowns, in the frame of their body; vertices are surface points, in the world.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ environment itself instead of waiting for a launch that does. On a CPU a block i
 a CPU, go to :mod:`ipc.solver.pcg_block`.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -129,10 +129,8 @@ class Pcg:
     """Preconditioned conjugate gradients (Hestenes, Stiefel 1952).
 
     Args:
-        batch: environments, B.
-        nodes: unknowns of each, N, three numbers each.
+        batch, nodes: environments, B, and unknowns of each, N, three numbers each.
         lanes: threads that share the contact rows of an environment.
-        device: Warp device.
     """
 
     def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:

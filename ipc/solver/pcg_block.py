@@ -5,8 +5,8 @@ multiprocessor's bandwidth, so a single large system is better served by the lau
 thread, which does everything in order: Warp's own conjugate gradients take 10 ms there for one dot product of 9,450 numbers.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Scalars:
     __syncthreads();
 #endif
 """)
-def wait_for_block(): ...
+def wait_for_block():
+    """Every thread's writes are there for the whole block after this; on a CPU a block is one."""
+    ...
 
 
 @wp.func

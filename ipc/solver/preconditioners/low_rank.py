@@ -10,8 +10,8 @@ in double precision by one block of threads an environment. An environment with 
 one that does not fit: with part of its contacts the identity is of little use.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import warp as wp
 from ipc.arrays import IntArray, IntArray2d, MatArray2d, SingleArray2d, SingleArray3d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
+from ipc.solver.pcg_block import wait_for_block
 
 __all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
 
@@ -30,16 +31,6 @@ REGULAR = 1e-6
 """Stiffness added to every contact node, as a share of its elastic one."""
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_lanes():
-    """Every lane's writes are there for all lanes after this; on a CPU there is one lane."""
-    ...
 
 
 @wp.struct
@@ -176,7 +167,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
 
     All lanes of the environment work on it and get the same result: False where a pivot is not positive.
     """
-    wait_for_lanes()
+    wait_for_block()
     for k in range(m):
         pivot = small.a[env, k, k]
         if not (wp.determinant(pivot) > wp.float64(0.0) and wp.trace(pivot) > wp.float64(0.0)):
@@ -185,7 +176,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
         for i in range(lane, m, lanes):
             small.column[env, i] = small.a[env, i, k]
             small.row[env, i] = inverse * small.a[env, k, i]
-        wait_for_lanes()
+        wait_for_block()
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
@@ -197,7 +188,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
                 small.a[env, i, j] = -(small.column[env, i] * inverse)
             else:
                 small.a[env, i, j] = small.a[env, i, j] - small.column[env, i] * small.row[env, j]
-        wait_for_lanes()
+        wait_for_block()
     return True
 
 
@@ -231,7 +222,7 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
             j = e - m * i
             small.a[env, i, j] = small.a[env, i, j] + compliance(rest, small.node[env, i], small.node[env, j])
         good = invert_small(small, env, m, lane, lanes)
-    wait_for_lanes()
+    wait_for_block()
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
@@ -243,7 +234,7 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
         small.count[env] = 0
-    wait_for_lanes()
+    wait_for_block()
     for e in range(lane, m * m, lanes):
         small.a[env, e / m, e % m] = wp.mat33d()
 
@@ -265,7 +256,7 @@ def contact_forces(rest: Rest, y: SingleArray3d, running: IntArray, lanes: wp.in
     n = 3 * small.count[env]
     for i in range(lane, n, lanes):
         small.t[env, i] = sum_of_parts(y, env, rest.unknown[small.node[env, i / 3]] + i % 3)
-    wait_for_lanes()
+    wait_for_block()
     for i in range(lane, n, lanes):
         total = wp.float32(0.0)
         for j in range(n):
@@ -277,11 +268,8 @@ class LowRank:
     """Contact nodes, their factored small systems W, and products with these.
 
     Args:
-        rest: K_0⁻¹ on the surfaces.
-        batch: number of environments.
         room: contact nodes that an environment may have.
         row_lanes: threads that share the contact rows of an environment; one adds them in order.
-        device: Warp device.
     """
 
     def __init__(self, rest: Rest, batch: int, room: int, row_lanes: int, device: wp.Device) -> None:
