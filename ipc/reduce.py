@@ -4,13 +4,15 @@ On CUDA a block of threads takes a strided share and adds it up in shared memory
 Warp runs one thread after the other, one thread adds everything.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
+
+from ipc.arrays import FloatArray, FloatArray2d, IntArray
 
 __all__ = ["BLOCK", "MAX", "MIN", "SUM", "Reducer", "chunks_of", "raise_if_any", "total_of"]
 
@@ -28,7 +30,7 @@ def chunks_of(n: int) -> int:
 
 
 @wp.func
-def total_of(partial: wp.array2d(dtype=wp.float64), env: wp.int32) -> wp.float64:
+def total_of(partial: FloatArray2d, env: wp.int32) -> wp.float64:
     """Sum of one row, in order."""
     total = wp.float64(0.0)
     for c in range(partial.shape[1]):
@@ -55,14 +57,7 @@ def neutral(kind: wp.int32) -> wp.float64:
 
 
 @wp.kernel
-def reduce_in_order(
-    values: wp.array2d(dtype=wp.float64),
-    count: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    kind: wp.int32,
-    # outputs
-    out: wp.array(dtype=wp.float64),
-):
+def reduce_in_order(values: FloatArray2d, count: IntArray, active: IntArray, kind: wp.int32, out: FloatArray):
     """One thread an environment: out ← out ∘ values[0] ∘ values[1] …"""
     env = wp.tid()
     if active[env] == 0:
@@ -74,14 +69,7 @@ def reduce_in_order(
 
 
 @wp.kernel
-def reduce_blocks(
-    values: wp.array2d(dtype=wp.float64),
-    count: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    kind: wp.int32,
-    # outputs
-    partial: wp.array2d(dtype=wp.float64),
-):
+def reduce_blocks(values: FloatArray2d, count: IntArray, active: IntArray, kind: wp.int32, partial: FloatArray2d):
     """One block a share of an environment's numbers."""
     env, c, lane = wp.tid()
     total = neutral(kind)
@@ -101,20 +89,7 @@ def reduce_blocks(
 
 
 @wp.kernel
-def reduce_partials(
-    partial: wp.array2d(dtype=wp.float64), active: wp.array(dtype=wp.int32), kind: wp.int32, out: wp.array(dtype=wp.float64)
-):
-    env = wp.tid()
-    if active[env] == 0:
-        return
-    total = neutral(kind)
-    for c in range(partial.shape[1]):
-        total = combined(total, partial[env, c], kind)
-    out[env] = combined(out[env], total, kind)
-
-
-@wp.kernel
-def raise_if_any(flags: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):
+def raise_if_any(flags: IntArray, flag: IntArray):
     """flag[0] = 1 if any of the flags is set; the caller has cleared it."""
     if flags[wp.tid()] != 0:
         flag[0] = 1
@@ -126,7 +101,6 @@ class Reducer:
     Args:
         batch: environments, B.
         longest: largest row.
-        device: Warp device.
     """
 
     def __init__(self, batch: int, longest: int, device: wp.Device) -> None:
@@ -135,6 +109,7 @@ class Reducer:
             c: wp.zeros((batch, c), dtype=wp.float64, device=device) for c in range(1, chunks_of(longest) + 1) if device.is_cuda
         }
         self._counts: dict[int, wp.array] = {}
+        self.prepare(*self._partial)
 
     def _whole(self, n: int) -> wp.array:
         if n not in self._counts:
@@ -152,11 +127,9 @@ class Reducer:
         if n == 0:
             return
         count = self._whole(n) if count is None else count
-        if not self.device.is_cuda:
-            wp.launch(reduce_in_order, dim=self.batch, inputs=[values, count, active, kind], outputs=[out], device=self.device)
-            return
-        partial = self._partial[min(chunks_of(n), chunks_of(self.longest))]
-        dim = (*partial.shape, BLOCK)
-        inputs = [values, count, active, kind]
-        wp.launch(reduce_blocks, dim=dim, inputs=inputs, outputs=[partial], device=self.device, block_dim=BLOCK)
-        wp.launch(reduce_partials, dim=self.batch, inputs=[partial, active, kind], outputs=[out], device=self.device)
+        if self.device.is_cuda:
+            partial = self._partial[min(chunks_of(n), chunks_of(self.longest))]
+            inputs, dim = [values, count, active, kind], (*partial.shape, BLOCK)
+            wp.launch(reduce_blocks, dim=dim, inputs=inputs, outputs=[partial], device=self.device, block_dim=BLOCK)
+            values, count = partial, self._whole(partial.shape[1])
+        wp.launch(reduce_in_order, dim=self.batch, inputs=[values, count, active, kind], outputs=[out], device=self.device)

@@ -153,8 +153,7 @@ class World:
             pot.goal_q.assign(self._goal_q)
             self._targets_set = False
         values = self._newton.step(alive)
-        failed = values["failed"].astype(bool)
-        self._failed |= failed
+        self._failed |= values["failed"].astype(bool)
         return StepReport(
             converged=values["converged"].astype(bool),
             failed=self._failed.copy(),

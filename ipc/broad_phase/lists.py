@@ -8,29 +8,15 @@ The search by lists: per body pair, primitives outside the other body's box are 
 for a pad and a tool is a few hundred against a few hundred. :mod:`ipc.broad_phase.trees` finds the same pairs where there are more.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
-__all__ = [
-    "Candidates",
-    "Surface",
-    "body_boxes",
-    "check_candidates",
-    "clear_body_boxes",
-    "find_ee",
-    "find_pt",
-    "leaves_box",
-    "put_back",
-    "rank_candidates",
-    "reset_lists",
-    "select_prims",
-    "vertex_boxes",
-]
+from ipc.arrays import FloatArray, IntArray, IntArray2d, VecArray2d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,14 +25,14 @@ wp.set_module_options({"enable_backward": False})
 class Surface:
     """The surfaces of all bodies, which every environment shares."""
 
-    edges: wp.array2d(dtype=wp.int32)
-    faces: wp.array2d(dtype=wp.int32)
-    vert_area: wp.array(dtype=wp.float64)
-    edge_area: wp.array(dtype=wp.float64)
-    edge_rest2: wp.array(dtype=wp.float64)
-    plane_vert: wp.array(dtype=wp.int32)
-    plane_body: wp.array(dtype=wp.int32)
-    plane_pair: wp.array(dtype=wp.int32)
+    edges: IntArray2d
+    faces: IntArray2d
+    vert_area: FloatArray
+    edge_area: FloatArray
+    edge_rest2: FloatArray
+    plane_vert: IntArray
+    plane_body: IntArray
+    plane_pair: IntArray
     d_hat: wp.float64
 
 
@@ -56,8 +42,8 @@ class Candidates:
 
     pt: wp.array2d(dtype=wp.vec3i)
     ee: wp.array2d(dtype=wp.vec3i)
-    pt_count: wp.array(dtype=wp.int32)
-    ee_count: wp.array(dtype=wp.int32)
+    pt_count: IntArray
+    ee_count: IntArray
 
 
 @wp.func
@@ -85,23 +71,24 @@ def pair_vertices(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.vec4i:
     return wp.vec4i(a, surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2])
 
 
+@wp.struct
+class Boxes:
+    """Corners [m] of the boxes of vertices (B, V) and of bodies (B, bodies)."""
+
+    low: VecArray2d
+    high: VecArray2d
+    body_low: VecArray2d
+    body_high: VecArray2d
+
+
 @wp.kernel
-def leaves_box(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    stale: wp.array(dtype=wp.int32),
-    any_stale: wp.array(dtype=wp.int32),
-):
+def leaves_box(x: VecArray2d, dx: VecArray2d, boxes: Boxes, active: IntArray, stale: IntArray, any_stale: IntArray):
     """Marks environments in which x or x + dx lies outside its vertex's box."""
     env, v = wp.tid()
     if active[env] == 0:
         return
     p, q = x[env, v], x[env, v] + dx[env, v]
-    lo, hi = low[env, v], high[env, v]
+    lo, hi = boxes.low[env, v], boxes.high[env, v]
     a, b = wp.min(p, q), wp.max(p, q)
     if not (a[0] >= lo[0] and a[1] >= lo[1] and a[2] >= lo[2] and b[0] <= hi[0] and b[1] <= hi[1] and b[2] <= hi[2]):
         stale[env] = 1
@@ -109,7 +96,7 @@ def leaves_box(
 
 
 @wp.kernel
-def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32)):
+def check_candidates(candidates: Candidates, overflow: IntArray):
     """Raises the flag if a list did not fit."""
     env = wp.tid()
     if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
@@ -117,58 +104,32 @@ def check_candidates(candidates: Candidates, overflow: wp.array(dtype=wp.int32))
 
 
 @wp.kernel
-def vertex_boxes(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
-    margin: wp.float64,
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-):
-    """Boxes around [x, x + dx], widened by the margin."""
+def clear_body_boxes(stale: IntArray, boxes: Boxes):
+    """Empty boxes."""
+    env, body = wp.tid()
+    if stale[env] != 0:
+        far = wp.float64(1.0e300)
+        boxes.body_low[env, body] = wp.vec3d(far, far, far)
+        boxes.body_high[env, body] = -wp.vec3d(far, far, far)
+
+
+@wp.kernel
+def fill_boxes(x: VecArray2d, dx: VecArray2d, margin: wp.float64, vert_body: IntArray, stale: IntArray, boxes: Boxes):
+    """Boxes of the vertices around [x, x + dx], widened by the margin, and their unions."""
     env, v = wp.tid()
     if stale[env] == 0:
         return
     p, q = x[env, v], x[env, v] + dx[env, v]
     m = wp.vec3d(margin, margin, margin)
-    low[env, v] = wp.min(p, q) - m
-    high[env, v] = wp.max(p, q) + m
+    lo, hi = wp.min(p, q) - m, wp.max(p, q) + m
+    boxes.low[env, v] = lo
+    boxes.high[env, v] = hi
+    wp.atomic_min(boxes.body_low, env, vert_body[v], lo)
+    wp.atomic_max(boxes.body_high, env, vert_body[v], hi)
 
 
 @wp.kernel
-def clear_body_boxes(stale: wp.array(dtype=wp.int32), low: wp.array3d(dtype=wp.float64), high: wp.array3d(dtype=wp.float64)):
-    """Empty boxes."""
-    env, body = wp.tid()
-    if stale[env] == 0:
-        return
-    for k in range(3):
-        low[env, body, k] = wp.float64(1.0e300)
-        high[env, body, k] = wp.float64(-1.0e300)
-
-
-@wp.kernel
-def body_boxes(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    vert_body: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
-):
-    """Unions of the vertices' boxes."""
-    env, v = wp.tid()
-    if stale[env] == 0:
-        return
-    body = vert_body[v]
-    for k in range(3):
-        wp.atomic_min(body_low, env, body, k, low[env, v][k])
-        wp.atomic_max(body_high, env, body, k, high[env, v][k])
-
-
-@wp.kernel
-def reset_lists(stale: wp.array(dtype=wp.int32), list_count: wp.array2d(dtype=wp.int32), candidates: Candidates):
+def reset_lists(stale: IntArray, list_count: IntArray2d, candidates: Candidates):
     """Empties the lists of the stale environments."""
     env = wp.tid()
     if stale[env] == 0:
@@ -180,22 +141,22 @@ def reset_lists(stale: wp.array(dtype=wp.int32), list_count: wp.array2d(dtype=wp
 
 
 @wp.func
-def prim_low(low: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
-    """Lower corner of the box of vertex (kind 0), edge (1) or face (2) i."""
+def prim_vertices(surface: Surface, kind: wp.int32, i: wp.int32) -> wp.vec3i:
+    """Vertices of vertex (kind 0), edge (1) or face (2) i; the last is repeated."""
     if kind == 0:
-        return low[env, i]
+        return wp.vec3i(i, i, i)
     if kind == 1:
-        return wp.min(low[env, surface.edges[i, 0]], low[env, surface.edges[i, 1]])
-    return wp.min(wp.min(low[env, surface.faces[i, 0]], low[env, surface.faces[i, 1]]), low[env, surface.faces[i, 2]])
+        return wp.vec3i(surface.edges[i, 0], surface.edges[i, 1], surface.edges[i, 1])
+    return wp.vec3i(surface.faces[i, 0], surface.faces[i, 1], surface.faces[i, 2])
 
 
 @wp.func
-def prim_high(high: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32) -> wp.vec3d:
-    if kind == 0:
-        return high[env, i]
-    if kind == 1:
-        return wp.max(high[env, surface.edges[i, 0]], high[env, surface.edges[i, 1]])
-    return wp.max(wp.max(high[env, surface.faces[i, 0]], high[env, surface.faces[i, 1]]), high[env, surface.faces[i, 2]])
+def prim_box(boxes: Boxes, surface: Surface, env: wp.int32, kind: wp.int32, i: wp.int32):
+    """Lower and upper corner of the box of a primitive."""
+    v = prim_vertices(surface, kind, i)
+    lo = wp.min(wp.min(boxes.low[env, v[0]], boxes.low[env, v[1]]), boxes.low[env, v[2]])
+    hi = wp.max(wp.max(boxes.high[env, v[0]], boxes.high[env, v[1]]), boxes.high[env, v[2]])
+    return lo, hi
 
 
 @wp.func
@@ -211,131 +172,90 @@ def overlap(lo: wp.vec3d, hi: wp.vec3d, lo2: wp.vec3d, hi2: wp.vec3d, reach: wp.
 
 
 @wp.func
-def add_point_triangle(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+def add_pair(
+    boxes: Boxes,
     lo: wp.vec3d,
     hi: wp.vec3d,
     surface: Surface,
     env: wp.int32,
-    v: wp.int32,
-    f: wp.int32,
-    pair: wp.int32,
+    ee: wp.bool,
+    pair: wp.vec3i,
     candidates: Candidates,
 ):
-    """Adds vertex v, with box ``lo`` to ``hi``, and face f if their boxes overlap, but for its corners."""
-    if overlap(lo, hi, prim_low(low, surface, env, 2, f), prim_high(high, surface, env, 2, f), surface.d_hat):
-        if v != surface.faces[f, 0] and v != surface.faces[f, 1] and v != surface.faces[f, 2]:
-            slot = wp.atomic_add(candidates.pt_count, env, 1)
-            if slot < candidates.pt.shape[1]:
-                candidates.pt[env, slot] = wp.vec3i(v, f, pair)
+    """Adds two edges (``ee``) or a vertex and a face if their boxes overlap, but for neighbours.
 
-
-@wp.func
-def add_edge_edge(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    lo: wp.vec3d,
-    hi: wp.vec3d,
-    surface: Surface,
-    env: wp.int32,
-    a: wp.int32,
-    b: wp.int32,
-    pair: wp.int32,
-    candidates: Candidates,
-):
-    """Adds edge a, with box ``lo`` to ``hi``, and edge b if boxes overlap, but for neighbours."""
-    if overlap(lo, hi, prim_low(low, surface, env, 1, b), prim_high(high, surface, env, 1, b), surface.d_hat):
-        a0, a1 = surface.edges[a, 0], surface.edges[a, 1]
-        b0, b1 = surface.edges[b, 0], surface.edges[b, 1]
-        if a0 != b0 and a0 != b1 and a1 != b0 and a1 != b1:
+    ``lo`` to ``hi`` is the box of the first.
+    """
+    lo2, hi2 = prim_box(boxes, surface, env, 2 - wp.int32(ee), pair[1])
+    if not overlap(lo, hi, lo2, hi2, surface.d_hat):
+        return
+    v = pair_vertices(surface, ee, pair)
+    if v[0] == v[2] or v[0] == v[3]:
+        return
+    if ee:
+        if v[1] != v[2] and v[1] != v[3]:
             slot = wp.atomic_add(candidates.ee_count, env, 1)
             if slot < candidates.ee.shape[1]:
-                candidates.ee[env, slot] = wp.vec3i(a, b, pair)
+                candidates.ee[env, slot] = pair
+    elif v[0] != v[1]:
+        slot = wp.atomic_add(candidates.pt_count, env, 1)
+        if slot < candidates.pt.shape[1]:
+            candidates.pt[env, slot] = pair
 
 
 @wp.kernel
 def select_prims(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+    boxes: Boxes,
     surface: Surface,
-    prim_kind: wp.array(dtype=wp.int32),
-    prim_index: wp.array(dtype=wp.int32),
-    prim_other: wp.array(dtype=wp.int32),
-    prim_list: wp.array(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
+    prim_kind: IntArray,
+    prim_index: IntArray,
+    prim_other: IntArray,
+    prim_list: IntArray,
+    list_start: IntArray,
+    stale: IntArray,
     # outputs
-    list_count: wp.array2d(dtype=wp.int32),
-    members: wp.array2d(dtype=wp.int32),
+    list_count: IntArray2d,
+    members: IntArray2d,
 ):
     """Keeps the primitives of each list that reach the box of the body they may touch."""
     env, i = wp.tid()
     if stale[env] == 0:
         return
-    kind, index, other, which = prim_kind[i], prim_index[i], prim_other[i], prim_list[i]
-    lo = prim_low(low, surface, env, kind, index)
-    hi = prim_high(high, surface, env, kind, index)
-    blo = wp.vec3d(body_low[env, other, 0], body_low[env, other, 1], body_low[env, other, 2])
-    bhi = wp.vec3d(body_high[env, other, 0], body_high[env, other, 1], body_high[env, other, 2])
-    if overlap(lo, hi, blo, bhi, surface.d_hat):
+    index, other, which = prim_index[i], prim_other[i], prim_list[i]
+    lo, hi = prim_box(boxes, surface, env, prim_kind[i], index)
+    if overlap(lo, hi, boxes.body_low[env, other], boxes.body_high[env, other], surface.d_hat):
         slot = wp.atomic_add(list_count, env, which, 1)
         members[env, list_start[which] + slot] = index
 
 
 @wp.kernel
-def find_pt(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+def find_pairs(
+    boxes: Boxes,
     surface: Surface,
-    members: wp.array2d(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    list_count: wp.array2d(dtype=wp.int32),
+    members: IntArray2d,
+    list_start: IntArray,
+    list_count: IntArray2d,
+    ee: wp.bool,
     first: wp.int32,
     second: wp.int32,
     pair: wp.int32,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
-    """Vertices of list ``first`` against faces of list ``second``."""
-    env, i = wp.tid()
-    if stale[env] == 0 or i >= list_count[env, first]:
-        return
-    v = members[env, list_start[first] + i]
-    lo, hi = low[env, v], high[env, v]
-    for k in range(list_count[env, second]):
-        f = members[env, list_start[second] + k]
-        add_point_triangle(low, high, lo, hi, surface, env, v, f, pair, candidates)
+    """Edges (``ee``) or vertices of list ``first`` against edges or faces of list ``second``.
 
-
-@wp.kernel
-def find_ee(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    members: wp.array2d(dtype=wp.int32),
-    list_start: wp.array(dtype=wp.int32),
-    list_count: wp.array2d(dtype=wp.int32),
-    first: wp.int32,
-    second: wp.int32,
-    pair: wp.int32,
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    candidates: Candidates,
-):
-    """Edges of list ``first`` against those of ``second``; within one body each pair once."""
+    Within one list each pair is looked at once.
+    """
     env, i = wp.tid()
     if stale[env] == 0 or i >= list_count[env, first]:
         return
     a = members[env, list_start[first] + i]
-    lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
+    lo, hi = prim_box(boxes, surface, env, wp.int32(ee), a)
     for k in range(list_count[env, second]):
         b = members[env, list_start[second] + k]
         if first != second or a < b:
-            add_edge_edge(low, high, lo, hi, surface, env, a, b, pair, candidates)
+            add_pair(boxes, lo, hi, surface, env, ee, wp.vec3i(a, b, pair), candidates)
 
 
 @wp.func
@@ -344,13 +264,7 @@ def comes_before(a: wp.vec3i, b: wp.vec3i) -> wp.bool:
 
 
 @wp.kernel
-def rank_candidates(
-    items: wp.array2d(dtype=wp.vec3i),
-    count: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    ordered: wp.array2d(dtype=wp.vec3i),
-):
+def rank_candidates(items: wp.array2d(dtype=wp.vec3i), count: IntArray, stale: IntArray, ordered: wp.array2d(dtype=wp.vec3i)):
     """Sorts the pairs, which are unique, so that their order does not depend on scheduling."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= count[env]:
@@ -363,13 +277,7 @@ def rank_candidates(
 
 
 @wp.kernel
-def put_back(
-    ordered: wp.array2d(dtype=wp.vec3i),
-    count: wp.array(dtype=wp.int32),
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    items: wp.array2d(dtype=wp.vec3i),
-):
+def put_back(ordered: wp.array2d(dtype=wp.vec3i), count: IntArray, stale: IntArray, items: wp.array2d(dtype=wp.vec3i)):
     env, i = wp.tid()
     if stale[env] != 0 and i < count[env]:
         items[env, i] = ordered[env, i]

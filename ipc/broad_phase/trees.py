@@ -9,21 +9,21 @@ Refitting neither allocates nor waits, so it may be part of a recorded step. Box
 there is tested again in double precision, which makes the pairs the same as those of the lists.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ipc.arrays import IntArray, IntArray2d, filled
 from ipc.bodies.layout import Layout
-from ipc.broad_phase.lists import Candidates, Surface, add_edge_edge, add_point_triangle, overlap, prim_high, prim_low
+from ipc.broad_phase.lists import Boxes, Candidates, Surface, add_pair, overlap, prim_box, prim_vertices
 
 __all__ = ["Trees", "trees_pay"]
 
@@ -72,22 +72,22 @@ class Tree:
     """A hierarchy over n primitives an environment; item env·n + k is primitive ``prim[k]``."""
 
     id: wp.uint64
-    prim: wp.array(dtype=wp.int32)  # (n,)
-    root: wp.array2d(dtype=wp.int32)  # node above all primitives of a body (B, bodies)
+    prim: IntArray  # (n,)
+    root: IntArray2d  # node above all primitives of a body (B, bodies)
 
 
 @wp.struct
 class Partners:
     """Queries of the primitives ``asking`` to each ``body`` from a body's ``start`` on."""
 
-    asking: wp.array(dtype=wp.int32)
-    start: wp.array(dtype=wp.int32)  # (bodies + 1,)
-    body: wp.array(dtype=wp.int32)
-    pair: wp.array(dtype=wp.int32)
+    asking: IntArray
+    start: IntArray  # (bodies + 1,)
+    body: IntArray
+    pair: IntArray
 
 
 @wp.kernel
-def find_roots(id: wp.uint64, group: wp.array(dtype=wp.int32), groups: wp.int32, root: wp.array2d(dtype=wp.int32)):
+def find_roots(id: wp.uint64, group: IntArray, groups: wp.int32, root: IntArray2d):
     env, body = wp.tid()
     if group[body] >= 0:
         root[env, body] = wp.bvh_get_group_root(id, env * groups + group[body])
@@ -95,12 +95,11 @@ def find_roots(id: wp.uint64, group: wp.array(dtype=wp.int32), groups: wp.int32,
 
 @wp.kernel
 def fill_boxes(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
+    boxes: Boxes,
     surface: Surface,
     kind: wp.int32,
     tree: Tree,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     lower: wp.array2d(dtype=wp.vec3),
     upper: wp.array2d(dtype=wp.vec3),
@@ -108,82 +107,45 @@ def fill_boxes(
     """Boxes of the edges (kind 1) or faces (2) of a tree, rounded outward."""
     env, k = wp.tid()
     if stale[env] != 0:
-        lower[env, k] = corner_down(prim_low(low, surface, env, kind, tree.prim[k]))
-        upper[env, k] = corner_up(prim_high(high, surface, env, kind, tree.prim[k]))
-
-
-@wp.func
-def body_corner(corners: wp.array3d(dtype=wp.float64), env: wp.int32, body: wp.int32) -> wp.vec3d:
-    return wp.vec3d(corners[env, body, 0], corners[env, body, 1], corners[env, body, 2])
+        lo, hi = prim_box(boxes, surface, env, kind, tree.prim[k])
+        lower[env, k] = corner_down(lo)
+        upper[env, k] = corner_up(hi)
 
 
 @wp.kernel
-def query_faces(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
+def query(
+    boxes: Boxes,
     surface: Surface,
-    vert_body: wp.array(dtype=wp.int32),
+    vert_body: IntArray,
+    ee: wp.bool,
     tree: Tree,
     partners: Partners,
-    stale: wp.array(dtype=wp.int32),
+    stale: IntArray,
     # outputs
     candidates: Candidates,
 ):
-    """Vertices against the faces of the bodies that their body may touch."""
-    env, i = wp.tid()
-    if stale[env] == 0:
-        return
-    v = partners.asking[i]
-    own = vert_body[v]
-    lo, hi = low[env, v], high[env, v]
-    reach = WIDER * surface.d_hat
-    margin = wp.vec3d(reach, reach, reach)
-    lower, upper = corner_down(lo - margin), corner_up(hi + margin)
-    for k in range(partners.start[own], partners.start[own + 1]):
-        other = partners.body[k]
-        if overlap(lo, hi, body_corner(body_low, env, other), body_corner(body_high, env, other), surface.d_hat):
-            query = wp.bvh_query_aabb(tree.id, lower, upper, tree.root[env, other])
-            item = wp.int32(0)
-            while wp.bvh_query_next(query, item):
-                f = tree.prim[item - env * tree.prim.shape[0]]
-                add_point_triangle(low, high, lo, hi, surface, env, v, f, partners.pair[k], candidates)
+    """Vertices against faces, or edges against edges (``ee``), of the bodies that theirs may touch.
 
-
-@wp.kernel
-def query_edges(
-    low: wp.array2d(dtype=wp.vec3d),
-    high: wp.array2d(dtype=wp.vec3d),
-    body_low: wp.array3d(dtype=wp.float64),
-    body_high: wp.array3d(dtype=wp.float64),
-    surface: Surface,
-    vert_body: wp.array(dtype=wp.int32),
-    tree: Tree,
-    partners: Partners,
-    stale: wp.array(dtype=wp.int32),
-    # outputs
-    candidates: Candidates,
-):
-    """Edges against those of bodies that theirs may touch; within one body each pair once."""
+    Within one body each pair of edges is looked at once.
+    """
     env, i = wp.tid()
     if stale[env] == 0:
         return
     a = partners.asking[i]
-    own = vert_body[surface.edges[a, 0]]
-    lo, hi = prim_low(low, surface, env, 1, a), prim_high(high, surface, env, 1, a)
+    own = vert_body[prim_vertices(surface, wp.int32(ee), a)[0]]
+    lo, hi = prim_box(boxes, surface, env, wp.int32(ee), a)
     reach = WIDER * surface.d_hat
     margin = wp.vec3d(reach, reach, reach)
     lower, upper = corner_down(lo - margin), corner_up(hi + margin)
     for k in range(partners.start[own], partners.start[own + 1]):
         other = partners.body[k]
-        if overlap(lo, hi, body_corner(body_low, env, other), body_corner(body_high, env, other), surface.d_hat):
+        if overlap(lo, hi, boxes.body_low[env, other], boxes.body_high[env, other], surface.d_hat):
             query = wp.bvh_query_aabb(tree.id, lower, upper, tree.root[env, other])
             item = wp.int32(0)
             while wp.bvh_query_next(query, item):
                 b = tree.prim[item - env * tree.prim.shape[0]]
-                if other != own or a < b:
-                    add_edge_edge(low, high, lo, hi, surface, env, a, b, partners.pair[k], candidates)
+                if not ee or other != own or a < b:
+                    add_pair(boxes, lo, hi, surface, env, ee, wp.vec3i(a, b, partners.pair[k]), candidates)
 
 
 _EDGES, _FACES = 1, 2
@@ -208,10 +170,8 @@ class _Side:
 
     Args:
         kind: 1 for edges, 2 for faces.
-        layout: the flat arrays.
         asks: (asking body, asked body, body pair).
         batch: number of environments, B.
-        device: Warp device.
     """
 
     def __init__(self, kind: int, layout: Layout, asks: list[tuple[int, int, int]], batch: int, device: wp.Device) -> None:
@@ -234,11 +194,8 @@ class _Side:
             wp.array(np.broadcast_to(values, (batch, *values.shape)), dtype=wp.vec3, device=device) for values in (low, high)
         )
         everyone = (len(asked) * np.arange(batch)[:, None] + groups).ravel()
-        self._bvh = wp.Bvh(
-            self._lower.flatten(),
-            self._upper.flatten(),
-            groups=wp.array(everyone, dtype=wp.int32, device=device),
-        )
+        members = wp.array(everyone, dtype=wp.int32, device=device)
+        self._bvh = wp.Bvh(self._lower.flatten(), self._upper.flatten(), groups=members)
         self.tree = Tree()
         self.tree.id = self._bvh.id
         self.tree.prim = wp.array(np.concatenate([_span(start, body) for body in asked]), dtype=wp.int32, device=device)
@@ -253,19 +210,13 @@ class _Side:
         from_start = layout.edge_start if kind == _EDGES else layout.vert_start
         asking = np.concatenate([_span(from_start, body) for body in sorted({a for a, _, _ in asks})])
         counts = np.bincount([a for a, _, _ in order], minlength=bodies)
-        self.partners = Partners()
-        for name, values in {
-            "asking": asking,
-            "start": np.concatenate([[0], np.cumsum(counts)]),
-            "body": [b for _, b, _ in order],
-            "pair": [i for _, _, i in order],
-        }.items():
-            setattr(self.partners, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device))
+        starts, (_, body, pair) = np.concatenate([[0], np.cumsum(counts)]), zip(*order, strict=True)
+        self.partners = filled(Partners, device, {"asking": asking, "start": starts, "body": body, "pair": pair})
         self.asking = len(asking)
 
-    def refit(self, low: wp.array, high: wp.array, surface: Surface, stale: wp.array) -> None:
-        inputs, outputs = [low, high, surface, self.kind, self.tree, stale], [self._lower, self._upper]
-        wp.launch(fill_boxes, dim=self.shape, inputs=inputs, outputs=outputs, device=low.device)
+    def refit(self, boxes: Boxes, surface: Surface, stale: wp.array) -> None:
+        inputs, outputs = [boxes, surface, self.kind, self.tree, stale], [self._lower, self._upper]
+        wp.launch(fill_boxes, dim=self.shape, inputs=inputs, outputs=outputs, device=stale.device)
         self._bvh.refit()
 
 
@@ -273,10 +224,8 @@ class Trees:
     """The hierarchies of a batch of environments and the searches in them.
 
     Args:
-        layout: the flat arrays.
         pairs: body pairs (index, a, b) to look at; a = b for a body that touches itself. At least one.
         batch: number of environments, B.
-        device: Warp device.
     """
 
     def __init__(self, layout: Layout, pairs: Sequence[tuple[int, int, int]], batch: int, device: wp.Device) -> None:
@@ -284,26 +233,13 @@ class Trees:
         self._faces = _Side(_FACES, layout, sorted(both), batch, device)
         self._edges = _Side(_EDGES, layout, [(a, b, i) for i, a, b in pairs], batch, device)
 
-    def find(
-        self,
-        boxes: tuple[wp.array, ...],
-        surface: Surface,
-        vert_body: wp.array,
-        stale: wp.array,
-        candidates: Candidates,
-    ) -> None:
-        """Add the pairs of the stale environments to ``candidates``, without allocation or wait.
+    def find(self, boxes: Boxes, surface: Surface, vert_body: wp.array, stale: wp.array, candidates: Candidates) -> None:
+        """Add the pairs of environments of the mask ``stale`` (B,), without allocation or wait.
 
-        Args:
-            boxes: lower and upper corners of the vertices' boxes [m] (B, V), then those of the bodies' (B, bodies, 3).
-            surface: edges, faces and d̂.
-            vert_body: body of each vertex (V,).
-            stale: mask (B,).
-            candidates: where to add.
+        ``vert_body`` (V,) is the body of each vertex.
         """
-        searches: tuple[tuple[Any, _Side], ...] = ((query_faces, self._faces), (query_edges, self._edges))
-        for kernel, side in searches:
-            side.refit(*boxes[:2], surface, stale)
-            inputs = [*boxes, surface, vert_body, side.tree, side.partners, stale]
+        for side in (self._faces, self._edges):
+            side.refit(boxes, surface, stale)
+            inputs = [boxes, surface, vert_body, side.kind == _EDGES, side.tree, side.partners, stale]
             dim = (stale.shape[0], side.asking)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[candidates], device=stale.device)
+            wp.launch(query, dim=dim, inputs=inputs, outputs=[candidates], device=stale.device)

@@ -7,15 +7,12 @@ With D the squared distance, D̂ = d̂² and an area A, a pair stores the energy
 so that κ is a pressure [Pa] (Li et al. 2023, "Convergent Incremental Potential Contact", section 5).
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
-
-__all__ = ["barrier", "barrier_first", "barrier_second", "mollifier", "mollifier_first", "mollifier_second"]
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,18 +9,17 @@ when a step is taken. A step therefore never ends with a distance below ``RESOLU
 surfaces through each other; a pair that is closer already may not come closer.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.distance import pair_coefficients, separation
-
-__all__ = ["ccd_pairs", "ccd_plane"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -91,17 +90,17 @@ def additive_ccd(
 
 @wp.kernel
 def ccd_pairs(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
+    dx: VecArray2d,
     surface: Surface,
     candidates: Candidates,
     ee: wp.bool,
-    slack: wp.array(dtype=wp.float64),
-    floor: wp.array(dtype=wp.float64),
-    reach: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    slack: FloatArray,
+    floor: FloatArray,
+    reach: FloatArray,
+    active: IntArray,
     # outputs
-    alpha: wp.array(dtype=wp.float64),
+    alpha: FloatArray,
 ):
     """Lowers alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
     env, i = wp.tid()
@@ -130,19 +129,19 @@ def ccd_pairs(
 
 @wp.kernel
 def ccd_plane(
-    x: wp.array2d(dtype=wp.vec3d),
-    dx: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
+    dx: VecArray2d,
     surface: Surface,
-    R0: wp.array2d(dtype=wp.mat33d),
-    t0: wp.array2d(dtype=wp.vec3d),
-    R1: wp.array2d(dtype=wp.mat33d),
-    t1: wp.array2d(dtype=wp.vec3d),
-    slack: wp.array(dtype=wp.float64),
-    floor: wp.array(dtype=wp.float64),
-    reach: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    R0: MatArray2d,
+    t0: VecArray2d,
+    R1: MatArray2d,
+    t1: VecArray2d,
+    slack: FloatArray,
+    floor: FloatArray,
+    reach: FloatArray,
+    active: IntArray,
     # outputs
-    alpha: wp.array(dtype=wp.float64),
+    alpha: FloatArray,
 ):
     """Lowers alpha[env] to what half-spaces allow, which move from frame 0 to frame 1."""
     env, i = wp.tid()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ipc.arrays import filled
 from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
@@ -26,12 +27,10 @@ class Collision:
     """Contact buffers of a batch of environments; every buffer grows when it is too small.
 
     Args:
-        layout: the flat arrays.
-        batch: number of environments.
+        batch: number of environments, B.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.
-        device: Warp device.
         broad_phase: search for pairs, as in :class:`ipc.settings.Settings`.
     """
 
@@ -66,16 +65,10 @@ class Collision:
         def ints(parts: list) -> wp.array:
             return wp.array(np.concatenate([np.zeros(0), *parts]).astype(np.int32), dtype=wp.int32, device=device)
 
-        self.surface = lists.Surface()
-        self.surface.edges = wp.array(layout.edges, dtype=wp.int32, device=device)
-        self.surface.faces = wp.array(layout.faces, dtype=wp.int32, device=device)
-        self.surface.vert_area = wp.array(layout.vert_area, dtype=wp.float64, device=device)
-        self.surface.edge_area = wp.array(layout.edge_area, dtype=wp.float64, device=device)
-        self.surface.edge_rest2 = wp.array(layout.edge_rest2, dtype=wp.float64, device=device)
-        self.surface.plane_vert, self.surface.plane_body, self.surface.plane_pair = (
-            ints(plane_vert),
-            ints(plane_body),
-            ints(plane_pair),
+        shapes = ("edges", "faces", "vert_area", "edge_area", "edge_rest2")
+        self.surface = filled(lists.Surface, device, {name: getattr(layout, name) for name in shapes})
+        self.surface.plane_vert, self.surface.plane_body, self.surface.plane_pair = map(
+            ints, (plane_vert, plane_body, plane_pair)
         )
         self.surface.d_hat = d_hat
         self.pair_mu = wp.array(layout.friction, dtype=wp.float64, device=device)
@@ -98,30 +91,26 @@ class Collision:
             starts.append(starts[-1] + len(ids))
             return len(starts) - 2
 
-        self._searches: list[tuple[str, int, int, int, int]] = []
+        self._searches: list[tuple[bool, int, int, int, int]] = []
         for index, a, b in meshes if self._trees is None else []:
             va, ea, fa = (add_list(kind, a, b) for kind in range(3))
             if a == b:
-                self._searches += [("pt", va, fa, index, len(members[va])), ("ee", ea, ea, index, len(members[ea]))]
+                self._searches += [(False, va, fa, index, len(members[va])), (True, ea, ea, index, len(members[ea]))]
                 continue
             vb, eb, fb = (add_list(kind, b, a) for kind in range(3))
             self._searches += [
-                ("pt", va, fb, index, len(members[va])),
-                ("pt", vb, fa, index, len(members[vb])),
-                ("ee", ea, eb, index, len(members[ea])),
+                (False, va, fb, index, len(members[va])),
+                (False, vb, fa, index, len(members[vb])),
+                (True, ea, eb, index, len(members[ea])),
             ]
-        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = (
-            ints(kinds),
-            ints(members),
-            ints(others),
-            ints(numbers),
-        )
+        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = map(ints, (kinds, members, others, numbers))
         self._prims = starts[-1]
         self._list_start = wp.array(np.array(starts, np.int32), dtype=wp.int32, device=device)
         self._list_count = wp.zeros((batch, max(1, len(starts) - 1)), dtype=wp.int32, device=device)
         self._members = wp.zeros((batch, max(1, starts[-1])), dtype=wp.int32, device=device)
-        self._low, self._high = (wp.zeros((batch, verts), dtype=wp.vec3d, device=device) for _ in range(2))
-        self._body_low, self._body_high = (wp.zeros((batch, bodies, 3), dtype=wp.float64, device=device) for _ in range(2))
+        self._boxes = lists.Boxes()
+        self._boxes.low, self._boxes.high = (wp.zeros((batch, verts), dtype=wp.vec3d, device=device) for _ in range(2))
+        self._boxes.body_low, self._boxes.body_high = (wp.zeros((batch, bodies), dtype=wp.vec3d, device=device) for _ in range(2))
         self._stale = wp.zeros(batch, dtype=wp.int32, device=device)
         self.candidates = lists.Candidates()
         self.candidates.pt_count, self.candidates.ee_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
@@ -138,7 +127,7 @@ class Collision:
         self._force = wp.zeros(batch, dtype=wp.float64, device=device)
         self._reduce = Reducer(batch, max(1, verts), device)
         self._reduce.prepare(verts)
-        self._low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
+        self._boxes.low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
 
     # --- buffers ---------------------------------------------------------------------------------------------------------------
 
@@ -184,9 +173,9 @@ class Collision:
 
     def forget(self, envs: np.ndarray) -> None:
         """Drop the lists of the environments of the mask (B,): their vertices were moved by hand."""
-        low = self._low.numpy()
+        low = self._boxes.low.numpy()
         low[envs] = np.inf
-        self._low.assign(low)
+        self._boxes.low.assign(low)
 
     def refresh(self, x: wp.array, dx: wp.array, active: wp.array) -> None:
         """Make the candidates valid for all positions from x to x + dx (B, V), or set ``overflow``."""
@@ -194,55 +183,45 @@ class Collision:
             return
         self._stale.zero_()
         self._any_stale.zero_()
-        inputs, outputs = [x, dx, self._low, self._high, active], [self._stale, self._any_stale]
-        wp.launch(lists.leaves_box, dim=x.shape, inputs=inputs, outputs=outputs, device=self.device)
+        self._launch(lists.leaves_box, x.shape, [x, dx, self._boxes, active], [self._stale, self._any_stale])
         wp.capture_if(self._any_stale, on_true=self._rebuild, x=x, dx=dx)
 
     def _rebuild(self, x: wp.array, dx: wp.array) -> None:
         """New boxes and lists for the stale environments."""
-        device, stale = self.device, self._stale
-        bodies = (self.batch, self._body_low.shape[1])
-        inputs, outputs = [x, dx, self.margin, stale], [self._low, self._high]
-        wp.launch(lists.vertex_boxes, dim=x.shape, inputs=inputs, outputs=outputs, device=device)
-        wp.launch(lists.clear_body_boxes, dim=bodies, inputs=[stale, self._body_low, self._body_high], device=device)
-        inputs, outputs = [self._low, self._high, self.vert_body, stale], [self._body_low, self._body_high]
-        wp.launch(lists.body_boxes, dim=x.shape, inputs=inputs, outputs=outputs, device=device)
-        wp.launch(lists.reset_lists, dim=self.batch, inputs=[stale, self._list_count, self.candidates], device=device)
-        boxes = (self._low, self._high, self._body_low, self._body_high)
+        boxes, stale, candidates = self._boxes, self._stale, self.candidates
+        self._launch(lists.clear_body_boxes, boxes.body_low.shape, [stale], [boxes])
+        self._launch(lists.fill_boxes, x.shape, [x, dx, self.margin, self.vert_body, stale], [boxes])
+        self._launch(lists.reset_lists, self.batch, [stale], [self._list_count, candidates])
         if self._trees is None:
-            self._search_lists(boxes, stale)
+            self._search_lists()
         else:
-            self._trees.find(boxes, self.surface, self.vert_body, stale, self.candidates)
+            self._trees.find(boxes, self.surface, self.vert_body, stale, candidates)
         if self._sort:
-            for items, count in ((self.candidates.pt, self.candidates.pt_count), (self.candidates.ee, self.candidates.ee_count)):
+            for items, count in ((candidates.pt, candidates.pt_count), (candidates.ee, candidates.ee_count)):
                 ordered = self._ordered[items.shape[1]]
-                inputs, outputs = [items, count, stale], [ordered]
-                wp.launch(lists.rank_candidates, dim=items.shape, inputs=inputs, outputs=outputs, device=device)
-                wp.launch(lists.put_back, dim=items.shape, inputs=[ordered, count, stale], outputs=[items], device=device)
-        wp.launch(lists.check_candidates, dim=self.batch, inputs=[self.candidates], outputs=[self.overflow], device=device)
+                self._launch(lists.rank_candidates, items.shape, [items, count, stale], [ordered])
+                self._launch(lists.put_back, items.shape, [ordered, count, stale], [items])
+        self._launch(lists.check_candidates, self.batch, [candidates], [self.overflow])
 
-    def _search_lists(self, boxes: tuple[wp.array, ...], stale: wp.array) -> None:
+    def _search_lists(self) -> None:
         """All against all, of the primitives that reach the other body."""
         inputs = [
-            *(*boxes, self.surface),
-            *(self._prim_kind, self._prim_index, self._prim_other, self._prim_list, self._list_start, stale),
+            *(self._boxes, self.surface, self._prim_kind, self._prim_index, self._prim_other, self._prim_list),
+            *(self._list_start, self._stale),
         ]
-        outputs = [self._list_count, self._members]
-        wp.launch(lists.select_prims, dim=(self.batch, self._prims), inputs=inputs, outputs=outputs, device=self.device)
-        for kind, first, second, pair, size in self._searches:
-            kernel = lists.find_pt if kind == "pt" else lists.find_ee
-            inputs = [
-                *(*boxes[:2], self.surface, self._members, self._list_start, self._list_count),
-                *(first, second, pair, stale),
-            ]
-            wp.launch(kernel, dim=(self.batch, size), inputs=inputs, outputs=[self.candidates], device=self.device)
+        self._launch(lists.select_prims, (self.batch, self._prims), inputs, [self._list_count, self._members])
+        common = [self._boxes, self.surface, self._members, self._list_start, self._list_count]
+        for *search, size in self._searches:
+            self._launch(lists.find_pairs, (self.batch, size), [*common, *search, self._stale], [self.candidates])
 
     # --- contact ---------------------------------------------------------------------------------------------------------------
 
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
     def _each(self, kernel: Any, inputs: list, outputs: list) -> None:
         """Launch a kernel whose threads go over the lists of an environment together."""
-        inputs = [*inputs, self.lanes]
-        wp.launch(kernel, dim=(self.batch, self.lanes), inputs=inputs, outputs=outputs, device=self.device)
+        self._launch(kernel, (self.batch, self.lanes), [*inputs, self.lanes], outputs)
 
     def assemble(
         self,
@@ -260,20 +239,16 @@ class Collision:
 
         What does not fit sets ``overflow``.
         """
-        device = self.device
-        wp.launch(contacts.clear, dim=x.shape, inputs=[active], outputs=[gradient, energy, self.contacts], device=device)
         outputs = [gradient, energy, self.contacts]
+        self._launch(contacts.clear, x.shape, [active], outputs)
         if self._meshes:
-            for kernel in (normal.contact_pt, normal.contact_ee):
-                self._each(kernel, [x, self.surface, self.candidates, kappa, active], outputs)
+            for ee in (False, True):
+                self._each(normal.contact_pairs, [x, self.surface, self.candidates, ee, kappa, active], outputs)
         if self.planes:
-            inputs = [x, self.surface, R, t, kappa, active]
-            self._each(normal.contact_plane, inputs, outputs)
+            self._each(normal.contact_plane, [x, self.surface, R, t, kappa, active], outputs)
         if self.friction:
-            inputs = [x, start, self.lagged, friction_eps, active]
-            outputs = [gradient, self.contacts]
-            self._each(friction.friction_rows, inputs, outputs)
-        wp.launch(contacts.check_contacts, dim=self.batch, inputs=[self.contacts], outputs=[self.overflow], device=device)
+            self._each(friction.friction_rows, [x, start, self.lagged, friction_eps, active], [gradient, self.contacts])
+        self._launch(contacts.check_contacts, self.batch, [self.contacts], [self.overflow])
 
     def energy_change(
         self,
@@ -317,10 +292,10 @@ class Collision:
         if self._meshes:
             for ee, items in ((False, self.candidates.pt), (True, self.candidates.ee)):
                 inputs = [x, dx, self.surface, self.candidates, ee, slack, floor, reach, active]
-                wp.launch(ccd.ccd_pairs, dim=items.shape, inputs=inputs, outputs=[alpha], device=self.device)
+                self._launch(ccd.ccd_pairs, items.shape, inputs, [alpha])
         if self.planes:
             inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, reach, active]
-            wp.launch(ccd.ccd_plane, dim=(self.batch, self.planes), inputs=inputs, outputs=[alpha], device=self.device)
+            self._launch(ccd.ccd_plane, (self.batch, self.planes), inputs, [alpha])
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
@@ -329,24 +304,15 @@ class Collision:
 
         ``changed`` (B,) becomes by how much the friction limits μ λ n changed, as a share of their sum.
         """
-        device, dim = self.device, self.lagged.limit.shape
-        wp.launch(friction.keep_lagged, dim=dim, inputs=[self.lagged, active], outputs=[self._old], device=device)
-        inputs = [self.contacts, self.pair_mu, active]
-        wp.launch(friction.lag_contacts, dim=dim, inputs=inputs, outputs=[self.lagged], device=device)
-        wp.launch(
-            friction.clear_change,
-            dim=self._change.shape,
-            inputs=[active],
-            outputs=[self._change, self._force, changed],
-            device=device,
-        )
+        limits, vertices = self.lagged.limit.shape, self._change.shape
+        self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
+        self._launch(friction.lag_contacts, limits, [self.contacts, self.pair_mu, active], [self.lagged])
+        self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
-            inputs, outputs = [lagged, sign, active], [self._change, self._force]
-            self._each(friction.lag_difference, inputs, outputs)
-        inputs, outputs = [self._change, active], [self._change_size]
-        wp.launch(friction.size_of_change, dim=self._change.shape, inputs=inputs, outputs=outputs, device=device)
+            self._each(friction.lag_difference, [lagged, sign, active], [self._change, self._force])
+        self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
-        wp.launch(friction.share_of_change, dim=self.batch, inputs=[self._force, active], outputs=[changed], device=device)
+        self._launch(friction.share_of_change, self.batch, [self._force, active], [changed])
 
     def drop(self, envs: np.ndarray) -> None:
         """Forget the contacts and the lagged pairs of the environments of the mask (B,)."""

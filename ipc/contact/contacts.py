@@ -1,23 +1,13 @@
 """Buffers of contacts and of the rows of their Hessian; counts may exceed what fits."""
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
-__all__ = [
-    "Contacts",
-    "check_contacts",
-    "clear",
-    "mat34d",
-    "push_contact",
-    "push_matrix",
-    "push_row",
-    "rows_of",
-]
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,14 +22,14 @@ class Contacts:
 
     verts: wp.array2d(dtype=wp.vec4i)
     coef: wp.array2d(dtype=wp.vec4d)
-    normal: wp.array2d(dtype=wp.vec3d)
-    force: wp.array2d(dtype=wp.float64)
-    gap: wp.array2d(dtype=wp.float64)
-    pair: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    normal: VecArray2d
+    force: FloatArray2d
+    gap: FloatArray2d
+    pair: IntArray2d
+    count: IntArray
     row_verts: wp.array2d(dtype=wp.vec4i)
     row: wp.array2d(dtype=mat34d)
-    row_count: wp.array(dtype=wp.int32)
+    row_count: IntArray
 
 
 @wp.func
@@ -76,13 +66,7 @@ def push_contact(
 
 
 @wp.kernel
-def clear(
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
+def clear(active: IntArray, gradient: VecArray2d, energy: FloatArray, out: Contacts):
     """No forces, contacts or rows in the active environments."""
     env, v = wp.tid()
     if active[env] == 0:
@@ -95,7 +79,7 @@ def clear(
 
 
 @wp.kernel
-def check_contacts(contacts: Contacts, overflow: wp.array(dtype=wp.int32)):
+def check_contacts(contacts: Contacts, overflow: IntArray):
     """Raises the flag if contacts or rows did not fit."""
     env = wp.tid()
     if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:

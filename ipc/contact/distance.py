@@ -4,15 +4,12 @@ Every distance is that of t = Σ_i c_i x_i. Near a closest point the coefficient
 theorem), so ∂D/∂x_i = 2 c_i t for D = ‖t‖², whichever features are closest.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
-
-__all__ = ["edge_edge_coefficients", "pair_coefficients", "point_triangle_coefficients", "separation"]
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,27 +9,16 @@ The Hessian μ λ [(f1/y)(1 − û ûᵀ) + f1' û ûᵀ] has no negative eigenv
 under the tangential load r μ λ creeps at ε_v (1 − √(1 − r)).
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, push_row
-
-__all__ = [
-    "Lagged",
-    "clear_change",
-    "friction_change",
-    "friction_rows",
-    "keep_lagged",
-    "lag_contacts",
-    "lag_difference",
-    "share_of_change",
-    "size_of_change",
-]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,10 +29,10 @@ class Lagged:
 
     verts: wp.array2d(dtype=wp.vec4i)
     coef: wp.array2d(dtype=wp.vec4d)
-    normal: wp.array2d(dtype=wp.vec3d)
-    limit: wp.array2d(dtype=wp.float64)
-    pair: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    normal: VecArray2d
+    limit: FloatArray2d
+    pair: IntArray2d
+    count: IntArray
 
 
 @wp.func
@@ -71,9 +60,7 @@ def friction_curvature(y: wp.float64, eps: wp.float64) -> wp.float64:
 
 
 @wp.func
-def sliding(
-    x: wp.array2d(dtype=wp.vec3d), start: wp.array2d(dtype=wp.vec3d), env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d
-) -> wp.vec3d:
+def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d) -> wp.vec3d:
     """u, the tangential part of Σ c_i (x_i − start_i) [m]."""
     u = wp.vec3d()
     for i in range(4):
@@ -83,7 +70,7 @@ def sliding(
 
 
 @wp.kernel
-def keep_lagged(lagged: Lagged, active: wp.array(dtype=wp.int32), out: Lagged):
+def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
     """Copies the lagged pairs of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
@@ -98,13 +85,7 @@ def keep_lagged(lagged: Lagged, active: wp.array(dtype=wp.int32), out: Lagged):
 
 
 @wp.kernel
-def lag_contacts(
-    contacts: Contacts,
-    mu: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    out: Lagged,
-):
+def lag_contacts(contacts: Contacts, mu: FloatArray, active: IntArray, out: Lagged):
     """Freezes the contacts of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
@@ -121,14 +102,14 @@ def lag_contacts(
 
 @wp.kernel
 def friction_rows(
-    x: wp.array2d(dtype=wp.vec3d),
-    start: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
+    start: VecArray2d,
     lagged: Lagged,
     eps: wp.float64,
-    active: wp.array(dtype=wp.int32),
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
+    gradient: VecArray2d,
     out: Contacts,
 ):
     """Friction forces and rows."""
@@ -163,15 +144,15 @@ def friction_rows(
 
 @wp.kernel
 def friction_change(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
-    start: wp.array2d(dtype=wp.vec3d),
+    x0: VecArray2d,
+    x1: VecArray2d,
+    start: VecArray2d,
     lagged: Lagged,
     eps: wp.float64,
-    active: wp.array(dtype=wp.int32),
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    change: wp.array(dtype=wp.float64),
+    change: FloatArray,
 ):
     """Adds the change of the friction potential from x0 to x1 [J]."""
     env, lane = wp.tid()
@@ -185,15 +166,7 @@ def friction_change(
 
 
 @wp.kernel
-def lag_difference(
-    lagged: Lagged,
-    sign: wp.float64,
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    force: wp.array2d(dtype=wp.vec3d),
-    size: wp.array(dtype=wp.float64),
-):
+def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray):
     """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
 
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
@@ -211,13 +184,7 @@ def lag_difference(
 
 
 @wp.kernel
-def clear_change(
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    change: wp.array2d(dtype=wp.vec3d),
-    force: wp.array(dtype=wp.float64),
-    changed: wp.array(dtype=wp.float64),
-):
+def clear_change(active: IntArray, change: VecArray2d, force: FloatArray, changed: FloatArray):
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -228,14 +195,14 @@ def clear_change(
 
 
 @wp.kernel
-def size_of_change(change: wp.array2d(dtype=wp.vec3d), active: wp.array(dtype=wp.int32), size: wp.array2d(dtype=wp.float64)):
+def size_of_change(change: VecArray2d, active: IntArray, size: FloatArray2d):
     env, v = wp.tid()
     if active[env] != 0:
         size[env, v] = wp.length(change[env, v])
 
 
 @wp.kernel
-def share_of_change(force: wp.array(dtype=wp.float64), active: wp.array(dtype=wp.int32), changed: wp.array(dtype=wp.float64)):
+def share_of_change(force: FloatArray, active: IntArray, changed: FloatArray):
     """changed ← changed / Σ μ λ."""
     env = wp.tid()
     if active[env] != 0:

@@ -9,26 +9,19 @@ that a Woodbury update needs. An unmollified pair gives one row, the Gauss-Newto
 gives five: two for the 2×2 Hessian in (distance, c), clamped, and three for the curvature of c.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
-from ipc.contact.distance import edge_edge_coefficients, pair_coefficients, point_triangle_coefficients, separation
-
-__all__ = [
-    "contact_ee",
-    "contact_plane",
-    "contact_pt",
-    "energy_pairs",
-    "energy_plane",
-]
+from ipc.contact.distance import pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,8 +39,11 @@ def mollifier_threshold(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float6
 
 
 @wp.func
-def edge_weight(surface: Surface, a: wp.int32, b: wp.int32) -> wp.float64:
-    return wp.float64(0.25) * (surface.edge_area[a] + surface.edge_area[b])
+def pair_weight(surface: Surface, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+    """Area A [m²] of two edges (``ee``) or of a vertex and a face."""
+    if ee:
+        return wp.float64(0.25) * (surface.edge_area[pair[0]] + surface.edge_area[pair[1]])
+    return wp.float64(0.25) * surface.vert_area[pair[0]]
 
 
 @wp.func
@@ -59,8 +55,8 @@ def scale_of(surface: Surface, kappa: wp.float64) -> wp.float64:
 @wp.func
 def push_simple(
     out: Contacts,
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     env: wp.int32,
     verts: wp.vec4i,
     coef: wp.vec4d,
@@ -87,8 +83,8 @@ def push_simple(
 @wp.func
 def push_mollified(
     out: Contacts,
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     env: wp.int32,
     verts: wp.vec4i,
     coef: wp.vec4d,
@@ -159,84 +155,55 @@ def push_mollified(
 
 
 @wp.kernel
-def contact_pt(
-    x: wp.array2d(dtype=wp.vec3d),
+def contact_pairs(
+    x: VecArray2d,
     surface: Surface,
     candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    ee: wp.bool,
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     out: Contacts,
 ):
-    """Point-triangle pairs."""
+    """Point-triangle or edge-edge (``ee``) pairs; edges are mollified where nearly parallel."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
-    for i in range(lane, pairs_of(candidates, False, env), lanes):
-        item = candidates.pt[env, i]
-        verts = pair_vertices(surface, False, item)
-        p, a, b, c = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        item = pair_at(candidates, ee, env, i)
+        verts = pair_vertices(surface, ee, item)
+        x0, x1, x2, x3 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
         Dh = surface.d_hat * surface.d_hat
-        coef = point_triangle_coefficients(p, a, b, c)
-        t = separation(coef, p, a, b, c)
-        D = wp.length_sq(t)
-        if Dh > D:
-            scale = wp.float64(0.25) * surface.vert_area[verts[0]] * scale_of(surface, kappa[env])
-            push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
-
-
-@wp.kernel
-def contact_ee(
-    x: wp.array2d(dtype=wp.vec3d),
-    surface: Surface,
-    candidates: Candidates,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
-    out: Contacts,
-):
-    """Edge-edge pairs, mollified where they are nearly parallel."""
-    env, lane = wp.tid()
-    if active[env] == 0:
-        return
-    for i in range(lane, pairs_of(candidates, True, env), lanes):
-        item = candidates.ee[env, i]
-        ea, eb = item[0], item[1]
-        verts = pair_vertices(surface, True, item)
-        a0, a1, b0, b1 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
-        Dh = surface.d_hat * surface.d_hat
-        coef = edge_edge_coefficients(a0, a1, b0, b1)
-        t = separation(coef, a0, a1, b0, b1)
+        coef = pair_coefficients(ee, x0, x1, x2, x3)
+        t = separation(coef, x0, x1, x2, x3)
         D = wp.length_sq(t)
         if Dh <= D:
             continue
-        scale = edge_weight(surface, ea, eb) * scale_of(surface, kappa[env])
-        eps = mollifier_threshold(surface, ea, eb)
-        c = cross_squared(a0, a1, b0, b1)
+        scale = pair_weight(surface, ee, item) * scale_of(surface, kappa[env])
+        c, eps = wp.float64(0.0), wp.float64(0.0)
+        if ee:
+            c, eps = cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, item[0], item[1])
         if c >= eps:
             push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
         else:
-            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, a1 - a0, b1 - b0, c, eps, item[2])
+            push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, x1 - x0, x3 - x2, c, eps, item[2])
 
 
 @wp.kernel
 def contact_plane(
-    x: wp.array2d(dtype=wp.vec3d),
+    x: VecArray2d,
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    frame_R: MatArray2d,
+    frame_t: VecArray2d,
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    energy: wp.array(dtype=wp.float64),
+    gradient: VecArray2d,
+    energy: FloatArray,
     out: Contacts,
 ):
     """Points above half-spaces."""
@@ -256,31 +223,31 @@ def contact_plane(
 
 
 @wp.func
-def pair_energy(x: wp.array2d(dtype=wp.vec3d), surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
+def pair_energy(x: VecArray2d, surface: Surface, env: wp.int32, ee: wp.bool, pair: wp.vec3i) -> wp.float64:
     """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
     v = pair_vertices(surface, ee, pair)
     x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
     b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
     if b == wp.float64(0.0):
         return b
+    energy = pair_weight(surface, ee, pair) * b
     if ee:
-        m = mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
-        return edge_weight(surface, pair[0], pair[1]) * b * m
-    return wp.float64(0.25) * surface.vert_area[v[0]] * b
+        energy = energy * mollifier(cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, pair[0], pair[1]))
+    return energy
 
 
 @wp.kernel
 def energy_pairs(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
+    x0: VecArray2d,
+    x1: VecArray2d,
     surface: Surface,
     candidates: Candidates,
     ee: wp.bool,
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    change: wp.array(dtype=wp.float64),
+    change: FloatArray,
 ):
     """Adds the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
     env, lane = wp.tid()
@@ -295,16 +262,16 @@ def energy_pairs(
 
 @wp.kernel
 def energy_plane(
-    x0: wp.array2d(dtype=wp.vec3d),
-    x1: wp.array2d(dtype=wp.vec3d),
+    x0: VecArray2d,
+    x1: VecArray2d,
     surface: Surface,
-    frame_R: wp.array2d(dtype=wp.mat33d),
-    frame_t: wp.array2d(dtype=wp.vec3d),
-    kappa: wp.array(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
+    frame_R: MatArray2d,
+    frame_t: VecArray2d,
+    kappa: FloatArray,
+    active: IntArray,
     lanes: wp.int32,
     # outputs
-    change: wp.array(dtype=wp.float64),
+    change: FloatArray,
 ):
     """Adds the change of the point-plane energy from x0 to x1 [J]."""
     env, lane = wp.tid()

@@ -38,14 +38,7 @@ class TetMesh:
     tets: NDArray[np.integer]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "vertices", np.ascontiguousarray(self.vertices, dtype=np.float64))
-        object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, dtype=np.int32))
-        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
-            raise IpcError(f"vertices have shape {self.vertices.shape}: it must be (N, 3)")
-        if self.tets.ndim != 2 or self.tets.shape[1] != 4 or len(self.tets) == 0:
-            raise IpcError(f"tets have shape {self.tets.shape}: it must be (T, 4) with T ≥ 1")
-        if self.tets.min() < 0 or self.tets.max() >= len(self.vertices):
-            raise IpcError(f"tets name vertices {self.tets.min()} to {self.tets.max()}: there are {len(self.vertices)}")
+        _check_arrays(self, "tets", 4)
         volumes = tet_volumes(self.vertices, self.tets)
         if not (volumes > 0).all():
             bad = int(np.argmin(volumes))
@@ -65,14 +58,22 @@ class TriMesh:
     faces: NDArray[np.integer]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "vertices", np.ascontiguousarray(self.vertices, dtype=np.float64))
-        object.__setattr__(self, "faces", np.ascontiguousarray(self.faces, dtype=np.int32))
-        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
-            raise IpcError(f"vertices have shape {self.vertices.shape}: it must be (N, 3)")
-        if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
-            raise IpcError(f"faces have shape {self.faces.shape}: it must be (F, 3) with F ≥ 1")
-        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise IpcError(f"faces name vertices {self.faces.min()} to {self.faces.max()}: there are {len(self.vertices)}")
+        _check_arrays(self, "faces", 3)
+
+
+def _check_arrays(mesh: TetMesh | TriMesh, cells: Literal["tets", "faces"], corners: int) -> None:
+    """Make a mesh's arrays contiguous float64 and int32; refuse shapes and indices that are wrong."""
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    indices = np.ascontiguousarray(getattr(mesh, cells), dtype=np.int32)
+    object.__setattr__(mesh, "vertices", vertices)
+    object.__setattr__(mesh, cells, indices)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise IpcError(f"vertices have shape {vertices.shape}: it must be (N, 3)")
+    if indices.ndim != 2 or indices.shape[1] != corners or len(indices) == 0:
+        count = cells[0].upper()
+        raise IpcError(f"{cells} have shape {indices.shape}: it must be ({count}, {corners}) with {count} ≥ 1")
+    if indices.min() < 0 or indices.max() >= len(vertices):
+        raise IpcError(f"{cells} name vertices {indices.min()} to {indices.max()}: there are {len(vertices)}")
 
 
 def tet_volumes(vertices: ArrayLike, tets: ArrayLike) -> NDArray[np.float64]:

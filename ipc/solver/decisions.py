@@ -4,37 +4,15 @@ Flags of one element say whether any environment needs a branch; they are the co
 ``halt`` is set (a buffer was too small) nothing is decided and no state changes, so that the iteration can be repeated.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, IntArray
 from ipc.solver.step_state import Decisions, Flags
-
-__all__ = [
-    "after_lag",
-    "after_solve",
-    "choose_advancing",
-    "choose_good",
-    "choose_lagging",
-    "clear_det",
-    "conclude",
-    "conclude_advance",
-    "end_search",
-    "judge_advance",
-    "judge_direction",
-    "judge_energy",
-    "set_done",
-    "set_flags",
-    "start_advance",
-    "start_limit",
-    "start_search",
-    "start_step",
-    "try_advance",
-]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,13 +106,7 @@ def choose_advancing(d: Decisions, f: Flags):
 
 
 @wp.kernel
-def after_solve(
-    iterations: wp.array(dtype=wp.int32),
-    negative: wp.array(dtype=wp.int32),
-    mask: wp.array(dtype=wp.int32),
-    d: Decisions,
-    f: Flags,
-):
+def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Decisions, f: Flags):
     """Counts iterations and asks for a definite matrix after negative curvature."""
     env = wp.tid()
     again = 0
@@ -255,7 +227,7 @@ def start_limit(slack: wp.float64, d: Decisions, f: Flags):
 
 
 @wp.kernel
-def start_search(reach: wp.array(dtype=wp.float64), d: Decisions, f: Flags):
+def start_search(reach: FloatArray, d: Decisions, f: Flags):
     """Starts the line search, which allows for rounding of positions by force × size × 1e-15."""
     env = wp.tid()
     d.trials[env] = 0

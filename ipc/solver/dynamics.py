@@ -4,8 +4,8 @@ Backward Euler minimises ½‖x − x̃‖²_M/h² + potentials with x̃ = x_n +
 in frame coordinates with ỹ = Rᵀ(x̃ − t): there are no fictitious forces, and a bonded vertex is a constant.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -14,24 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, QuatArray2d, VecArray, VecArray2d
 from ipc.solver.frames import VertexMap
-
-__all__ = [
-    "Masses",
-    "advance_nodes",
-    "aim_bodies",
-    "difference",
-    "inertia_change",
-    "inertia_target",
-    "kinetic_energy",
-    "lengths",
-    "new_velocity",
-    "node_gradient",
-    "predict",
-    "restart",
-    "slope_of",
-    "take",
-]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,22 +24,15 @@ wp.set_module_options({"enable_backward": False})
 class Masses:
     """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s²]."""
 
-    row_start: wp.array(dtype=wp.int32)
-    col: wp.array(dtype=wp.int32)
-    mass: wp.array(dtype=wp.float64)
-    inertia: wp.array(dtype=wp.float64)
-    drag: wp.array(dtype=wp.float64)
+    row_start: IntArray
+    col: IntArray
+    mass: FloatArray
+    inertia: FloatArray
+    drag: FloatArray
 
 
 @wp.kernel
-def predict(
-    xw: wp.array2d(dtype=wp.vec3d),
-    v: wp.array2d(dtype=wp.vec3d),
-    acceleration: wp.array(dtype=wp.vec3d),
-    h: wp.float64,
-    # outputs
-    target: wp.array2d(dtype=wp.vec3d),
-):
+def predict(xw: VecArray2d, v: VecArray2d, acceleration: VecArray, h: wp.float64, target: VecArray2d):
     """x̃ of the nodes, world frame."""
     env, i = wp.tid()
     target[env, i] = xw[env, i] + h * v[env, i] + h * h * acceleration[env]
@@ -63,14 +40,14 @@ def predict(
 
 @wp.kernel
 def inertia_target(
-    target: wp.array2d(dtype=wp.vec3d),
-    xw: wp.array2d(dtype=wp.vec3d),
-    R: wp.array2d(dtype=wp.mat33d),
-    t: wp.array2d(dtype=wp.vec3d),
-    node_body: wp.array(dtype=wp.int32),
+    target: VecArray2d,
+    xw: VecArray2d,
+    R: MatArray2d,
+    t: VecArray2d,
+    node_body: IntArray,
     # outputs
-    local_target: wp.array2d(dtype=wp.vec3d),
-    local_start: wp.array2d(dtype=wp.vec3d),
+    local_target: VecArray2d,
+    local_start: VecArray2d,
 ):
     """ỹ and the start position of the nodes in the frames as they are now."""
     env, i = wp.tid()
@@ -81,21 +58,21 @@ def inertia_target(
 
 @wp.kernel
 def node_gradient(
-    y: wp.array2d(dtype=wp.vec3d),
-    local_target: wp.array2d(dtype=wp.vec3d),
-    local_start: wp.array2d(dtype=wp.vec3d),
+    y: VecArray2d,
+    local_target: VecArray2d,
+    local_start: VecArray2d,
     masses: Masses,
     inertia_scale: wp.float64,
-    vert_gradient: wp.array2d(dtype=wp.vec3d),
-    R: wp.array2d(dtype=wp.mat33d),
-    node_body: wp.array(dtype=wp.int32),
-    node_free: wp.array(dtype=wp.int32),
+    vert_gradient: VecArray2d,
+    R: MatArray2d,
+    node_body: IntArray,
+    node_free: IntArray,
     verts: VertexMap,
-    active: wp.array(dtype=wp.int32),
+    active: IntArray,
     # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
-    residual: wp.array2d(dtype=wp.vec3d),
-    force_size: wp.array2d(dtype=wp.float64),
+    gradient: VecArray2d,
+    residual: VecArray2d,
+    force_size: FloatArray2d,
 ):
     """Adds inertia, drag and contact to the elastic gradient.
 
@@ -126,15 +103,15 @@ def node_gradient(
 
 @wp.kernel
 def inertia_change(
-    y0: wp.array2d(dtype=wp.vec3d),
-    y1: wp.array2d(dtype=wp.vec3d),
-    local_target: wp.array2d(dtype=wp.vec3d),
-    local_start: wp.array2d(dtype=wp.vec3d),
+    y0: VecArray2d,
+    y1: VecArray2d,
+    local_target: VecArray2d,
+    local_start: VecArray2d,
     masses: Masses,
     inertia_scale: wp.float64,
-    active: wp.array(dtype=wp.int32),
+    active: IntArray,
     # outputs
-    change: wp.array2d(dtype=wp.float64),
+    change: FloatArray2d,
 ):
     """Change of the inertial and drag energy [J], (y1 − y0)·M((y1 + y0)/2 − ỹ)/h² by node."""
     env, i = wp.tid()
@@ -152,14 +129,7 @@ def inertia_change(
 
 
 @wp.kernel
-def new_velocity(
-    xw_new: wp.array2d(dtype=wp.vec3d),
-    xw: wp.array2d(dtype=wp.vec3d),
-    h: wp.float64,
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    v: wp.array2d(dtype=wp.vec3d),
-):
+def new_velocity(xw_new: VecArray2d, xw: VecArray2d, h: wp.float64, active: IntArray, v: VecArray2d):
     """Velocities at the end of the step, world frame."""
     env, i = wp.tid()
     if active[env] != 0:
@@ -167,12 +137,7 @@ def new_velocity(
 
 
 @wp.kernel
-def kinetic_energy(
-    v: wp.array2d(dtype=wp.vec3d),
-    masses: Masses,
-    # outputs
-    energy: wp.array2d(dtype=wp.float64),
-):
+def kinetic_energy(v: VecArray2d, masses: Masses, energy: FloatArray2d):
     """½ v·M v node by node [J]."""
     env, i = wp.tid()
     f = wp.vec3d()
@@ -182,12 +147,7 @@ def kinetic_energy(
 
 
 @wp.kernel
-def advance_nodes(
-    y: wp.array2d(dtype=wp.vec3d),
-    p: wp.array2d(dtype=wp.vec3d),
-    alpha: wp.array(dtype=wp.float64),
-    y1: wp.array2d(dtype=wp.vec3d),
-):
+def advance_nodes(y: VecArray2d, p: VecArray2d, alpha: FloatArray, y1: VecArray2d):
     """y1 = y + alpha p."""
     env, i = wp.tid()
     y1[env, i] = y[env, i] + alpha[env] * p[env, i]
@@ -195,13 +155,7 @@ def advance_nodes(
 
 @wp.kernel
 def aim_bodies(
-    goal_q: wp.array2d(dtype=wp.quatd),
-    goal_p: wp.array2d(dtype=wp.vec3d),
-    node_drive: wp.array(dtype=wp.float64),
-    node_aim: wp.array(dtype=wp.int32),
-    aim_local: wp.array(dtype=wp.vec3d),
-    # outputs
-    target: wp.array2d(dtype=wp.vec3d),
+    goal_q: QuatArray2d, goal_p: VecArray2d, node_drive: FloatArray, node_aim: IntArray, aim_local: VecArray, target: VecArray2d
 ):
     """x̃ ← (x̃ + s x_aim)/(1 + s), the target of inertia and a drive of strength s together."""
     env, i = wp.tid()
@@ -212,7 +166,7 @@ def aim_bodies(
 
 
 @wp.kernel
-def lengths(p: wp.array2d(dtype=wp.vec3d), residual: wp.array2d(dtype=wp.vec3d), size: wp.array2d(dtype=wp.float64)):
+def lengths(p: VecArray2d, residual: VecArray2d, size: FloatArray2d):
     """‖p‖ node by node [m]; 1e300 where p or the residual is not finite."""
     env, i = wp.tid()
     length = wp.length(p[env, i])
@@ -222,12 +176,7 @@ def lengths(p: wp.array2d(dtype=wp.vec3d), residual: wp.array2d(dtype=wp.vec3d),
 
 
 @wp.kernel
-def restart(
-    right_side: wp.array2d(dtype=wp.vec3d),
-    again: wp.array(dtype=wp.int32),
-    residual: wp.array2d(dtype=wp.vec3d),
-    p: wp.array2d(dtype=wp.vec3d),
-):
+def restart(right_side: VecArray2d, again: IntArray, residual: VecArray2d, p: VecArray2d):
     """Restores the right-hand side and clears the solution."""
     env, i = wp.tid()
     if again[env] != 0:
@@ -236,14 +185,14 @@ def restart(
 
 
 @wp.kernel
-def slope_of(p: wp.array2d(dtype=wp.vec3d), gradient: wp.array2d(dtype=wp.vec3d), slope: wp.array2d(dtype=wp.float64)):
+def slope_of(p: VecArray2d, gradient: VecArray2d, slope: FloatArray2d):
     """g·p node by node [J]; p is zero on bonded nodes."""
     env, i = wp.tid()
     slope[env, i] = wp.dot(p[env, i], gradient[env, i])
 
 
 @wp.kernel
-def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2d(dtype=Any)):
+def take(y1: wp.array2d(dtype=Any), mask: IntArray, y: wp.array2d(dtype=Any)):
     """y = y1 where the mask is set."""
     env, i = wp.tid()
     if mask[env] != 0:
@@ -252,11 +201,11 @@ def take(y1: wp.array2d(dtype=Any), mask: wp.array(dtype=wp.int32), y: wp.array2
 
 # All types at once, so that the module is compiled only once.
 for _type in (wp.vec3d, wp.mat33d):
-    wp.overload(take, [wp.array2d(dtype=_type), wp.array(dtype=wp.int32), wp.array2d(dtype=_type)])
+    wp.overload(take, [wp.array2d(dtype=_type), IntArray, wp.array2d(dtype=_type)])
 
 
 @wp.kernel
-def difference(a: wp.array2d(dtype=wp.vec3d), b: wp.array2d(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec3d)):
+def difference(a: VecArray2d, b: VecArray2d, out: VecArray2d):
     """out = a − b."""
     env, i = wp.tid()
     out[env, i] = a[env, i] - b[env, i]

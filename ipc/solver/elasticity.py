@@ -19,18 +19,17 @@ a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-defi
 the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, VecArray2d
 from ipc.contact.barrier import barrier, barrier_first, barrier_second
 from ipc.solver.dynamics import Masses
-
-__all__ = ["Elements", "block_hessian", "element_energy_change", "element_state", "node_elastic_gradient"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,12 +38,12 @@ wp.set_module_options({"enable_backward": False})
 class Elements:
     """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa]."""
 
-    tets: wp.array2d(dtype=wp.int32)
-    grads: wp.array2d(dtype=wp.vec3d)
-    volume: wp.array(dtype=wp.float64)
-    model: wp.array(dtype=wp.int32)
-    mu: wp.array(dtype=wp.float64)
-    lam: wp.array(dtype=wp.float64)
+    tets: IntArray2d
+    grads: VecArray2d
+    volume: FloatArray
+    model: IntArray
+    mu: FloatArray
+    lam: FloatArray
 
 
 @wp.func
@@ -180,7 +179,7 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
 
 
 @wp.func
-def deformation(env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), elements: Elements) -> wp.mat33d:
+def deformation(env: wp.int32, e: wp.int32, y: VecArray2d, elements: Elements) -> wp.mat33d:
     """F of element e. Differences to corner 0, so that a common translation costs no digits."""
     x0 = y[env, elements.tets[e, 0]]
     F = wp.outer(y[env, elements.tets[e, 1]] - x0, elements.grads[e, 1])
@@ -191,16 +190,16 @@ def deformation(env: wp.int32, e: wp.int32, y: wp.array2d(dtype=wp.vec3d), eleme
 
 @wp.kernel
 def element_state(
-    y: wp.array2d(dtype=wp.vec3d),
+    y: VecArray2d,
     elements: Elements,
-    active: wp.array(dtype=wp.int32),
-    project: wp.array(dtype=wp.int32),
+    active: IntArray,
+    project: IntArray,
     # outputs
-    el_F: wp.array2d(dtype=wp.mat33d),
-    el_P: wp.array2d(dtype=wp.mat33d),
-    el_mck: wp.array2d(dtype=wp.vec3d),
-    el_J: wp.array2d(dtype=wp.float64),
-    el_energy: wp.array2d(dtype=wp.float64),
+    el_F: MatArray2d,
+    el_P: MatArray2d,
+    el_mck: VecArray2d,
+    el_J: FloatArray2d,
+    el_energy: FloatArray2d,
 ):
     """F, volume·P, (m, c', k), J and energy [J] of every element of the active environments."""
     env, e = wp.tid()
@@ -220,13 +219,7 @@ def element_state(
 
 @wp.kernel
 def node_elastic_gradient(
-    corner_start: wp.array(dtype=wp.int32),
-    corner: wp.array(dtype=wp.int32),
-    elements: Elements,
-    el_P: wp.array2d(dtype=wp.mat33d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    gradient: wp.array2d(dtype=wp.vec3d),
+    corner_start: IntArray, corner: IntArray, elements: Elements, el_P: MatArray2d, active: IntArray, gradient: VecArray2d
 ):
     """∂Ψ/∂y of every node [N], body frame; gathered, so the order of the sum never changes."""
     env, i = wp.tid()
@@ -241,17 +234,17 @@ def node_elastic_gradient(
 
 @wp.kernel
 def block_hessian(
-    upper: wp.array2d(dtype=wp.int32),
-    part_start: wp.array(dtype=wp.int32),
-    part: wp.array(dtype=wp.int32),
+    upper: IntArray2d,
+    part_start: IntArray,
+    part: IntArray,
     elements: Elements,
     masses: Masses,
     inertia_scale: wp.float64,
-    el_F: wp.array2d(dtype=wp.mat33d),
-    el_mck: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
+    el_F: MatArray2d,
+    el_mck: VecArray2d,
+    active: IntArray,
     # outputs
-    blocks: wp.array2d(dtype=wp.mat33d),
+    blocks: MatArray2d,
 ):
     """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements.
 
@@ -291,13 +284,7 @@ def block_hessian(
 
 @wp.kernel
 def element_energy_change(
-    y0: wp.array2d(dtype=wp.vec3d),
-    y1: wp.array2d(dtype=wp.vec3d),
-    elements: Elements,
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    change: wp.array2d(dtype=wp.float64),
-    det: wp.array2d(dtype=wp.float64),
+    y0: VecArray2d, y1: VecArray2d, elements: Elements, active: IntArray, change: FloatArray2d, det: FloatArray2d
 ):
     """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; sums of differences keep digits."""
     env, e = wp.tid()

@@ -3,24 +3,14 @@
 Nodes are unknowns, in the frame of their body; vertices are surface points, in the world.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
-__all__ = [
-    "VertexMap",
-    "compare_frames",
-    "frames_at",
-    "lift_grips",
-    "node_world",
-    "place_grips",
-    "vertex_motion",
-    "vertex_positions",
-]
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, QuatArray2d, VecArray, VecArray2d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,27 +19,27 @@ wp.set_module_options({"enable_backward": False})
 class VertexMap:
     """Nodes that vertices follow, and the inverse; see :class:`ipc.bodies.layout.Layout`."""
 
-    body: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    nodes: wp.array2d(dtype=wp.int32)
-    weight: wp.array2d(dtype=wp.float64)
-    local: wp.array(dtype=wp.vec3d)
-    follower_start: wp.array(dtype=wp.int32)
-    follower: wp.array(dtype=wp.int32)
-    follower_weight: wp.array(dtype=wp.float64)
+    body: IntArray
+    count: IntArray
+    nodes: IntArray2d
+    weight: FloatArray2d
+    local: VecArray
+    follower_start: IntArray
+    follower: IntArray
+    follower_weight: FloatArray
 
 
 @wp.kernel
 def frames_at(
-    start_q: wp.array2d(dtype=wp.quatd),
-    start_p: wp.array2d(dtype=wp.vec3d),
-    end_q: wp.array2d(dtype=wp.quatd),
-    end_p: wp.array2d(dtype=wp.vec3d),
-    progress: wp.array(dtype=wp.float64),
+    start_q: QuatArray2d,
+    start_p: VecArray2d,
+    end_q: QuatArray2d,
+    end_p: VecArray2d,
+    progress: FloatArray,
     # outputs
-    R: wp.array2d(dtype=wp.mat33d),
-    t: wp.array2d(dtype=wp.vec3d),
-    now_q: wp.array2d(dtype=wp.quatd),
+    R: MatArray2d,
+    t: VecArray2d,
+    now_q: QuatArray2d,
 ):
     """Frames at a share of the motion: positions on a line, rotations on the shorter arc."""
     env, b = wp.tid()
@@ -75,13 +65,7 @@ def frames_at(
 
 @wp.kernel
 def compare_frames(
-    frame_q: wp.array2d(dtype=wp.quatd),
-    frame_p: wp.array2d(dtype=wp.vec3d),
-    goal_q: wp.array2d(dtype=wp.quatd),
-    goal_p: wp.array2d(dtype=wp.vec3d),
-    moves: wp.array(dtype=wp.int32),
-    # outputs
-    progress: wp.array(dtype=wp.float64),
+    frame_q: QuatArray2d, frame_p: VecArray2d, goal_q: QuatArray2d, goal_p: VecArray2d, moves: IntArray, progress: FloatArray
 ):
     """progress = 0 where a frame has to move, else 1."""
     env = wp.tid()
@@ -95,14 +79,7 @@ def compare_frames(
 
 
 @wp.kernel
-def vertex_positions(
-    y: wp.array2d(dtype=wp.vec3d),
-    R: wp.array2d(dtype=wp.mat33d),
-    t: wp.array2d(dtype=wp.vec3d),
-    verts: VertexMap,
-    # outputs
-    x: wp.array2d(dtype=wp.vec3d),
-):
+def vertex_positions(y: VecArray2d, R: MatArray2d, t: VecArray2d, verts: VertexMap, x: VecArray2d):
     """World positions of the vertices."""
     env, v = wp.tid()
     local = wp.vec3d()
@@ -114,13 +91,7 @@ def vertex_positions(
 
 
 @wp.kernel
-def vertex_motion(
-    p: wp.array2d(dtype=wp.vec3d),
-    R: wp.array2d(dtype=wp.mat33d),
-    verts: VertexMap,
-    # outputs
-    dx: wp.array2d(dtype=wp.vec3d),
-):
+def vertex_motion(p: VecArray2d, R: MatArray2d, verts: VertexMap, dx: VecArray2d):
     """World displacements of the vertices for the node displacements p."""
     env, v = wp.tid()
     local = wp.vec3d()
@@ -130,14 +101,7 @@ def vertex_motion(
 
 
 @wp.kernel
-def node_world(
-    y: wp.array2d(dtype=wp.vec3d),
-    R: wp.array2d(dtype=wp.mat33d),
-    t: wp.array2d(dtype=wp.vec3d),
-    node_body: wp.array(dtype=wp.int32),
-    # outputs
-    xw: wp.array2d(dtype=wp.vec3d),
-):
+def node_world(y: VecArray2d, R: MatArray2d, t: VecArray2d, node_body: IntArray, xw: VecArray2d):
     """World positions of the nodes."""
     env, i = wp.tid()
     xw[env, i] = R[env, node_body[i]] * y[env, i] + t[env, node_body[i]]
@@ -145,14 +109,14 @@ def node_world(
 
 @wp.kernel
 def place_grips(
-    grip_node: wp.array(dtype=wp.int32),
-    grip_frame: wp.array(dtype=wp.int32),
-    grip_local: wp.array(dtype=wp.vec3d),
-    node_body: wp.array(dtype=wp.int32),
-    R: wp.array2d(dtype=wp.mat33d),
-    t: wp.array2d(dtype=wp.vec3d),
+    grip_node: IntArray,
+    grip_frame: IntArray,
+    grip_local: VecArray,
+    node_body: IntArray,
+    R: MatArray2d,
+    t: VecArray2d,
     # outputs
-    y: wp.array2d(dtype=wp.vec3d),
+    y: VecArray2d,
 ):
     """Positions y of gripped nodes, moved by their grip, in the frame of their body."""
     env, g = wp.tid()
@@ -163,13 +127,7 @@ def place_grips(
 
 
 @wp.kernel
-def lift_grips(
-    grip_node: wp.array(dtype=wp.int32),
-    y: wp.array2d(dtype=wp.vec3d),
-    y1: wp.array2d(dtype=wp.vec3d),
-    # outputs
-    lift: wp.array2d(dtype=wp.vec3d),
-):
+def lift_grips(grip_node: IntArray, y: VecArray2d, y1: VecArray2d, lift: VecArray2d):
     """lift = y1 − y of the gripped nodes."""
     env, g = wp.tid()
     lift[env, grip_node[g]] = y1[env, grip_node[g]] - y[env, grip_node[g]]

@@ -4,8 +4,8 @@ Products with it, its diagonal, and approximations of its inverse. Everything he
 dimensions, counts are read on the device.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ipc.arrays import FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.frames import VertexMap
 
@@ -43,15 +44,15 @@ class SystemView:
     read neighbouring blocks (Monakov et al. 2010, sliced ELLPACK); with a stride of 1 the rows lie one after the other.
     """
 
-    row_base: wp.array(dtype=wp.int32)
-    row_length: wp.array(dtype=wp.int32)
+    row_base: IntArray
+    row_length: IntArray
     stride: wp.int32
-    col: wp.array(dtype=wp.int32)
-    diagonal: wp.array(dtype=wp.int32)
-    free: wp.array(dtype=wp.int32)
+    col: IntArray
+    diagonal: IntArray
+    free: IntArray
     verts: VertexMap
-    blocks: wp.array2d(dtype=wp.mat33d)
-    R: wp.array2d(dtype=wp.mat33d)
+    blocks: MatArray2d
+    R: MatArray2d
 
 
 def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -73,7 +74,7 @@ def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int
 
 
 @wp.func
-def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: wp.array2d(dtype=wp.vec3d)) -> wp.vec3d:
+def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: VecArray2d) -> wp.vec3d:
     """Row i of blocks · p."""
     f = wp.vec3d()
     k = system.row_base[i]
@@ -85,13 +86,7 @@ def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: wp.array2d(dtyp
 
 @wp.kernel
 def multiply_blocks(
-    system: SystemView,
-    p: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    threads: wp.int32,
-    # outputs
-    out: wp.array2d(dtype=wp.vec3d),
-    partial: wp.array2d(dtype=wp.float64),
+    system: SystemView, p: VecArray2d, active: IntArray, threads: wp.int32, out: VecArray2d, partial: FloatArray2d
 ):
     """out = blocks p on the unknowns, else 0, and shares of p·out; threads (B, chunks, n)."""
     env, c, lane = wp.tid()
@@ -112,7 +107,7 @@ def row_column(row: mat34d, k: wp.int32) -> wp.vec3d:
 
 
 @wp.func
-def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, p: wp.array2d(dtype=wp.vec3d)) -> wp.float64:
+def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, p: VecArray2d) -> wp.float64:
     """q·p with node motions p in their bodies' frames."""
     s = wp.float64(0.0)
     for k in range(4):
@@ -127,7 +122,7 @@ def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
 
 
 @wp.func
-def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, s: wp.float64, out: wp.array2d(dtype=wp.vec3d)):
+def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, s: wp.float64, out: VecArray2d):
     """out += s q on the unknowns."""
     for k in range(4):
         v = verts[k]
@@ -141,14 +136,7 @@ def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
 
 
 @wp.func
-def add_row(
-    system: SystemView,
-    contacts: Contacts,
-    env: wp.int32,
-    r: wp.int32,
-    p: wp.array2d(dtype=wp.vec3d),
-    out: wp.array2d(dtype=wp.vec3d),
-) -> wp.float64:
+def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d) -> wp.float64:
     """out += q (q·p) of row r, on the unknowns; returns (q·p)²."""
     verts, row = contacts.row_verts[env, r], contacts.row[env, r]
     s = row_motion(system, verts, row, env, p)
@@ -160,13 +148,13 @@ def add_row(
 def multiply_rows(
     system: SystemView,
     contacts: Contacts,
-    p: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
+    p: VecArray2d,
+    active: IntArray,
     lanes: wp.int32,
     threads: wp.int32,
     # outputs
-    out: wp.array2d(dtype=wp.vec3d),
-    partial: wp.array2d(dtype=wp.float64),
+    out: VecArray2d,
+    partial: FloatArray2d,
 ):
     """out += Σ q (q·p), and the shares of Σ (q·p)²; bonded nodes have p = 0 and get nothing.
 
@@ -182,15 +170,7 @@ def multiply_rows(
 
 
 @wp.kernel
-def push_rows(
-    system: SystemView,
-    contacts: Contacts,
-    dx: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    residual: wp.array2d(dtype=wp.vec3d),
-):
+def push_rows(system: SystemView, contacts: Contacts, dx: VecArray2d, active: IntArray, lanes: wp.int32, residual: VecArray2d):
     """residual −= Σ q (q·dx) with vertex motions dx in the world, on the unknowns."""
     env, lane = wp.tid()
     if active[env] == 0:
@@ -205,13 +185,7 @@ def push_rows(
 
 
 @wp.kernel
-def push_blocks(
-    system: SystemView,
-    lift: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    residual: wp.array2d(dtype=wp.vec3d),
-):
+def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual: VecArray2d):
     """residual −= blocks · lift on the unknowns, for the prescribed motion of gripped nodes."""
     env, i = wp.tid()
     if active[env] != 0 and system.free[i] != 0:
@@ -219,21 +193,14 @@ def push_blocks(
 
 
 @wp.kernel
-def diagonal_blocks(system: SystemView, active: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.mat33d)):
+def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
     env, i = wp.tid()
     if active[env] != 0:
         out[env, i] = system.blocks[env, system.diagonal[i]]
 
 
 @wp.kernel
-def diagonal_rows(
-    system: SystemView,
-    contacts: Contacts,
-    active: wp.array(dtype=wp.int32),
-    lanes: wp.int32,
-    # outputs
-    out: wp.array2d(dtype=wp.mat33d),
-):
+def diagonal_rows(system: SystemView, contacts: Contacts, active: IntArray, lanes: wp.int32, out: MatArray2d):
     """Adds the diagonal blocks of Σ q qᵀ."""
     env, lane = wp.tid()
     if active[env] == 0:
@@ -250,7 +217,7 @@ def diagonal_rows(
 
 
 @wp.kernel
-def invert_blocks(free: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int32), blocks: wp.array2d(dtype=wp.mat33d)):
+def invert_blocks(free: IntArray, active: IntArray, blocks: MatArray2d):
     """Inverts in place; one that is not positive becomes the inverse of its mean diagonal."""
     env, i = wp.tid()
     if active[env] == 0:
@@ -270,12 +237,7 @@ def invert_blocks(free: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.int3
 
 
 @wp.kernel
-def apply_blocks(
-    inverse: wp.array2d(dtype=wp.mat33d),
-    r: wp.array2d(dtype=wp.vec3d),
-    running: wp.array(dtype=wp.int32),
-    z: wp.array2d(dtype=wp.vec3d),
-):
+def apply_blocks(inverse: MatArray2d, r: VecArray2d, running: IntArray, z: VecArray2d):
     env, i = wp.tid()
     if running[env] != 0:
         z[env, i] = inverse[env, i] * r[env, i]

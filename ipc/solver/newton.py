@@ -41,13 +41,7 @@ __all__ = ["Newton"]
 
 
 class Newton:
-    """The step of a batch.
-
-    Args:
-        potential: state and energy; the step moves its state.
-        layout: the flat arrays.
-        settings: how to step.
-    """
+    """The step of a batch; it moves the state of ``potential``."""
 
     def __init__(self, potential: Potential, layout: Layout, settings: Settings) -> None:
         self.potential, self.settings = potential, settings

@@ -5,8 +5,8 @@ environment itself instead of waiting for a launch that does. On a CPU a block i
 a CPU, go to :mod:`ipc.solver.pcg_block`.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from ipc.arrays import FloatArray2d, IntArray, VecArray2d
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, multiply_blocks, multiply_rows
@@ -33,15 +34,7 @@ ONE_BLOCK_TOTAL = 600_000
 
 
 @wp.kernel
-def dots(
-    r: wp.array2d(dtype=wp.vec3d),
-    z: wp.array2d(dtype=wp.vec3d),
-    running: wp.array(dtype=wp.int32),
-    threads: wp.int32,
-    # outputs
-    rr: wp.array2d(dtype=wp.float64),
-    rz: wp.array2d(dtype=wp.float64),
-):
+def dots(r: VecArray2d, z: VecArray2d, running: IntArray, threads: wp.int32, rr: FloatArray2d, rz: FloatArray2d):
     """Shares of r·r and r·z; blocks of threads (B, chunks, ``threads``)."""
     env, c, lane = wp.tid()
     a, b = wp.float64(0.0), wp.float64(0.0)
@@ -54,16 +47,7 @@ def dots(
 
 
 @wp.kernel
-def start(
-    z: wp.array2d(dtype=wp.vec3d),
-    rr: wp.array2d(dtype=wp.float64),
-    rz: wp.array2d(dtype=wp.float64),
-    active: wp.array(dtype=wp.int32),
-    # outputs
-    s: Scalars,
-    p: wp.array2d(dtype=wp.vec3d),
-    running: wp.array(dtype=wp.int32),
-):
+def start(z: VecArray2d, rr: FloatArray2d, rz: FloatArray2d, active: IntArray, s: Scalars, p: VecArray2d, running: IntArray):
     """p = z, and which environments have anything to solve."""
     env, i = wp.tid()
     if active[env] == 0:
@@ -84,16 +68,16 @@ def start(
 
 @wp.kernel
 def update_iterate(
-    p: wp.array2d(dtype=wp.vec3d),
-    Ap: wp.array2d(dtype=wp.vec3d),
-    by_blocks: wp.array2d(dtype=wp.float64),
-    by_rows: wp.array2d(dtype=wp.float64),
+    p: VecArray2d,
+    Ap: VecArray2d,
+    by_blocks: FloatArray2d,
+    by_rows: FloatArray2d,
     parity: wp.int32,
     # outputs
     s: Scalars,
-    running: wp.array(dtype=wp.int32),
-    x: wp.array2d(dtype=wp.vec3d),
-    r: wp.array2d(dtype=wp.vec3d),
+    running: IntArray,
+    x: VecArray2d,
+    r: VecArray2d,
 ):
     """x += α p, r −= α H p with α = r·z / p·Hp, the same in every thread of an environment."""
     env, i = wp.tid()
@@ -115,16 +99,16 @@ def update_iterate(
 
 @wp.kernel
 def next_direction(
-    z: wp.array2d(dtype=wp.vec3d),
-    rr: wp.array2d(dtype=wp.float64),
-    rz: wp.array2d(dtype=wp.float64),
+    z: VecArray2d,
+    rr: FloatArray2d,
+    rz: FloatArray2d,
     parity: wp.int32,
     tolerance: wp.float64,
     max_iterations: wp.int32,
     # outputs
     s: Scalars,
-    running: wp.array(dtype=wp.int32),
-    p: wp.array2d(dtype=wp.vec3d),
+    running: IntArray,
+    p: VecArray2d,
 ):
     """p = z + β p, unless ‖r‖ is small enough or the iterations are used up."""
     env, i = wp.tid()
@@ -145,10 +129,8 @@ class Pcg:
     """Preconditioned conjugate gradients (Hestenes, Stiefel 1952).
 
     Args:
-        batch: environments, B.
-        nodes: unknowns of each, N, three numbers each.
+        batch, nodes: environments, B, and unknowns of each, N, three numbers each.
         lanes: threads that share the contact rows of an environment.
-        device: Warp device.
     """
 
     def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:

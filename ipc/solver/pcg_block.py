@@ -5,14 +5,15 @@ multiprocessor's bandwidth, so a single large system is better served by the lau
 thread, which does everything in order: Warp's own conjugate gradients take 10 ms there for one dot product of 9,450 numbers.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.linear import SystemView, add_row, block_row
 
@@ -28,10 +29,10 @@ THREADS = 256
 class Scalars:
     """r·z of even and odd iterations, ‖r‖² at the start, iterations, negative curvature."""
 
-    rz: wp.array2d(dtype=wp.float64)
-    rr0: wp.array(dtype=wp.float64)
-    iterations: wp.array(dtype=wp.int32)
-    negative: wp.array(dtype=wp.int32)
+    rz: FloatArray2d
+    rr0: FloatArray
+    iterations: IntArray
+    negative: IntArray
 
 
 @wp.func_native("""
@@ -39,7 +40,9 @@ class Scalars:
     __syncthreads();
 #endif
 """)
-def wait_for_block(): ...
+def wait_for_block():
+    """Every thread's writes are there for the whole block after this; on a CPU a block is one."""
+    ...
 
 
 @wp.func
@@ -52,17 +55,17 @@ def block_sum(value: wp.float64) -> wp.float64:
 def solve_in_one_block(
     system: SystemView,
     contacts: Contacts,
-    inverse: wp.array2d(dtype=wp.mat33d),
+    inverse: MatArray2d,
     tolerance: wp.float64,
     max_iterations: wp.int32,
     threads: wp.int32,
     lanes: wp.int32,
-    active: wp.array(dtype=wp.int32),
-    p: wp.array2d(dtype=wp.vec3d),
-    Ap: wp.array2d(dtype=wp.vec3d),
+    active: IntArray,
+    p: VecArray2d,
+    Ap: VecArray2d,
     # outputs
-    r: wp.array2d(dtype=wp.vec3d),
-    x: wp.array2d(dtype=wp.vec3d),
+    r: VecArray2d,
+    x: VecArray2d,
     s: Scalars,
 ):
     """``threads`` work on an environment, ``lanes`` of them on its contact rows; CPU: 1."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ipc.arrays import filled
 from ipc.bodies.layout import Layout
 from ipc.contact.collision import Collision
 from ipc.reduce import MAX, MIN, SUM, Reducer
@@ -30,11 +31,8 @@ class Potential:
     """State and work space of a batch, and the launches that evaluate them.
 
     Args:
-        layout: the flat arrays.
-        settings: how to step.
-        batch: number of environments.
+        batch: number of environments, B.
         d_hat: [m].    kappa: [Pa].
-        device: Warp device.
     """
 
     def __init__(self, layout: Layout, settings: Settings, batch: int, d_hat: float, kappa: float, device: wp.Device) -> None:
@@ -60,20 +58,16 @@ class Potential:
         self.collision = Collision(layout, batch, d_hat, d_hat, settings.deterministic, device, settings.broad_phase)
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
-        self.elements = elasticity.Elements()
-        self.elements.tets, self.elements.model = ints(layout.tets), ints(layout.model)
-        self.elements.grads = wp.array(layout.grads, dtype=wp.vec3d, device=device)
-        self.elements.volume, self.elements.mu, self.elements.lam = floats(layout.volume), floats(layout.mu), floats(layout.lam)
+        self.elements = filled(elasticity.Elements, device, {name: getattr(layout, name) for name in elasticity.Elements.vars})
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
         self.dt = settings.dt
         self._damping = np.zeros(len(layout.col))
         self._damping[diagonal] = layout.node_damping
-        self.masses = dynamics.Masses()
-        self.masses.row_start, self.masses.col = ints(layout.row_start), ints(layout.col)
-        self.masses.mass, self.masses.drag = floats(layout.mass), floats(self._damping / self.dt)
-        self.masses.inertia = floats(layout.mass * (1.0 + layout.node_drive[rows]))
+        pattern = {"row_start": layout.row_start, "col": layout.col, "mass": layout.mass}
+        inertia = layout.mass * (1.0 + layout.node_drive[rows])
+        self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": self._damping / self.dt})
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
         self.driven = bool((layout.node_aim >= 0).any())
         self.grips = len(layout.grip_node)
@@ -84,16 +78,9 @@ class Potential:
         self.frame_moves = ints(layout.frame_moves)
         self.part_start, self.part = ints(layout.part_start), ints(layout.part)
         self.corner_start, self.corner = ints(layout.corner_start), ints(layout.corner)
-        self.verts = frames.VertexMap()
-        self.verts.body, self.verts.count, self.verts.nodes = (
-            ints(layout.vert_body),
-            ints(layout.vert_count),
-            ints(layout.vert_nodes),
-        )
-        self.verts.weight = floats(layout.vert_weight)
-        self.verts.local = wp.array(layout.vert_local, dtype=wp.vec3d, device=device)
-        self.verts.follower_start, self.verts.follower = ints(layout.node_vert_start), ints(layout.node_vert)
-        self.verts.follower_weight = floats(layout.node_vert_weight)
+        followed = {name: getattr(layout, f"vert_{name}") for name in ("body", "count", "nodes", "weight", "local")}
+        followers = {f"follower{name}": getattr(layout, f"node_vert{name}") for name in ("_start", "", "_weight")}
+        self.verts = filled(frames.VertexMap, device, followed | followers)
 
         # State: node positions in their bodies' frames, world velocities, frames as they are, and their goals.
         self.y, self.v = vectors(nodes), vectors(nodes)
@@ -115,7 +102,6 @@ class Potential:
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
-        self.system = SystemView()
         width = _SLICE if device.is_cuda else 1
         base, self.where = slice_rows(layout.row_start, width)
         columns = np.zeros(int(self.where.max()) + 1, np.int32)
@@ -123,10 +109,9 @@ class Potential:
         above = np.flatnonzero(layout.col >= rows)
         mirror = np.searchsorted(rows * nodes + layout.col, layout.col[above].astype(np.int64) * nodes + rows[above])
         self.upper = ints(np.stack([above, self.where[above], self.where[mirror]], axis=1))
-        self.system.row_base, self.system.row_length = ints(base), ints(np.diff(layout.row_start))
-        self.system.stride = width
-        self.system.col, self.system.diagonal = ints(columns), ints(self.where[diagonal])
-        self.system.free = self.node_free
+        rows_at = {"row_base": base, "row_length": np.diff(layout.row_start)}
+        self.system = filled(SystemView, device, {**rows_at, "col": columns, "diagonal": self.where[diagonal]})
+        self.system.stride, self.system.free = width, self.node_free
         self.system.verts = self.verts
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R

@@ -1,7 +1,6 @@
 """The state of a step: the decisions of each environment, and flags made from them."""
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -12,6 +11,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ipc.arrays import FloatArray, IntArray
+
 __all__ = ["Decisions", "Flags", "StepState"]
 
 wp.set_module_options({"enable_backward": False})
@@ -21,64 +22,64 @@ wp.set_module_options({"enable_backward": False})
 class Decisions:
     """Arrays (B,), one element an environment. Masks and marks are 0 or 1."""
 
-    alive: wp.array(dtype=wp.int32)  # takes part in this step
-    active: wp.array(dtype=wp.int32)  # is being minimised
-    pending: wp.array(dtype=wp.int32)  # came to rest, or begins: its friction is to be lagged
-    lagging: wp.array(dtype=wp.int32)  # its friction is lagged now
-    advancing: wp.array(dtype=wp.int32)  # its frames advance in this iteration
-    plain: wp.array(dtype=wp.int32)  # takes an ordinary Newton step in this iteration
-    again: wp.array(dtype=wp.int32)  # solves again with a definite matrix
-    shorten: wp.array(dtype=wp.int32)  # still looks for the length of its advance
-    attempts: wp.array(dtype=wp.int32)  # at that length
-    searching: wp.array(dtype=wp.int32)  # still looks for the length of its Newton step
-    trials: wp.array(dtype=wp.int32)  # of that length
-    accepted: wp.array(dtype=wp.int32)  # changes state now
-    pcg_iterations: wp.array(dtype=wp.int32)  # in this Newton iteration
-    poor: wp.array(dtype=wp.int32)  # its frames hardly advanced: plain iterations until the unknowns rest, then one more try
-    rested: wp.array(dtype=wp.int32)  # its unknowns came to rest since the last advance
-    ready: wp.array(dtype=wp.int32)  # took a plain step since the last advance
-    since_lag: wp.array(dtype=wp.int32)  # iterations since friction was lagged
-    good: wp.array(dtype=wp.int32)  # ends the step with a new state
-    failed: wp.array(dtype=wp.int32)
-    converged: wp.array(dtype=wp.int32)
-    stalled: wp.array(dtype=wp.int32)
-    newton: wp.array(dtype=wp.int32)
-    linear: wp.array(dtype=wp.int32)
-    line_search: wp.array(dtype=wp.int32)
-    relags: wp.array(dtype=wp.int32)  # −1 before friction was lagged for the first time
-    project: wp.array(dtype=wp.int32)  # its Hessian is made definite
-    progress: wp.array(dtype=wp.float64)  # share of the frames' motion that is done
-    trial_progress: wp.array(dtype=wp.float64)  # where the advance that is tried would end
-    length: wp.array(dtype=wp.float64)  # of an advance, as a share of what remains
-    alpha: wp.array(dtype=wp.float64)  # length of the step that is tried
-    allowed: wp.array(dtype=wp.float64)  # by continuous collision detection
-    slope: wp.array(dtype=wp.float64)
-    change: wp.array(dtype=wp.float64)  # of the energy
-    noise: wp.array(dtype=wp.float64)  # of the energy, by rounding
-    trial_det: wp.array(dtype=wp.float64)  # least det F of the step that is tried
-    size: wp.array(dtype=wp.float64)  # of the Newton step
-    slack: wp.array(dtype=wp.float64)  # share of a gap that has to stay
-    floor: wp.array(dtype=wp.float64)  # gap that has to stay
-    changed: wp.array(dtype=wp.float64)  # share of the friction forces that the last lag changed
-    speed: wp.array(dtype=wp.float64)
-    ccd: wp.array(dtype=wp.float64)
-    min_gap: wp.array(dtype=wp.float64)
-    min_det: wp.array(dtype=wp.float64)
+    alive: IntArray  # takes part in this step
+    active: IntArray  # is being minimised
+    pending: IntArray  # came to rest, or begins: its friction is to be lagged
+    lagging: IntArray  # its friction is lagged now
+    advancing: IntArray  # its frames advance in this iteration
+    plain: IntArray  # takes an ordinary Newton step in this iteration
+    again: IntArray  # solves again with a definite matrix
+    shorten: IntArray  # still looks for the length of its advance
+    attempts: IntArray  # at that length
+    searching: IntArray  # still looks for the length of its Newton step
+    trials: IntArray  # of that length
+    accepted: IntArray  # changes state now
+    pcg_iterations: IntArray  # in this Newton iteration
+    poor: IntArray  # its frames hardly advanced: plain iterations until the unknowns rest, then one more try
+    rested: IntArray  # its unknowns came to rest since the last advance
+    ready: IntArray  # took a plain step since the last advance
+    since_lag: IntArray  # iterations since friction was lagged
+    good: IntArray  # ends the step with a new state
+    failed: IntArray
+    converged: IntArray
+    stalled: IntArray
+    newton: IntArray
+    linear: IntArray
+    line_search: IntArray
+    relags: IntArray  # −1 before friction was lagged for the first time
+    project: IntArray  # its Hessian is made definite
+    progress: FloatArray  # share of the frames' motion that is done
+    trial_progress: FloatArray  # where the advance that is tried would end
+    length: FloatArray  # of an advance, as a share of what remains
+    alpha: FloatArray  # length of the step that is tried
+    allowed: FloatArray  # by continuous collision detection
+    slope: FloatArray
+    change: FloatArray  # of the energy
+    noise: FloatArray  # of the energy, by rounding
+    trial_det: FloatArray  # least det F of the step that is tried
+    size: FloatArray  # of the Newton step
+    slack: FloatArray  # share of a gap that has to stay
+    floor: FloatArray  # gap that has to stay
+    changed: FloatArray  # share of the friction forces that the last lag changed
+    speed: FloatArray
+    ccd: FloatArray
+    min_gap: FloatArray
+    min_det: FloatArray
 
 
 @wp.struct
 class Flags:
     """Arrays of one element each."""
 
-    halt: wp.array(dtype=wp.int32)
-    go: wp.array(dtype=wp.int32)
-    pending: wp.array(dtype=wp.int32)
-    advance: wp.array(dtype=wp.int32)
-    again: wp.array(dtype=wp.int32)
-    shorten: wp.array(dtype=wp.int32)
-    plain: wp.array(dtype=wp.int32)
-    search: wp.array(dtype=wp.int32)
-    done: wp.array(dtype=wp.int32)
+    halt: IntArray
+    go: IntArray
+    pending: IntArray
+    advance: IntArray
+    again: IntArray
+    shorten: IntArray
+    plain: IntArray
+    search: IntArray
+    done: IntArray
 
 
 class StepState:

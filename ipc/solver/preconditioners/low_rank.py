@@ -10,16 +10,18 @@ in double precision by one block of threads an environment. An environment with 
 one that does not fit: with part of its contacts the identity is of little use.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
 import warp as wp
 
+from ipc.arrays import IntArray, IntArray2d, MatArray2d, SingleArray2d, SingleArray3d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
+from ipc.solver.pcg_block import wait_for_block
 
 __all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
 
@@ -29,16 +31,6 @@ REGULAR = 1e-6
 """Stiffness added to every contact node, as a share of its elastic one."""
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_lanes():
-    """Every lane's writes are there for all lanes after this; on a CPU there is one lane."""
-    ...
 
 
 @wp.struct
@@ -51,13 +43,13 @@ class Rest:
     """
 
     inverse: wp.array(dtype=wp.float32)
-    start: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int32)
-    width: wp.array(dtype=wp.int32)
-    unknown: wp.array(dtype=wp.int32)
-    part: wp.array(dtype=wp.int32)
-    surface: wp.array(dtype=wp.int32)
-    surface_node: wp.array(dtype=wp.int32)
+    start: IntArray
+    first: IntArray
+    width: IntArray
+    unknown: IntArray
+    part: IntArray
+    surface: IntArray
+    surface_node: IntArray
 
 
 @wp.struct
@@ -70,16 +62,16 @@ class Small:
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
     """
 
-    touched: wp.array2d(dtype=wp.int32)
-    slot: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    node: wp.array2d(dtype=wp.int32)
+    touched: IntArray2d
+    slot: IntArray2d
+    count: IntArray
+    node: IntArray2d
     a: wp.array3d(dtype=wp.mat33d)
-    row: wp.array2d(dtype=wp.mat33d)
-    column: wp.array2d(dtype=wp.mat33d)
-    w: wp.array3d(dtype=wp.float32)
-    t: wp.array2d(dtype=wp.float32)
-    force: wp.array2d(dtype=wp.float32)
+    row: MatArray2d
+    column: MatArray2d
+    w: SingleArray3d
+    t: SingleArray2d
+    force: SingleArray2d
 
 
 @wp.func
@@ -95,7 +87,7 @@ def fits(small: Small, env: wp.int32) -> wp.bool:
 
 
 @wp.kernel
-def forget_contacts(active: wp.array(dtype=wp.int32), small: Small):
+def forget_contacts(active: IntArray, small: Small):
     env, s = wp.tid()
     if active[env] == 0:
         return
@@ -115,9 +107,7 @@ def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def mark_contacts(
-    system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small
-):
+def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """Marks the surface nodes that the rows act on."""
     env, lane = wp.tid()
     if active[env] == 0:
@@ -131,7 +121,7 @@ def mark_contacts(
 
 
 @wp.kernel
-def place_contacts(rest: Rest, active: wp.array(dtype=wp.int32), small: Small):
+def place_contacts(rest: Rest, active: IntArray, small: Small):
     """Numbers the contact nodes in the order of the surface."""
     env, s = wp.tid()
     if active[env] == 0 or small.touched[env, s] == 0:
@@ -162,7 +152,7 @@ def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, res
 
 
 @wp.kernel
-def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """S = Σ q qᵀ."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -177,7 +167,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
 
     All lanes of the environment work on it and get the same result: False where a pivot is not positive.
     """
-    wait_for_lanes()
+    wait_for_block()
     for k in range(m):
         pivot = small.a[env, k, k]
         if not (wp.determinant(pivot) > wp.float64(0.0) and wp.trace(pivot) > wp.float64(0.0)):
@@ -186,7 +176,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
         for i in range(lane, m, lanes):
             small.column[env, i] = small.a[env, i, k]
             small.row[env, i] = inverse * small.a[env, k, i]
-        wait_for_lanes()
+        wait_for_block()
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
@@ -198,7 +188,7 @@ def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes
                 small.a[env, i, j] = -(small.column[env, i] * inverse)
             else:
                 small.a[env, i, j] = small.a[env, i, j] - small.column[env, i] * small.row[env, j]
-        wait_for_lanes()
+        wait_for_block()
     return True
 
 
@@ -215,7 +205,7 @@ def compliance(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
 
 
 @wp.kernel
-def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """W from S, one block of threads an environment; leaves ``a`` zero for the next S."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -232,7 +222,7 @@ def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, 
             j = e - m * i
             small.a[env, i, j] = small.a[env, i, j] + compliance(rest, small.node[env, i], small.node[env, j])
         good = invert_small(small, env, m, lane, lanes)
-    wait_for_lanes()
+    wait_for_block()
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
@@ -244,13 +234,13 @@ def factor_small(rest: Rest, active: wp.array(dtype=wp.int32), lanes: wp.int32, 
     elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
         small.count[env] = 0
-    wait_for_lanes()
+    wait_for_block()
     for e in range(lane, m * m, lanes):
         small.a[env, e / m, e % m] = wp.mat33d()
 
 
 @wp.func
-def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) -> wp.float32:
+def sum_of_parts(y: SingleArray3d, env: wp.int32, u: wp.int32) -> wp.float32:
     total = wp.float32(0.0)
     for c in range(y.shape[0]):
         total += y[c, env, u]
@@ -258,7 +248,7 @@ def sum_of_parts(y: wp.array3d(dtype=wp.float32), env: wp.int32, u: wp.int32) ->
 
 
 @wp.kernel
-def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.array(dtype=wp.int32), lanes: wp.int32, small: Small):
+def contact_forces(rest: Rest, y: SingleArray3d, running: IntArray, lanes: wp.int32, small: Small):
     """W J K_0⁻¹ r, one block of threads an environment."""
     env, lane = wp.tid()
     if running[env] == 0 or not fits(small, env):
@@ -266,7 +256,7 @@ def contact_forces(rest: Rest, y: wp.array3d(dtype=wp.float32), running: wp.arra
     n = 3 * small.count[env]
     for i in range(lane, n, lanes):
         small.t[env, i] = sum_of_parts(y, env, rest.unknown[small.node[env, i / 3]] + i % 3)
-    wait_for_lanes()
+    wait_for_block()
     for i in range(lane, n, lanes):
         total = wp.float32(0.0)
         for j in range(n):
@@ -278,11 +268,8 @@ class LowRank:
     """Contact nodes, their factored small systems W, and products with these.
 
     Args:
-        rest: K_0⁻¹ on the surfaces.
-        batch: number of environments.
         room: contact nodes that an environment may have.
         row_lanes: threads that share the contact rows of an environment; one adds them in order.
-        device: Warp device.
     """
 
     def __init__(self, rest: Rest, batch: int, room: int, row_lanes: int, device: wp.Device) -> None:

@@ -7,8 +7,8 @@ is room for, have block-Jacobi. Across a batch the application is a product of m
 everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
 """
 
-# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
-# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecArray2d, filled
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
@@ -40,14 +41,14 @@ MAX_CONTACTS = 48
 
 @wp.kernel
 def multiply_vectors(
-    matrix: wp.array3d(dtype=wp.float32),
-    x: wp.array2d(dtype=wp.float32),
+    matrix: SingleArray3d,
+    x: SingleArray2d,
     x_first: wp.int32,
     y_first: wp.int32,
     length: wp.int32,
-    running: wp.array(dtype=wp.int32),
+    running: IntArray,
     # outputs
-    y: wp.array3d(dtype=wp.float32),
+    y: SingleArray3d,
 ):
     """y[c] = the share of ``length`` inputs in matrixᵀ x, patch by patch."""
     c, env, e = wp.tid()
@@ -65,13 +66,7 @@ def multiply_vectors(
 
 @wp.kernel
 def multiply_tiles(
-    matrix: wp.array3d(dtype=wp.float32),
-    x: wp.array2d(dtype=wp.float32),
-    x_first: wp.int32,
-    y_first: wp.int32,
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    y: wp.array2d(dtype=wp.float32),
+    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, running: IntArray, y: SingleArray2d
 ):
     """y = x · matrix in tiles, patch by patch, without those that have nothing running."""
     patch, i, j = wp.tid()
@@ -96,7 +91,6 @@ class Product:
     Args:
         matrix: shape (patches, inputs, outputs), both a multiple of the tile.
         x: (B or more, …) and y: (parts, B or more, …), where patch p has inputs from x_first + p·inputs and outputs likewise.
-        batch: number of environments.
     """
 
     def __init__(self, matrix: wp.array, x: wp.array, y: wp.array, x_first: int, y_first: int, batch: int) -> None:
@@ -141,17 +135,15 @@ class Inside:
     ``twin_in`` where the second one reads x_Γ.
     """
 
-    unknown: wp.array(dtype=wp.int32)
-    patch_out: wp.array(dtype=wp.int32)
-    twin_start: wp.array(dtype=wp.int32)
-    twin_out: wp.array(dtype=wp.int32)
-    twin_in: wp.array(dtype=wp.int32)
+    unknown: IntArray
+    patch_out: IntArray
+    twin_start: IntArray
+    twin_out: IntArray
+    twin_in: IntArray
 
 
 @wp.kernel
-def gather_inside(
-    inside: Inside, r: wp.array2d(dtype=wp.vec3d), running: wp.array(dtype=wp.int32), x: wp.array2d(dtype=wp.float32)
-):
+def gather_inside(inside: Inside, r: VecArray2d, running: IntArray, x: SingleArray2d):
     """r_p of every patch, in single precision."""
     env, i = wp.tid()
     u = inside.unknown[i]
@@ -164,14 +156,14 @@ def gather_inside(
 def gather_interface(
     rest: Rest,
     inside: Inside,
-    r: wp.array2d(dtype=wp.vec3d),
-    y_inside: wp.array3d(dtype=wp.float32),
+    r: VecArray2d,
+    y_inside: SingleArray3d,
     small: Small,
-    jacobi: wp.array2d(dtype=wp.mat33d),
-    running: wp.array(dtype=wp.int32),
+    jacobi: MatArray2d,
+    running: IntArray,
     # outputs
-    x: wp.array2d(dtype=wp.float32),
-    z: wp.array2d(dtype=wp.vec3d),
+    x: SingleArray2d,
+    z: VecArray2d,
 ):
     """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi."""
     env, i = wp.tid()
@@ -192,14 +184,7 @@ def gather_interface(
 
 @wp.kernel
 def scatter_interface(
-    rest: Rest,
-    inside: Inside,
-    small: Small,
-    y: wp.array3d(dtype=wp.float32),
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    z: wp.array2d(dtype=wp.vec3d),
-    x_back: wp.array2d(dtype=wp.float32),
+    rest: Rest, inside: Inside, small: Small, y: SingleArray3d, running: IntArray, z: VecArray2d, x_back: SingleArray2d
 ):
     """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node."""
     env, i = wp.tid()
@@ -224,13 +209,7 @@ def scatter_interface(
 
 @wp.kernel
 def scatter_inside(
-    inside: Inside,
-    y_inside: wp.array3d(dtype=wp.float32),
-    y_back: wp.array3d(dtype=wp.float32),
-    small: Small,
-    running: wp.array(dtype=wp.int32),
-    # outputs
-    z: wp.array2d(dtype=wp.vec3d),
+    inside: Inside, y_inside: SingleArray3d, y_back: SingleArray3d, small: Small, running: IntArray, z: VecArray2d
 ):
     """x_p = K_pp⁻¹ r_p − E_p x_Γ."""
     env, i = wp.tid()
@@ -254,10 +233,7 @@ class RestInverse:
 
     Args:
         layout: with a bonded body at least.
-        settings: time step.
-        batch: number of environments.
         lanes: threads that share the contact rows of an environment.
-        device: Warp device.
         max_contacts: contact nodes that an environment may have; with more it has block-Jacobi.
         patches: into how many the inside of every body is cut, a power of two; 0 for none; None: as few operations as possible.
 
@@ -291,14 +267,9 @@ class RestInverse:
         on_surface = on_surface[unknown[on_surface] >= 0]
         surface[on_surface] = np.arange(len(on_surface))
 
-        def ints(values: np.ndarray | list[int]) -> wp.array:
-            return wp.array(np.asarray(values), dtype=wp.int32, device=device)
-
-        rest = Rest()
-        rest.inverse = wp.array(np.concatenate(matrices), dtype=wp.float32, device=device)
-        rest.start, rest.first, rest.width = ints(starts[:-1]), ints(firsts[:-1]), ints(widths)
-        rest.unknown, rest.part, rest.surface, rest.surface_node = ints(unknown), ints(part), ints(surface), ints(on_surface)
-        self.rest = rest
+        parts = {"inverse": np.concatenate(matrices), "start": starts[:-1], "first": firsts[:-1], "width": widths}
+        numbers = {"unknown": unknown, "part": part, "surface": surface, "surface_node": on_surface}
+        self.rest = rest = filled(Rest, device, parts | numbers)
         self.low_rank = LowRank(rest, batch, max_contacts, lanes, device)
         self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
         views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
@@ -322,19 +293,14 @@ class RestInverse:
         """The two products of the patches, all of one padded size: [K_pp⁻¹, E_p] and E_pᵀ."""
         inner = padded(max((3 * len(p.nodes) for p in patches), default=0))
         border = padded(max((3 * len(p.border) for p in patches), default=0))
-        forward, backward = (
-            np.zeros((len(patches), inner, inner + border), np.float32),
-            np.zeros((len(patches), border, inner), np.float32),
-        )
+        forward = np.zeros((len(patches), inner, inner + border), np.float32)
+        backward = np.zeros((len(patches), border, inner), np.float32)
         unknown, patch_out = np.full(count, -1), np.full(count, -1)
         twins, outs, ins = [], [], []
         for p, patch in enumerate(patches):
             n, g = patch.extension.shape
-            forward[p, :n, :n], forward[p, :n, inner : inner + g], backward[p, :g, :n] = (
-                patch.inverse,
-                patch.extension,
-                patch.extension.T,
-            )
+            forward[p, :n, :n], forward[p, :n, inner : inner + g] = patch.inverse, patch.extension
+            backward[p, :g, :n] = patch.extension.T
             unknown[patch.nodes] = p * inner + 3 * np.arange(len(patch.nodes))
             patch_out[patch.nodes] = p * (inner + border) + 3 * np.arange(len(patch.nodes))
             twins.append(patch.border)
@@ -343,14 +309,10 @@ class RestInverse:
         nodes = np.concatenate([np.zeros(0, int), *twins])
         order = np.argsort(nodes, kind="stable")
 
-        def ints(values: np.ndarray) -> wp.array:
-            return wp.array(values, dtype=wp.int32, device=self.device)
-
-        self.inside = Inside()
-        self.inside.unknown, self.inside.patch_out = ints(unknown), ints(patch_out)
-        self.inside.twin_start = ints(np.concatenate([[0], np.cumsum(np.bincount(nodes, minlength=count))]))
-        self.inside.twin_out = ints(np.concatenate([np.zeros(0, int), *outs])[order])
-        self.inside.twin_in = ints(np.concatenate([np.zeros(0, int), *ins])[order])
+        twin_start = np.concatenate([[0], np.cumsum(np.bincount(nodes, minlength=count))])
+        twin_out, twin_in = (np.concatenate([np.zeros(0, int), *places])[order] for places in (outs, ins))
+        places = {"unknown": unknown, "patch_out": patch_out, "twin_start": twin_start, "twin_out": twin_out, "twin_in": twin_in}
+        self.inside = filled(Inside, self.device, places)
         self.patched = bool(patches)
         self.x_inside, self.y_inside = self._vectors(len(patches) * inner, len(patches) * (inner + border))
         self.x_back, self.y_back = self._vectors(len(patches) * border, len(patches) * inner)
