@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contacts import LAW_POINTS
+from raytac.physics.rigid.shape_kernels import infinity
 
 __all__ = ["BINS", "Bins", "add_node", "clear_bins", "tabulate"]
 
@@ -91,7 +92,7 @@ def tabulate(
         k = _BINS - 1 - back
         bins.low[block, k] = wp.min(bins.low[block, k], bins.low[block, k + 1])
     nodes = wp.int32(0)
-    before = wp.float64(-_INF)
+    before = -infinity()
     depth_before, stiffness_before, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for k in range(_BINS + 1):
         share = wp.float64(k) / _SCALE

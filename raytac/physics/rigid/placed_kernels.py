@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.shape_kernels import Shapes, first_hit, part_box
+from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box
 
 __all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "width_of", "window"]
 
@@ -83,7 +83,7 @@ def bottom_near(
 ) -> wp.float64:
     """Lower bound of z [m] of a part over the pad; inf if it stays out of reach of the gel and the layer behind it."""
     half_x, half_y, highest = pads.half[pad][0], pads.half[pad][1], pads.highest[pad] + reach
-    bottom = wp.float64(_INF)
+    bottom = infinity()
     if shapes.kind[part] == _PLANE:
         n = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
         if n[2] < _0:
@@ -147,7 +147,7 @@ def place_parts(
         placed.half[block, k] = part_box(shapes, part, rotation, at) + wp.vec3d(_SLACK, _SLACK, _SLACK)
         placed.radius[block, k] = shapes.radius[part] + _SLACK
         placed.bottom[block, k] = bottom
-        width = wp.float64(_INF)
+        width = infinity()
         if shapes.kind[part] != _PLANE:
             width = width_along_z(shapes, part, rotation)
         placed.width[block, k] = width
@@ -158,7 +158,7 @@ def place_parts(
 @wp.func
 def bottom_of(placed: Placed, block: wp.int32) -> wp.float64:
     """Lower bound of z of the placed parts."""
-    result = wp.float64(_INF)
+    result = infinity()
     for k in range(placed.count[block]):
         result = wp.min(result, placed.bottom[block, k])
     return result
@@ -167,7 +167,7 @@ def bottom_of(placed: Placed, block: wp.int32) -> wp.float64:
 @wp.func
 def width_of(placed: Placed, block: wp.int32) -> wp.vec2d:
     """Least ``width`` and ``blunt`` of the placed parts."""
-    width, blunt = wp.float64(_INF), wp.float64(_INF)
+    width, blunt = infinity(), infinity()
     for k in range(placed.count[block]):
         if placed.part[block, k] >= 0:
             width, blunt = wp.min(width, placed.width[block, k]), wp.min(blunt, placed.blunt[block, k])
@@ -189,13 +189,13 @@ def nodes_within(first: wp.int32, count: wp.int32, low: wp.float64, high: wp.flo
 @wp.func
 def window(pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, below: wp.float64) -> wp.vec4i:
     """Nodes of a grid over which a placed part may be lower than ``below`` [m]: x from, to, y from, to."""
-    low_x, high_x, low_y, high_y = wp.float64(_INF), wp.float64(-_INF), wp.float64(_INF), wp.float64(-_INF)
+    low_x, high_x, low_y, high_y = infinity(), -infinity(), infinity(), -infinity()
     for k in range(placed.count[block]):
         if placed.part[block, k] >= 0 and placed.bottom[block, k] <= below:
             c, h = placed.centre[block, k], placed.half[block, k]
             # In a ball, what is lower than a plane beneath its centre lies in a disc.
             radius, above = placed.radius[block, k], c[2] - below
-            disc = wp.float64(_INF)
+            disc = infinity()
             if above > _0 and radius < _INF:
                 disc = wp.sqrt(wp.max(radius * radius - above * above, _0)) + _SLACK
             reach_x, reach_y = wp.min(h[0], disc), wp.min(h[1], disc)
@@ -212,7 +212,7 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
 
     The top of a body is the underside of the body turned over about x.
     """
-    result = wp.float64(_INF)
+    result = infinity()
     for k in range(placed.count[block]):
         part = placed.part[block, k]
         if part >= 0:

@@ -15,7 +15,7 @@ import warp as wp
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.law_kernels import Bins, add_node, clear_bins, tabulate
 from raytac.physics.rigid.placed_kernels import Pads, Placed, bottom_of, lowest_of, place_parts, under, width_of, window
-from raytac.physics.rigid.shape_kernels import Shapes
+from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 __all__ = ["ENOUGH", "PITCHES", "Rows", "find_near", "measure"]
 
@@ -145,7 +145,7 @@ def pierced_at(
     i0, j0 = wp.max(area[0], 1), wp.max(area[2], 1)
     nx = wp.min(area[1], pads.nx[pad, level] - 1) - i0
     n = wp.max(nx, 0) * wp.max(wp.min(area[3], pads.ny[pad, level] - 1) - j0, 0)
-    lowest = wp.float64(_INF)
+    lowest = infinity()
     k = wp.int32(lane)
     while k < n:
         x = pads.lines[pads.first_x[pad, level] + i0 + k % nx][0]
@@ -212,15 +212,15 @@ def measure_pair(
     last = wp.int32(_LAST)
     while last < _FINEST and pads.pitch[last] > _HALF * width[0]:
         last += 1
-    lowest = wp.float64(_INF)  # of the body over the pad
+    lowest = infinity()  # of the body over the pad
     if bottom < bond:
         lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, last)
     pierced = lowest < _INF
 
     mode, level, touching = wp.int32(_SEARCH), wp.int32(0), wp.int32(0)
-    left, right, front, rear = wp.float64(-_INF), wp.float64(_INF), wp.float64(-_INF), wp.float64(_INF)
+    left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
     zero = wp.float64(0.0)  # gap below which nodes count
-    depth, deepest, least = wp.float64(0.0), wp.float64(0.0), wp.float64(_INF)
+    depth, deepest, least = wp.float64(0.0), wp.float64(0.0), infinity()
     refined_x, refined_y = wp.float64(0.0), wp.float64(0.0)
     i0, j0, nx, n = wp.int32(0), wp.int32(0), wp.int32(1), wp.int32(0)
     fx, fy = wp.int32(0), wp.int32(0)
@@ -252,7 +252,7 @@ def measure_pair(
             continue
         keep = _NEAR * pitch + clear
         count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
-        own_least, own_low = wp.float64(_INF), wp.float64(_INF)
+        own_least, own_low = infinity(), infinity()
         a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
         k = wp.int32(lane)
         while k < n:
@@ -261,7 +261,7 @@ def measure_pair(
             j += j0
             x, y = pads.lines[fx + i], pads.lines[fy + j]
             z = under(shapes, placed, block, x[0], y[0], False)
-            gap = wp.float64(_INF)
+            gap = infinity()
             if z >= bond and z < _INF:
                 gap = z - x[1] - y[1]
                 if z < own_low:
@@ -289,7 +289,7 @@ def measure_pair(
         a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
         if mode == _ZOOM and count > 0:  # it does touch, between the nodes that were looked at
             mode, may_zoom = wp.int32(_SEARCH), wp.int32(0)
-            left, right, front, rear = wp.float64(-_INF), wp.float64(_INF), wp.float64(-_INF), wp.float64(_INF)
+            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
             continue
         i, j = wp.int32(0), wp.int32(0)
         if least < _INF:
@@ -355,7 +355,7 @@ def measure_pair(
         else:
             mode, level, busy = wp.int32(_LAW), wp.int32(0), wp.int32(1)
             zero = _HALF * deepest - depth
-            left, right, front, rear = wp.float64(-_INF), wp.float64(_INF), wp.float64(-_INF), wp.float64(_INF)
+            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
     level -= 1
 
     if least == _INF:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["Shapes", "first_hit", "part_box"]
+__all__ = ["Shapes", "first_hit", "infinity", "part_box"]
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -65,6 +65,12 @@ class Shapes:
     samples: wp.array(dtype=wp.int32)
     """Samples along a side of a relief."""
     elevation: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def infinity() -> wp.float64:
+    """Infinity in a variable of its own: assigning to a name that was set to the constant itself changes the constant."""
+    return _INF
 
 
 @wp.func
@@ -165,7 +171,7 @@ def under_cone(size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64,
     b = o[0] * d[0] + o[1] * d[1] - rho * rho * above * d[2]
     c = o[0] * o[0] + o[1] * o[1] - rho * rho * above * above
     ends = slab(o[2], d[2], tangent, height)
-    frustum = wp.float64(_INF)
+    frustum = infinity()
     if a > _0:
         frustum = start_of(common(quadric(a, b, c), ends))
     else:
