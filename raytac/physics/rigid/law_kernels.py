@@ -33,7 +33,7 @@ _PI = wp.constant(wp.float64(3.141592653589793))
 
 @wp.struct
 class Bins:
-    """Nodes of one contact by gap at touch, a row for each block of threads; the last bin holds all beyond the table."""
+    """Nodes of one contact by gap at touch, a row for each block of threads."""
 
     count: wp.array2d(dtype=wp.int32)
     low: wp.array2d(dtype=wp.float64)
@@ -44,7 +44,7 @@ class Bins:
 @wp.func
 def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
     k = wp.int32(lane)
-    while k <= _BINS:
+    while k < _BINS:
         bins.count[block, k] = 0
         bins.low[block, k] = _INF
         bins.high[block, k] = -_INF
@@ -53,12 +53,8 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(bins: Bins, block: wp.int32, gap: wp.float64, deepest: wp.float64):
-    """Add a node with a gap at touch >= 0 [m] to the bin of the depths δ = 2 gap; sums and extremes do not depend on the order."""
-    k = wp.int32(wp.sqrt(wp.min(wp.float64(2.0) * gap / deepest, wp.float64(1.0))) * _SCALE)
-    if wp.float64(2.0) * gap >= deepest:
-        k = _BINS
-    else:
-        k = wp.min(k, _BINS - 1)
+    """Add a node with a gap at touch in [0, ``deepest`` / 2) [m]; counts and extremes do not depend on the order."""
+    k = wp.min(wp.int32(wp.sqrt(wp.float64(2.0) * gap / deepest) * _SCALE), _BINS - 1)
     wp.atomic_add(bins.count, block, k, 1)
     wp.atomic_min(bins.low, block, k, gap)
     wp.atomic_max(bins.high, block, k, gap)
@@ -78,6 +74,7 @@ def incremental_stiffness(radius: wp.float64, law: wp.array2d(dtype=wp.float64),
 def tabulate(
     bins: Bins,
     block: wp.int32,
+    beyond: wp.float64,
     deepest: wp.float64,
     cell: wp.float64,
     law: wp.array2d(dtype=wp.float64),
@@ -87,10 +84,12 @@ def tabulate(
     force: wp.array2d(dtype=wp.float64),
     radius: wp.array2d(dtype=wp.float64),
 ):
-    """Force and contact radius of one row at all depths of the table, by one thread."""
+    """Force and contact radius of one row at all depths of the table, by one thread; ``beyond``: least gap that is in no bin [m]."""
+    later = wp.float64(beyond + _0)
     for back in range(_BINS):  # the least gap in this bin or a later one
         k = _BINS - 1 - back
-        bins.low[block, k] = wp.min(bins.low[block, k], bins.low[block, k + 1])
+        later = wp.min(later, bins.low[block, k])
+        bins.low[block, k] = later
     nodes = wp.int32(0)
     before = -infinity()
     depth_before, stiffness_before, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
@@ -104,7 +103,9 @@ def tabulate(
         if nodes > 0:
             # Half a node at its own gap, so that the area grows continuously from node to node.
             counted = wp.float64(nodes) - _HALF
-            after = bins.low[block, k]
+            after = wp.float64(beyond + _0)
+            if k < _BINS:
+                after = bins.low[block, k]
             if after < _INF and after > before:
                 counted += wp.clamp((_HALF * depth - before) / (after - before), _0, wp.float64(1.0))
         a = wp.sqrt(wp.max(counted, _HALF) * cell / _PI)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box
+from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive
 
-__all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "width_of", "window"]
+__all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "under_nodes", "width_of", "window"]
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-_PLANE, _TORUS = wp.constant(wp.int32(0)), wp.constant(wp.int32(7))
+_PLANE, _MESH = wp.constant(wp.int32(0)), wp.constant(wp.int32(8))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -232,3 +232,41 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
     if top:
         return -result
     return result
+
+
+@wp.func
+def under_nodes(
+    shapes: Shapes, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, lines: wp.array(dtype=wp.vec3d),
+    first_x: wp.int32, first_y: wp.int32, nx: wp.int32, n: wp.int32,
+    # outputs
+    height: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """``under`` on n nodes, rows of ``nx``, each thread its own; the first ones are at ``first_x``, ``first_y`` of ``lines``."""
+    k = wp.int32(lane)
+    while k < n:
+        height[block, k] = _INF
+        k += lanes
+    for m in range(placed.count[block]):
+        part = placed.part[block, m]
+        if part >= 0:
+            c, h = placed.centre[block, m], placed.half[block, m]
+            rotation, at = placed.rotation[block, m], placed.at[block, m]
+            kind, size = shapes.kind[part], shapes.size[part]
+            i, j = wp.int32(lane), wp.int32(0)
+            k = wp.int32(lane)
+            while k < n:
+                while i >= nx:
+                    i -= nx
+                    j += 1
+                x, y = lines[first_x + i][0], lines[first_y + j][0]
+                if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
+                    if kind < _MESH:
+                        z = under_primitive(kind, size, rotation, at, x, y)
+                        if z < height[block, k]:
+                            height[block, k] = z
+                    else:
+                        z = first_hit(shapes, part, rotation, at, x, y)
+                        if z < height[block, k]:
+                            height[block, k] = z
+                i += lanes
+                k += lanes

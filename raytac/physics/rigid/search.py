@@ -131,7 +131,7 @@ class PadSearch:
         for name, dtype in _PLACED.items():
             setattr(work.placed, name, wp.zeros((blocks, self._shapes.most_parts), dtype=dtype, device=self.device))
         for name, dtype in (("count", wp.int32), ("low", wp.float64), ("high", wp.float64)):
-            setattr(work.bins, name, wp.zeros((blocks, BINS + 1), dtype=dtype, device=self.device))
+            setattr(work.bins, name, wp.zeros((blocks, BINS), dtype=dtype, device=self.device))
         work.gap = wp.zeros((blocks, self._pads.most_nodes), dtype=wp.float64, device=self.device)
         return work
 

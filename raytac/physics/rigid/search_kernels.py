@@ -14,7 +14,7 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.law_kernels import Bins, add_node, clear_bins, tabulate
-from raytac.physics.rigid.placed_kernels import Pads, Placed, bottom_of, lowest_of, place_parts, under, width_of, window
+from raytac.physics.rigid.placed_kernels import Pads, Placed, bottom_of, lowest_of, place_parts, under, under_nodes, width_of, window
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 __all__ = ["ENOUGH", "PITCHES", "Rows", "find_near", "measure"]
@@ -254,16 +254,17 @@ def measure_pair(
         count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
         own_least, own_low = infinity(), infinity()
         a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
+        under_nodes(shapes, placed, block, lane, lanes, pads.lines, fx + i0, fy + j0, nx, n, work.gap)
+        i, j = i0 + lane, wp.int32(j0)
         k = wp.int32(lane)
         while k < n:
-            j = k // nx
-            i = i0 + k - j * nx
-            j += j0
-            x, y = pads.lines[fx + i], pads.lines[fy + j]
-            z = under(shapes, placed, block, x[0], y[0], False)
+            while i >= i0 + nx:
+                i -= nx
+                j += 1
+            z = work.gap[block, k]
             gap = infinity()
             if z >= bond and z < _INF:
-                gap = z - x[1] - y[1]
+                gap = z - pads.lines[fx + i][1] - pads.lines[fy + j][1]
                 if z < own_low:
                     own_low = z
                     low_node = k
@@ -275,6 +276,7 @@ def measure_pair(
                 if gap < keep:
                     a0, a1, b0, b1 = wp.min(a0, i), wp.min(a1, -i), wp.min(b0, j), wp.min(b1, -j)
             work.gap[block, k] = gap
+            i += lanes
             k += lanes
         count = count_of(count)
         if mode == _LAW:
@@ -291,7 +293,7 @@ def measure_pair(
             mode, may_zoom = wp.int32(_SEARCH), wp.int32(0)
             left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
             continue
-        i, j = wp.int32(0), wp.int32(0)
+        i, j = wp.int32(0), wp.int32(0)  # of the least gap
         if least < _INF:
             j = near_node // nx
             i = i0 + near_node - j * nx
@@ -374,6 +376,7 @@ def measure_pair(
     )  # fmt: skip
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
+    beyond_law = infinity()
     k = wp.int32(lane)
     while k < n:
         gap = work.gap[block, k]
@@ -389,8 +392,12 @@ def measure_pair(
                 szz += overlap * overlap
                 slope_x += overlap * u[2]
                 slope_y += overlap * v[2]
-            add_node(work.bins, block, wp.max(gap + depth, _0), deepest)
+            if _2 * (gap + depth) < deepest:
+                add_node(work.bins, block, wp.max(gap + depth, _0), deepest)
+            else:
+                beyond_law = wp.min(beyond_law, gap + depth)
         k += lanes
+    beyond_law = least_of(beyond_law)
     s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
     slope_x, slope_y = total_of(slope_x), total_of(slope_y)
     if lane == 0:
@@ -403,7 +410,7 @@ def measure_pair(
             rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
         else:
             place_of_gap(pads, pad, refined_x, refined_y, depth, row, rows)
-        tabulate(work.bins, block, deepest, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
+        tabulate(work.bins, block, beyond_law, deepest, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
 
 
 @wp.func

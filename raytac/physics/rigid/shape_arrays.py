@@ -116,15 +116,16 @@ class PadArrays:
         lines: list[np.ndarray] = []
         highest = np.zeros(len(gelpads))
         for p, gelpad in enumerate(gelpads):
+            highest[p] = make_grid(gelpad, pitches[last]).rest.max()
             for k, pitch in enumerate(pitches):
-                grid = make_grid(gelpad, pitch)
-                cell[p, k] = grid.pitch[0] * grid.pitch[1]
-                rests = -gelpad.sag(grid.x, 0.0), -gelpad.sag(0.0, grid.y)
-                for first, count, line, rest in ((first_x, nx, grid.x, rests[0]), (first_y, ny, grid.y, rests[1])):
+                x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
+                cell[p, k] = (x[1] - x[0]) * (y[1] - y[0])
+                for first, count, line, rest in (
+                    (first_x, nx, x, -gelpad.sag(x, 0.0)),
+                    (first_y, ny, y, -gelpad.sag(0.0, y)),
+                ):
                     first[p, k], count[p, k] = sum(map(len, lines)), len(line)
                     lines.append(np.stack([line, rest, np.gradient(rest, line)], axis=1))
-                if k == last:
-                    highest[p] = grid.rest.max()
         self.most_nodes = int((nx[:, last] * ny[:, last]).max(initial=1))
         pads: Any = Pads()
         pads.half = _array([[0.5 * size for size in gelpad.size] for gelpad in gelpads], wp.vec2d, device)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["Shapes", "first_hit", "infinity", "part_box"]
+__all__ = ["Shapes", "first_hit", "infinity", "part_box", "under_primitive"]
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -322,19 +322,16 @@ def under_relief(shapes: Shapes, part: wp.int32, o: wp.vec3d, d: wp.vec3d) -> wp
 
 
 @wp.func
-def first_hit(
-    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
+def under_primitive(
+    kind: wp.int32, size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
 ) -> wp.float64:
-    """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
-    kind, size = shapes.kind[part], shapes.size[part]
+    """Lowest z [m] of a primitive on the vertical line at x, y."""
     if kind == SPHERE:
         return under_sphere(size[0], at, x, y)
     if kind == PLANE:
         if rotation[2, 2] >= _0:  # only one that looks down has an underside
             return _INF
         return at[2] - (rotation[0, 2] * (x - at[0]) + rotation[1, 2] * (y - at[1])) / rotation[2, 2]
-    if kind == MESH:
-        return under_triangles(shapes, part, rotation, at, x, y)
     if kind == CONE:
         return under_cone(size, rotation, at, x, y)
     o, d = line_through(rotation, at, x, y), direction_of(rotation)
@@ -348,11 +345,22 @@ def first_hit(
         return wp.min(ends, at[2] + under_cylinder(size[0], size[1], o, d))
     if kind == ELLIPSOID:
         return at[2] + under_ellipsoid(size, o, d)
-    if kind == TORUS:
-        return at[2] + under_torus(size[0], size[1], o, d)
-    tangent = wp.sqrt(d[0] * d[0] + d[1] * d[1])
-    if d[2] > _0 and tangent * shapes.max_slope[part] <= _RELIEF_LIMIT * d[2]:
-        return at[2] + under_relief(shapes, part, o, d)
+    return at[2] + under_torus(size[0], size[1], o, d)
+
+
+@wp.func
+def first_hit(
+    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
+) -> wp.float64:
+    """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
+    kind = shapes.kind[part]
+    if kind < MESH:
+        return under_primitive(kind, shapes.size[part], rotation, at, x, y)
+    if kind == RELIEF:
+        o, d = line_through(rotation, at, x, y), direction_of(rotation)
+        tangent = wp.sqrt(d[0] * d[0] + d[1] * d[1])
+        if d[2] > _0 and tangent * shapes.max_slope[part] <= _RELIEF_LIMIT * d[2]:
+            return at[2] + under_relief(shapes, part, o, d)
     return under_triangles(shapes, part, rotation, at, x, y)
 
 
