@@ -42,7 +42,7 @@ def bodies() -> dict[str, tuple[Part, float]]:
     ball = trimesh.creation.icosphere(4, 6e-3)
     return {
         "cube": (primitive("box", (10e-3, 10e-3, 10e-3)), 0.1e-3),
-        "cube_edge": (primitive("box", (10e-3, 10e-3, 10e-3)), 0.1e-3),
+        "cube_edge": (primitive("box", (10e-3, 10e-3, 10e-3)), 0.5e-3),
         "ball": (primitive("sphere", (6e-3,)), 0.3e-3),
         "mesh_5120": (mesh_part(ball.vertices, ball.faces), 0.3e-3),
         "apart": (primitive("sphere", (6e-3,)), -5e-3),
@@ -98,7 +98,9 @@ def main(args: Args) -> None:
                 ours, numpy = medians(args.calls, kernels, reference)
                 key = f"pad_contact.{name}.{count}"
                 metrics |= {f"{key}.ms": 1e3 * ours, f"{key}.numpy_ms": 1e3 * numpy, f"{key}.speedup": numpy / ours}
-                print(f"{name:10} {count:5} environments: {1e3 * ours:8.3f} ms, NumPy {1e3 * numpy:8.3f} ms, {numpy / ours:.1f} times")
+                print(
+                    f"{name:10} {count:5} environments: {1e3 * ours:8.3f} ms, NumPy {1e3 * numpy:8.3f} ms, {numpy / ours:.1f} times"
+                )
 
 
 if __name__ == "__main__":

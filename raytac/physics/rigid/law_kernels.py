@@ -6,6 +6,7 @@ so that the smoothing by half a node is that of ``LoadLaw`` at the edges of the 
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations

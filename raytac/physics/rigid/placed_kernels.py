@@ -2,6 +2,7 @@
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -72,9 +73,7 @@ class Placed:
 
 @wp.func
 def rotation_of(pose: wp.mat44d) -> wp.mat33d:
-    return wp.mat33d(
-        pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2]
-    )
+    return wp.mat33d(pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2])
 
 
 @wp.func
@@ -99,9 +98,7 @@ def bottom_near(
 
 
 @wp.func
-def lowest_of(
-    shapes: Shapes, part: wp.int32, pose: wp.mat44d, pads: Pads, pad: wp.int32, reach: wp.float64
-) -> wp.float64:
+def lowest_of(shapes: Shapes, part: wp.int32, pose: wp.mat44d, pads: Pads, pad: wp.int32, reach: wp.float64) -> wp.float64:
     """``bottom_near`` of a part of a body at a pose."""
     rotation = rotation_of(pose)
     at = rotation * shapes.offset[part] + wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])

@@ -65,7 +65,9 @@ class PadSearch:
         """
         poses, envs = np.asarray(pad_from_body, float), np.asarray(envs)
         if poses.ndim != 5 or poses.shape[1:] != (*self._shape, 4, 4):
-            raise InputError("pad_from_body", value=poses.shape, rule=f"must have shape (B, {self._shape[0]}, {self._shape[1]}, 4, 4)")
+            raise InputError(
+                "pad_from_body", value=poses.shape, rule=f"must have shape (B, {self._shape[0]}, {self._shape[1]}, 4, 4)"
+            )
         count = len(poses)
         if envs.shape != (count,):
             raise InputError("envs", value=envs.shape, rule=f"must have shape ({count},), one for each pose")
@@ -76,18 +78,18 @@ class PadSearch:
             raise InputError("reach", value=reach.tolist(), rule="must be finite and >= 0 [m]")
         pairs = count * self._shape[0] * self._shape[1]
         if pairs == 0:
-            return self._read(np.zeros(0, int), envs)
+            return self._read(0, envs)
         if count > self.poses.shape[0]:
             self._allocate(count)
         self._fill(poses, reach)
         self._find_near(count)
         rows = self._number_rows(pairs)
         if rows == 0:
-            return self._read(np.zeros(0, int), envs)
+            return self._read(0, envs)
         if rows > self._capacity:
             self.reserve(max(rows, 2 * self._capacity))
         self._measure(pairs)
-        return self._read(np.flatnonzero(self.rows.found.numpy()[:rows]), envs)
+        return self._read(rows, envs)
 
     def launch(self) -> None:
         """Fill ``rows`` from ``poses`` and ``reach`` of all environments; nothing waits for the device.
@@ -107,6 +109,8 @@ class PadSearch:
             shape = (rows, LAW_POINTS) if name in ("force", "radius") else (rows,)
             setattr(result, name, wp.zeros(shape, dtype=dtype, device=self.device))
         self.rows = result
+        # On a CPU these are views, and making one takes longer than copying a few rows.
+        self._views = {name: getattr(result, name).numpy() for name in _ROWS} if self.device.is_cpu else None
         self._record()
 
     def _allocate(self, num_envs: int) -> None:
@@ -138,7 +142,7 @@ class PadSearch:
     def _record(self) -> None:
         """Launches are recorded, so that repeating them costs a fifth."""
         shapes, pads = self._shapes.struct, self._pads.struct
-        self._near_launch = wp.launch(
+        self._near_launch: Any = wp.launch(
             find_near,
             dim=self.near.shape if 0 in self.poses.shape else self.poses.shape,
             inputs=[self.poses, self.reach, shapes, pads],
@@ -146,7 +150,7 @@ class PadSearch:
             device=self.device,
             record_cmd=True,
         )
-        self._measure_launch = wp.launch_tiled(
+        self._measure_launch: Any = wp.launch_tiled(
             measure,
             dim=[self._blocks],
             inputs=[
@@ -182,10 +186,12 @@ class PadSearch:
         self._measure_launch.set_param_by_name("pairs", pairs)
         self._measure_launch.launch()
 
-    def _read(self, at: np.ndarray, envs: np.ndarray) -> PadContacts:
-        fields = {name: getattr(self.rows, name).numpy()[at] for name in _ROWS if name != "found"}
-        fields["env"] = envs[fields["env"]] if len(at) else np.zeros(0, int)
-        return PadContacts(**fields)
+    def _read(self, rows: int, envs: np.ndarray) -> PadContacts:
+        """Those of the first rows that are contacts, copied."""
+        views = self._views or {name: getattr(self.rows, name).numpy() for name in _ROWS}
+        at = np.flatnonzero(views["found"][:rows])
+        fields = {name: views[name][at] for name in _FIELDS}
+        return PadContacts(env=envs[views["env"][at]], **fields)
 
 
 _ROWS = {
@@ -201,6 +207,7 @@ _ROWS = {
     "force": wp.float64,
     "radius": wp.float64,
 }
+_FIELDS = tuple(name for name in _ROWS if name not in ("found", "env"))
 _PLACED = {
     "part": wp.int32,
     "rotation": wp.mat33d,

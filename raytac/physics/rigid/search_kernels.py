@@ -6,6 +6,7 @@ window; sums are those of a tile, in a fixed order. On a CPU a block is one thre
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -14,7 +15,17 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.law_kernels import Bins, add_node, clear_bins, tabulate
-from raytac.physics.rigid.placed_kernels import Pads, Placed, bottom_of, lowest_of, place_parts, under, under_nodes, width_of, window
+from raytac.physics.rigid.placed_kernels import (
+    Pads,
+    Placed,
+    bottom_of,
+    lowest_of,
+    place_parts,
+    under,
+    under_nodes,
+    width_of,
+    window,
+)
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 __all__ = ["ENOUGH", "PITCHES", "Rows", "find_near", "measure"]
@@ -414,9 +425,7 @@ def measure_pair(
 
 
 @wp.func
-def place_of_gap(
-    pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows
-):
+def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows):
     """Place and normal where the gap is least, of a body too sharp to have nodes of its own there."""
     fx, fy = pads.first_x[pad, _LAST], pads.first_y[pad, _LAST]
     i = wp.int32(wp.round((x - pads.lines[fx][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])))

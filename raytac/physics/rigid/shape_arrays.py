@@ -105,6 +105,10 @@ _COLUMNS = {
 }
 
 
+_LEAST_MEMORY = 32768
+"""Nodes that a window may have at least, so that a blade of 0.1 mm across the pad has its finest grid."""
+
+
 class PadArrays:
     """Pads with grids of several pitches."""
 
@@ -126,7 +130,8 @@ class PadArrays:
                 ):
                     first[p, k], count[p, k] = sum(map(len, lines)), len(line)
                     lines.append(np.stack([line, rest, np.gradient(rest, line)], axis=1))
-        self.most_nodes = int((nx[:, last] * ny[:, last]).max(initial=1))
+        self.most_nodes = int((nx[:, last] * ny[:, last]).max(initial=_LEAST_MEMORY))
+        """Nodes that a window may have."""
         pads: Any = Pads()
         pads.half = _array([[0.5 * size for size in gelpad.size] for gelpad in gelpads], wp.vec2d, device)
         pads.thickness = _array([gelpad.thickness for gelpad in gelpads], wp.float64, device)

@@ -6,6 +6,7 @@ Triangles are searched in float32 by ``wp.mesh_query_ray``; the height on the on
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
 # (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
@@ -349,9 +350,7 @@ def under_primitive(
 
 
 @wp.func
-def first_hit(
-    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
-) -> wp.float64:
+def first_hit(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
     """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
     kind = shapes.kind[part]
     if kind < MESH:
