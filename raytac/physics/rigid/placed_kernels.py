@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive
+from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive, under_surface
 
 __all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "under_nodes", "width_of", "window"]
 
@@ -215,17 +215,14 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
         if part >= 0:
             c, h = placed.centre[block, k], placed.half[block, k]
             if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
-                rotation, at = placed.rotation[block, k], placed.at[block, k]
+                turn, side = wp.mat33d(placed.rotation[block, k]), wp.float64(1.0)
                 if top:
-                    over = wp.mat33d(
-                        rotation[0, 0], rotation[0, 1], rotation[0, 2], -rotation[1, 0], -rotation[1, 1], -rotation[1, 2],
-                        -rotation[2, 0], -rotation[2, 1], -rotation[2, 2],
-                    )  # fmt: skip
                     if shapes.kind[part] == _PLANE:
                         return _INF
-                    result = wp.min(result, first_hit(shapes, part, over, wp.vec3d(at[0], -at[1], -at[2]), x, -y))
-                else:
-                    result = wp.min(result, first_hit(shapes, part, rotation, at, x, y))
+                    side = wp.float64(-1.0)
+                over = wp.diag(wp.vec3d(_1, side, side))
+                at = over * placed.at[block, k]
+                result = wp.min(result, first_hit(shapes, part, over * turn, at, x, side * y))
     if top:
         return -result
     return result
@@ -257,13 +254,12 @@ def under_nodes(
                     j += 1
                 x, y = lines[first_x + i][0], lines[first_y + j][0]
                 if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
+                    z = wp.float64(0.0)
                     if kind < _MESH:
                         z = under_primitive(kind, size, rotation, at, x, y)
-                        if z < height[block, k]:
-                            height[block, k] = z
                     else:
-                        z = first_hit(shapes, part, rotation, at, x, y)
-                        if z < height[block, k]:
-                            height[block, k] = z
+                        z = under_surface(shapes, part, rotation, at, x, y)
+                    if z < height[block, k]:
+                        height[block, k] = z
                 i += lanes
                 k += lanes

@@ -94,8 +94,8 @@ class PadSearch:
     def launch(self) -> None:
         """Fill ``rows`` from ``poses`` and ``reach`` of all environments; nothing waits for the device.
 
-        Rows follow the order of environments, pads and bodies; ``ends`` (pairs,) holds the number of rows up to each pair. Rows beyond those
-        that ``reserve`` made are left out.
+        Rows follow the order of environments, pads and bodies; ``ends`` (pairs,) holds the number of rows up to each pair. Rows beyond
+        those that ``reserve`` made are left out.
         """
         self._find_near(self.poses.shape[0])
         wp.utils.array_scan(self.near, self.ends, inclusive=True)

@@ -197,6 +197,27 @@ def vertex_of(before: wp.float64, middle: wp.float64, after: wp.float64, pitch: 
 
 
 @wp.func
+def between_nodes(
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32,
+    middle: wp.float64, of: wp.int32,
+) -> wp.vec3d:  # fmt: skip
+    """Drop [m] below ``middle``, the z (``of`` 0) or gap (1) at node i, j, and the place of the least along x and y [nodes].
+
+    By parabolas through the neighbours along both axes.
+    """
+    beside = wp.vec4d()
+    k = wp.int32(0)
+    while k < 4:  # a loop that is not unrolled: the compiler's time goes by the code
+        step = wp.where(k % 2 == 0, -1, 1)
+        p, q = i + wp.where(k < 2, step, 0), j + wp.where(k < 2, 0, step)
+        beside[k] = height_at(shapes, pads, placed, block, pad, level, p, q)[of]
+        k += 1
+    across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
+    along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
+    return wp.vec3d(across[0] + along[0], across[1], along[1])
+
+
+@wp.func
 def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
     """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
     deepest = wp.max(_DEEPER * depth, depth + reach)
@@ -336,29 +357,14 @@ def measure_pair(
             q = low_node // nx
             p = i0 + low_node - q * nx
             q += j0
-            across = vertex_of(
-                height_at(shapes, pads, placed, block, pad, level, p - 1, q)[0], low,
-                height_at(shapes, pads, placed, block, pad, level, p + 1, q)[0], pitch,
-            )  # fmt: skip
-            along = vertex_of(
-                height_at(shapes, pads, placed, block, pad, level, p, q - 1)[0], low,
-                height_at(shapes, pads, placed, block, pad, level, p, q + 1)[0], pitch,
-            )  # fmt: skip
-            lowest = wp.max(low - across[0] - along[0], bond)
+            lowest = wp.max(low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0], bond)
         if beyond or least == _INF:
             least = _INF
             continue
-        across = vertex_of(
-            height_at(shapes, pads, placed, block, pad, level, i - 1, j)[1], least,
-            height_at(shapes, pads, placed, block, pad, level, i + 1, j)[1], pitch,
-        )  # fmt: skip
-        along = vertex_of(
-            height_at(shapes, pads, placed, block, pad, level, i, j - 1)[1], least,
-            height_at(shapes, pads, placed, block, pad, level, i, j + 1)[1], pitch,
-        )  # fmt: skip
-        depth = across[0] + along[0] - least
-        refined_x = pads.lines[fx + i][0] + across[1] * step_x
-        refined_y = pads.lines[fy + j][0] + along[1] * step_y
+        drop = between_nodes(shapes, pads, placed, block, pad, level, i, j, least, 1)
+        depth = drop[0] - least
+        refined_x = pads.lines[fx + i][0] + drop[1] * step_x
+        refined_y = pads.lines[fy + j][0] + drop[2] * step_y
         deepest = deepest_of(depth, reach, thickness)
         if least < _0:
             touching = 1

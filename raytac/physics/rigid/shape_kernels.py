@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["Shapes", "first_hit", "infinity", "part_box", "under_primitive"]
+__all__ = ["Shapes", "first_hit", "infinity", "part_box", "under_primitive", "under_surface"]
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -350,17 +350,26 @@ def under_primitive(
 
 
 @wp.func
-def first_hit(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
-    """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
-    kind = shapes.kind[part]
-    if kind < MESH:
-        return under_primitive(kind, shapes.size[part], rotation, at, x, y)
-    if kind == RELIEF:
+def under_surface(
+    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
+) -> wp.float64:
+    """Lowest z [m] of a mesh or relief on the vertical line at x, y."""
+    if shapes.kind[part] == RELIEF:
         o, d = line_through(rotation, at, x, y), direction_of(rotation)
         tangent = wp.sqrt(d[0] * d[0] + d[1] * d[1])
         if d[2] > _0 and tangent * shapes.max_slope[part] <= _RELIEF_LIMIT * d[2]:
             return at[2] + under_relief(shapes, part, o, d)
     return under_triangles(shapes, part, rotation, at, x, y)
+
+
+@wp.func
+def first_hit(
+    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
+) -> wp.float64:
+    """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
+    if shapes.kind[part] < MESH:
+        return under_primitive(shapes.kind[part], shapes.size[part], rotation, at, x, y)
+    return under_surface(shapes, part, rotation, at, x, y)
 
 
 @wp.func
