@@ -14,12 +14,11 @@ import numpy as np
 
 from experiments.running import recorded, run
 from raytac.io import CommonOptions
-from raytac.physics.rigid.search import PadSearch
+from raytac.physics import PadSearch
 from raytac.se3 import rotations
-from raytac.shapes.part import Part, mesh_part, primitive
-from raytac.shapes.underside import object_radius
+from raytac.shapes import Part, mesh_part, object_radius, primitive
 from raytac.specs import load_sensor
-from raytac.world.pad_overlap import PadOverlap
+from tests.physics.rigid.oracle import PadOverlap
 
 REACH = 0.1e-3
 """Gaps up to this are reported [m]."""

@@ -39,7 +39,7 @@ class Pads:
     """Nodes along x, (pads, grids)."""
     ny: wp.array2d(dtype=wp.int32)
     first_x: wp.array2d(dtype=wp.int32)
-    """Where the grid's nodes along x start in ``lines``."""
+    """Index in ``lines`` of the first node along x."""
     first_y: wp.array2d(dtype=wp.int32)
     cell: wp.array2d(dtype=wp.float64)
     """Area of one node [m²]."""

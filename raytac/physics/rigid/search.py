@@ -190,13 +190,13 @@ class PadSearch:
     def _read(self, rows: int, envs: np.ndarray) -> PadContacts:
         """Those of the first rows that are contacts, copied."""
         views = self._views or {name: getattr(self.rows, name).numpy() for name in _ROWS}
-        at = np.flatnonzero(views["found"][:rows])
+        at = np.flatnonzero(views["valid"][:rows])
         fields = {name: views[name][at] for name in _FIELDS}
         return PadContacts(env=envs[views["env"][at]], **fields)
 
 
 _ROWS = {
-    "found": wp.int32,
+    "valid": wp.int32,
     "env": wp.int32,
     "pad": wp.int32,
     "body": wp.int32,
@@ -208,7 +208,7 @@ _ROWS = {
     "force": wp.float64,
     "radius": wp.float64,
 }
-_FIELDS = tuple(name for name in _ROWS if name not in ("found", "env"))
+_FIELDS = tuple(name for name in _ROWS if name not in ("valid", "env"))
 _PLACED = {
     "part": wp.int32,
     "rotation": wp.mat33d,

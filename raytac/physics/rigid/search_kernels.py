@@ -57,14 +57,14 @@ _INF = wp.constant(wp.float64(float("inf")))
 _NAN = wp.constant(wp.float64(float("nan")))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _SEARCH, _ZOOM, _LAW = (wp.constant(wp.int32(k)) for k in range(3))
-"""What a pass over nodes is for: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
+"""Purpose of a pass over nodes: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
 
 
 @wp.struct
 class Rows:
     """Results, one row for each pair that is near; see ``PadContacts``."""
 
-    found: wp.array(dtype=wp.int32)
+    valid: wp.array(dtype=wp.int32)
     """1 where the pair touches, is within reach or has gone through."""
     env: wp.array(dtype=wp.int32)
     pad: wp.array(dtype=wp.int32)
@@ -379,7 +379,7 @@ def measure_pair(
 
     if least == _INF:
         if lane == 0:
-            rows.found[row] = 0
+            rows.valid[row] = 0
             if pierced:
                 missing_row(rows, row, thickness + bond - lowest, lowest - bond)
         return
@@ -418,7 +418,7 @@ def measure_pair(
     s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
     slope_x, slope_y = total_of(slope_x), total_of(slope_y)
     if lane == 0:
-        rows.found[row] = 1
+        rows.valid[row] = 1
         rows.depth[row] = depth
         rows.deepest[row] = deepest
         rows.clearance[row] = lowest - bond
@@ -446,7 +446,7 @@ def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth:
 @wp.func
 def missing_row(rows: Rows, row: wp.int32, depth: wp.float64, clearance: wp.float64):
     """A row without a law: of a body that is not over the gel but through it, or (NaN) of a pose that is not finite."""
-    rows.found[row] = 1
+    rows.valid[row] = 1
     rows.depth[row] = depth
     rows.clearance[row] = clearance
     rows.deepest[row] = _NAN

