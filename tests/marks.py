@@ -47,6 +47,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     "solver": (
         "ipc",
         "markers/test_other_models.py",
+        "physics/rigid/test_pad_search.py",
         "physics/test_soft.py",
         "physics/test_soft_batch.py",
         "physics/test_soft_forces.py",

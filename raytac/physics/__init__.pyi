@@ -8,7 +8,9 @@ from .press import CLEARANCE as CLEARANCE
 from .press import PressPad as PressPad
 from .registry import PHYSICS as PHYSICS
 from .registry import register as register
+from .rigid.contacts import PadContacts as PadContacts
 from .rigid.pad import RigidPad as RigidPad
+from .rigid.search import PadSearch as PadSearch
 from .soft.availability import quiet_solver as quiet_solver
 from .soft.bodies import ScenePad as ScenePad
 from .soft.bodies import scene_body as scene_body

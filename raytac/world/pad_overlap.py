@@ -198,7 +198,7 @@ class _Nodes:
         normal = np.stack([-slope_x, -slope_y, np.ones(len(values))], axis=1)
         normal /= np.sqrt(np.vecdot(normal, normal))[:, None]
         cell, clear = np.full(len(values), self.cell), np.full(len(values), self.near)
-        return Touches(env, -_refined(values), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
+        return Touches(env, -_refined(values, self.pitch), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
 
 
 def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
@@ -210,9 +210,9 @@ def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
     return np.minimum(np.maximum(first, 0), len(line) - nodes)[:, None] + np.arange(nodes)
 
 
-def _refined(gap: np.ndarray) -> np.ndarray:
+def _refined(gap: np.ndarray, pitch: float) -> np.ndarray:
     """The least gaps (n,) of (n, Ny, Nx) between the nodes: parabolas through the least node and its neighbours along both axes, exact
-    for a ball on a dome."""
+    for a ball on a dome; none where a neighbour is higher by half the pitch, for it lies beyond an edge."""
     n, ny, nx = gap.shape
     lowest = gap.reshape(n, -1).argmin(axis=1)
     j, i = np.divmod(lowest, nx)
@@ -221,7 +221,7 @@ def _refined(gap: np.ndarray) -> np.ndarray:
     step = np.where(inside, [[1], [nx]], 0)
     middle, before, after = (gap.take(lowest + offset * step) for offset in (0, -1, 1))
     curve = before + after - 2.0 * middle
-    bent = inside & np.isfinite(curve) & (curve > 0.0)
+    bent = inside & (curve > 0.0) & (np.maximum(before, after) < middle + 0.5 * pitch)
     rise = np.where(bent, after, 0.0) - np.where(bent, before, 0.0)
     return middle[0] - 0.125 * (rise * rise / np.where(bent, curve, 1.0)).sum(axis=0)
 

@@ -1,0 +1,119 @@
+"""Load law of a contact from its nodes' gaps, in Warp: ``LoadLaw`` at a few depths up to one that is given.
+
+Nodes are sorted into bins by the depth at which they count as in contact. Of each bin the number and the least and greatest gap are kept,
+so that the smoothing by half a node is that of ``LoadLaw`` at the edges of the bins, and exact.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from raytac.physics.rigid.contacts import LAW_POINTS
+from raytac.physics.rigid.shape_kernels import infinity
+
+__all__ = ["BINS", "Bins", "add_node", "clear_bins", "tabulate"]
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+_FINER = 4
+"""Bins between two depths of the table: where the area jumps, the force is known to a quarter of the table's spacing."""
+BINS = (LAW_POINTS - 1) * _FINER
+_BINS = wp.constant(wp.int32(BINS))
+_SCALE = wp.constant(wp.float64(BINS))
+_STEP = wp.constant(wp.int32(_FINER))
+_0 = wp.constant(wp.float64(0.0))
+_HALF = wp.constant(wp.float64(0.5))
+_INF = wp.constant(wp.float64(float("inf")))
+_PI = wp.constant(wp.float64(3.141592653589793))
+
+
+@wp.struct
+class Bins:
+    """Nodes of one contact by gap at touch, a row for each block of threads."""
+
+    count: wp.array2d(dtype=wp.int32)
+    low: wp.array2d(dtype=wp.float64)
+    """Least gap [m]; inf in an empty bin."""
+    high: wp.array2d(dtype=wp.float64)
+
+
+@wp.func
+def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
+    k = wp.int32(lane)
+    while k < _BINS:
+        bins.count[block, k] = 0
+        bins.low[block, k] = _INF
+        bins.high[block, k] = -_INF
+        k += lanes
+
+
+@wp.func
+def add_node(bins: Bins, block: wp.int32, gap: wp.float64, deepest: wp.float64):
+    """Add a node with a gap at touch in [0, ``deepest`` / 2) [m]; counts and extremes do not depend on the order."""
+    k = wp.min(wp.int32(wp.sqrt(wp.float64(2.0) * gap / deepest) * _SCALE), _BINS - 1)
+    wp.atomic_add(bins.count, block, k, 1)
+    wp.atomic_min(bins.low, block, k, gap)
+    wp.atomic_max(bins.high, block, k, gap)
+
+
+@wp.func
+def incremental_stiffness(radius: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
+    """dF/dδ [N/m] of a contact of a radius [m] on the bonded layer; ``law``: see ``law_constants``."""
+    ratio = radius / law[pad, 1]
+    stiffening = law[pad, 7]
+    for n in range(4):  # Horner's scheme
+        stiffening = stiffening * ratio + law[pad, 6 - n]
+    return law[pad, 0] * radius * wp.min(stiffening, wp.float64(1.0) + law[pad, 2] * ratio)
+
+
+@wp.func
+def tabulate(
+    bins: Bins,
+    block: wp.int32,
+    beyond: wp.float64,
+    deepest: wp.float64,
+    cell: wp.float64,
+    law: wp.array2d(dtype=wp.float64),
+    pad: wp.int32,
+    row: wp.int32,
+    # outputs
+    force: wp.array2d(dtype=wp.float64),
+    radius: wp.array2d(dtype=wp.float64),
+):
+    """Force and contact radius of one row at all depths of the table, by one thread; ``beyond``: least gap that is in no bin [m]."""
+    later = wp.float64(beyond + _0)
+    for back in range(_BINS):  # the least gap in this bin or a later one
+        k = _BINS - 1 - back
+        later = wp.min(later, bins.low[block, k])
+        bins.low[block, k] = later
+    nodes = wp.int32(0)
+    before = -infinity()
+    depth_before, stiffness_before, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for k in range(_BINS + 1):
+        share = wp.float64(k) / _SCALE
+        depth = deepest * share * share
+        if k > 0:
+            nodes += bins.count[block, k - 1]
+            before = wp.max(before, bins.high[block, k - 1])
+        counted = wp.float64(0.5)
+        if nodes > 0:
+            # Half a node at its own gap, so that the area grows continuously from node to node.
+            counted = wp.float64(nodes) - _HALF
+            after = wp.float64(beyond + _0)
+            if k < _BINS:
+                after = bins.low[block, k]
+            if after < _INF and after > before:
+                counted += wp.clamp((_HALF * depth - before) / (after - before), _0, wp.float64(1.0))
+        a = wp.sqrt(wp.max(counted, _HALF) * cell / _PI)
+        stiffness = incremental_stiffness(a, law, pad)
+        if k > 0:
+            total += _HALF * (stiffness + stiffness_before) * (depth - depth_before)
+        depth_before, stiffness_before = depth, stiffness
+        if k % _STEP == 0:
+            force[row, k // _STEP] = total
+            radius[row, k // _STEP] = a

@@ -1,0 +1,265 @@
+"""Parts of one body placed in a pad's frame, and the pad's grids of nodes, in Warp."""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive, under_surface
+
+__all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "under_nodes", "width_of", "window"]
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+_PLANE, _MESH = wp.constant(wp.int32(0)), wp.constant(wp.int32(8))
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
+_2 = wp.constant(wp.float64(2.0))
+_INF = wp.constant(wp.float64(float("inf")))
+_SLACK = wp.constant(wp.float64(1e-9))
+"""Boxes are widened by this [m], so that rounding leaves out no node on an edge."""
+
+
+@wp.struct
+class Pads:
+    """All pads with their grids, coarse to fine; lengths [m]."""
+
+    half: wp.array(dtype=wp.vec2d)
+    """Half edges along x and y."""
+    thickness: wp.array(dtype=wp.float64)
+    highest: wp.array(dtype=wp.float64)
+    """Highest node of the resting gel."""
+    pitch: wp.array(dtype=wp.float64)
+    """Nominal spacing of each grid."""
+    nx: wp.array2d(dtype=wp.int32)
+    """Nodes along x, (pads, grids)."""
+    ny: wp.array2d(dtype=wp.int32)
+    first_x: wp.array2d(dtype=wp.int32)
+    """Index in ``lines`` of the first node along x."""
+    first_y: wp.array2d(dtype=wp.int32)
+    cell: wp.array2d(dtype=wp.float64)
+    """Area of one node [m²]."""
+    lines: wp.array(dtype=wp.vec3d)
+    """Place, height of the resting gel and its slope; the gel is the sum of a function of x and one of y (``GelpadSpec.sag``)."""
+    law: wp.array2d(dtype=wp.float64)
+    """Constants of the load law (pads, 8)."""
+
+
+@wp.struct
+class Placed:
+    """Parts of the body that each block of threads measures, (blocks, most parts)."""
+
+    count: wp.array(dtype=wp.int32)
+    """Parts of the body."""
+    part: wp.array2d(dtype=wp.int32)
+    """Index of the part; −1 where it is not near the pad."""
+    rotation: wp.array2d(dtype=wp.mat33d)
+    at: wp.array2d(dtype=wp.vec3d)
+    centre: wp.array2d(dtype=wp.vec3d)
+    half: wp.array2d(dtype=wp.vec3d)
+    """Half edges of the box about ``centre`` that holds the part."""
+    radius: wp.array2d(dtype=wp.float64)
+    bottom: wp.array2d(dtype=wp.float64)
+    """Lower bound of z over the pad."""
+    width: wp.array2d(dtype=wp.float64)
+    """Least width of the part as seen along z."""
+    blunt: wp.array2d(dtype=wp.float64)
+    """See ``Shapes``."""
+
+
+@wp.func
+def rotation_of(pose: wp.mat44d) -> wp.mat33d:
+    return wp.mat33d(pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2])
+
+
+@wp.func
+def bottom_near(
+    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, pads: Pads, pad: wp.int32, reach: wp.float64
+) -> wp.float64:
+    """Lower bound of z [m] of a part over the pad; inf if it stays out of reach of the gel and the layer behind it."""
+    half_x, half_y, highest = pads.half[pad][0], pads.half[pad][1], pads.highest[pad] + reach
+    bottom = infinity()
+    if shapes.kind[part] == _PLANE:
+        n = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
+        if n[2] < _0:
+            bottom = at[2] + (n[0] * at[0] + n[1] * at[1] + wp.abs(n[0]) * half_x + wp.abs(n[1]) * half_y) / n[2]
+    else:
+        c, h = rotation * shapes.centre[part] + at, part_box(shapes, part, rotation, at)
+        beside = wp.abs(c[0]) > half_x + h[0] or wp.abs(c[1]) > half_y + h[1]
+        if not beside and c[2] + h[2] > -_2 * pads.thickness[pad]:
+            bottom = c[2] - h[2]
+    if bottom < highest:
+        return bottom
+    return _INF
+
+
+@wp.func
+def lowest_of(shapes: Shapes, part: wp.int32, pose: wp.mat44d, pads: Pads, pad: wp.int32, reach: wp.float64) -> wp.float64:
+    """``bottom_near`` of a part of a body at a pose."""
+    rotation = rotation_of(pose)
+    at = rotation * shapes.offset[part] + wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    return bottom_near(shapes, part, rotation * shapes.rotation[part], at, pads, pad, reach)
+
+
+@wp.func
+def width_along_z(shapes: Shapes, part: wp.int32, rotation: wp.mat33d) -> wp.float64:
+    """Least width [m] of the outline of the part's own box as seen along z, square to one of its edges."""
+    result, half = wp.float64(shapes.width[part]), shapes.half[part]
+    for k in range(3):
+        x, y = half[k] * rotation[0, k], half[k] * rotation[1, k]
+        length = wp.sqrt(x * x + y * y)
+        if length > wp.float64(1e-9):
+            across = wp.float64(0.0)
+            for m in range(3):
+                across += _2 * half[m] * wp.abs(x * rotation[1, m] - y * rotation[0, m]) / length
+            result = wp.min(result, across)
+    return result
+
+
+@wp.func
+def place_parts(
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, pose: wp.mat44d, pad: wp.int32,
+    body: wp.int32, reach: wp.float64,
+):  # fmt: skip
+    """Place the parts of a body; a barrier must follow."""
+    first = shapes.first_part[body]
+    count = shapes.first_part[body + 1] - first
+    if lane == 0:
+        placed.count[block] = count
+    turn = rotation_of(pose)
+    origin = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    k = wp.int32(lane)
+    while k < count:
+        part = first + k
+        rotation, at = turn * shapes.rotation[part], turn * shapes.offset[part] + origin
+        bottom = bottom_near(shapes, part, rotation, at, pads, pad, reach)
+        placed.part[block, k] = wp.where(bottom < _INF, part, -1)
+        placed.rotation[block, k] = rotation
+        placed.at[block, k] = at
+        placed.centre[block, k] = rotation * shapes.centre[part] + at
+        placed.half[block, k] = part_box(shapes, part, rotation, at) + wp.vec3d(_SLACK, _SLACK, _SLACK)
+        placed.radius[block, k] = shapes.radius[part] + _SLACK
+        placed.bottom[block, k] = bottom
+        width = infinity()
+        if shapes.kind[part] != _PLANE:
+            width = width_along_z(shapes, part, rotation)
+        placed.width[block, k] = width
+        placed.blunt[block, k] = shapes.blunt[part]
+        k += lanes
+
+
+@wp.func
+def bottom_of(placed: Placed, block: wp.int32) -> wp.float64:
+    """Lower bound of z of the placed parts."""
+    result = infinity()
+    for k in range(placed.count[block]):
+        result = wp.min(result, placed.bottom[block, k])
+    return result
+
+
+@wp.func
+def width_of(placed: Placed, block: wp.int32) -> wp.vec2d:
+    """Least ``width`` and ``blunt`` of the placed parts."""
+    width, blunt = infinity(), infinity()
+    for k in range(placed.count[block]):
+        if placed.part[block, k] >= 0:
+            width, blunt = wp.min(width, placed.width[block, k]), wp.min(blunt, placed.blunt[block, k])
+    return wp.vec2d(width, blunt)
+
+
+@wp.func
+def nodes_within(first: wp.int32, count: wp.int32, low: wp.float64, high: wp.float64, pads: Pads) -> wp.vec2i:
+    """First and one beyond the last of a line's nodes from ``low`` to ``high``."""
+    start = pads.lines[first][0]
+    step = pads.lines[first + 1][0] - start
+    top = wp.float64(count)
+    return wp.vec2i(
+        wp.int32(wp.clamp(wp.ceil((low - start) / step), _0, top)),
+        wp.int32(wp.clamp(wp.floor((high - start) / step) + _1, _0, top)),
+    )
+
+
+@wp.func
+def window(pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, below: wp.float64) -> wp.vec4i:
+    """Nodes of a grid over which a placed part may be lower than ``below`` [m]: x from, to, y from, to."""
+    low_x, high_x, low_y, high_y = infinity(), -infinity(), infinity(), -infinity()
+    for k in range(placed.count[block]):
+        if placed.part[block, k] >= 0 and placed.bottom[block, k] <= below:
+            c, h = placed.centre[block, k], placed.half[block, k]
+            # In a ball, what is lower than a plane beneath its centre lies in a disc.
+            radius, above = placed.radius[block, k], c[2] - below
+            disc = infinity()
+            if above > _0 and radius < _INF:
+                disc = wp.sqrt(wp.max(radius * radius - above * above, _0)) + _SLACK
+            reach_x, reach_y = wp.min(h[0], disc), wp.min(h[1], disc)
+            low_x, high_x = wp.min(low_x, c[0] - reach_x), wp.max(high_x, c[0] + reach_x)
+            low_y, high_y = wp.min(low_y, c[1] - reach_y), wp.max(high_y, c[1] + reach_y)
+    columns = nodes_within(pads.first_x[pad, level], pads.nx[pad, level], low_x, high_x, pads)
+    rows = nodes_within(pads.first_y[pad, level], pads.ny[pad, level], low_y, high_y, pads)
+    return wp.vec4i(columns[0], columns[1], rows[0], rows[1])
+
+
+@wp.func
+def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.float64, top: wp.bool) -> wp.float64:
+    """Lowest z [m] of the placed parts on the line at x, y, inf if it misses all; or (``top``) the highest, inf of a half-space.
+
+    The top of a body is the underside of the body turned over about x.
+    """
+    result = infinity()
+    for k in range(placed.count[block]):
+        part = placed.part[block, k]
+        if part >= 0:
+            c, h = placed.centre[block, k], placed.half[block, k]
+            if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
+                turn, side = wp.mat33d(placed.rotation[block, k]), wp.float64(1.0)
+                if top:
+                    if shapes.kind[part] == _PLANE:
+                        return _INF
+                    side = wp.float64(-1.0)
+                over = wp.diag(wp.vec3d(_1, side, side))
+                at = over * placed.at[block, k]
+                result = wp.min(result, first_hit(shapes, part, over * turn, at, x, side * y))
+    if top:
+        return -result
+    return result
+
+
+@wp.func
+def under_nodes(
+    shapes: Shapes, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, lines: wp.array(dtype=wp.vec3d),
+    first_x: wp.int32, first_y: wp.int32, nx: wp.int32, n: wp.int32,
+    # outputs
+    height: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """``under`` on n nodes, rows of ``nx``, each thread its own; the first ones are at ``first_x``, ``first_y`` of ``lines``."""
+    k = wp.int32(lane)
+    while k < n:
+        height[block, k] = _INF
+        k += lanes
+    for m in range(placed.count[block]):
+        part = placed.part[block, m]
+        if part >= 0:
+            c, h = placed.centre[block, m], placed.half[block, m]
+            rotation, at = placed.rotation[block, m], placed.at[block, m]
+            kind, size = shapes.kind[part], shapes.size[part]
+            i, j = wp.int32(lane), wp.int32(0)
+            k = wp.int32(lane)
+            while k < n:
+                while i >= nx:
+                    i -= nx
+                    j += 1
+                x, y = lines[first_x + i][0], lines[first_y + j][0]
+                if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
+                    z = wp.float64(0.0)
+                    if kind < _MESH:
+                        z = under_primitive(kind, size, rotation, at, x, y)
+                    else:
+                        z = under_surface(shapes, part, rotation, at, x, y)
+                    if z < height[block, k]:
+                        height[block, k] = z
+                i += lanes
+                k += lanes

@@ -1,0 +1,493 @@
+"""Search for contacts of resting pads and bodies in Warp: broad phase, grid of nodes, depth, centroid, load law.
+
+One block of threads measures one pair after the other, so that nothing depends on how many pairs there are. Threads share the nodes of a
+window; sums are those of a tile, in a fixed order. On a CPU a block is one thread.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from raytac.physics.rigid.contacts import LAW_POINTS
+from raytac.physics.rigid.law_kernels import Bins, add_node, clear_bins, tabulate
+from raytac.physics.rigid.placed_kernels import (
+    Pads,
+    Placed,
+    bottom_of,
+    lowest_of,
+    place_parts,
+    under,
+    under_nodes,
+    width_of,
+    window,
+)
+from raytac.physics.rigid.shape_kernels import Shapes, infinity
+
+__all__ = ["ENOUGH", "PITCHES", "Rows", "find_near", "measure"]
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+PITCHES = 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
+"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes. The last two are for bodies that are
+narrower there than two cells of the third."""
+ENOUGH = 150
+"""Nodes: 96 mm² of the first grid, 24 mm² of the second."""
+_ENOUGH = wp.constant(wp.int32(ENOUGH))
+_LAST = wp.constant(wp.int32(2))
+"""Last grid of bodies that are not narrow."""
+_FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
+_NEAR = wp.constant(wp.float64(0.75))
+"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
+_JUST_TOUCHING = wp.constant(wp.float64(50e-6))
+"""The place of a gap is the centroid of the overlap that the body would have so much deeper [m]."""
+_DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
+"""Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own."""
+_STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
+_SHALLOWEST = wp.constant(wp.float64(10e-6))
+"""Least depth up to which a law is tabulated [m]."""
+_0 = wp.constant(wp.float64(0.0))
+_2 = wp.constant(wp.float64(2.0))
+_HALF = wp.constant(wp.float64(0.5))
+_INF = wp.constant(wp.float64(float("inf")))
+_NAN = wp.constant(wp.float64(float("nan")))
+_MANY = wp.constant(wp.int32(0x7FFFFFFF))
+_SEARCH, _ZOOM, _LAW = (wp.constant(wp.int32(k)) for k in range(3))
+"""Purpose of a pass over nodes: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
+
+
+@wp.struct
+class Rows:
+    """Results, one row for each pair that is near; see ``PadContacts``."""
+
+    valid: wp.array(dtype=wp.int32)
+    """1 where the pair touches, is within reach or has gone through."""
+    env: wp.array(dtype=wp.int32)
+    pad: wp.array(dtype=wp.int32)
+    body: wp.array(dtype=wp.int32)
+    depth: wp.array(dtype=wp.float64)
+    centre: wp.array(dtype=wp.vec3d)
+    normal: wp.array(dtype=wp.vec3d)
+    clearance: wp.array(dtype=wp.float64)
+    deepest: wp.array(dtype=wp.float64)
+    force: wp.array2d(dtype=wp.float64)
+    radius: wp.array2d(dtype=wp.float64)
+
+
+@wp.struct
+class Work:
+    """Memory of the blocks."""
+
+    placed: Placed
+    bins: Bins
+    gap: wp.array2d(dtype=wp.float64)
+    """Gaps of a window's nodes [m], (blocks, most nodes)."""
+
+
+@wp.kernel
+def find_near(
+    poses: wp.array3d(dtype=wp.mat44d),
+    reach: wp.array2d(dtype=wp.float64),
+    shapes: Shapes,
+    pads: Pads,
+    # outputs
+    near: wp.array(dtype=wp.int32),
+):
+    """1 for pairs whose boxes come within reach of the pad's, and for poses that are not finite."""
+    env, pad, body = wp.tid()
+    pose = poses[env, pad, body]
+    result = wp.int32(0)
+    if not is_finite(pose):
+        result = 1
+    else:
+        radius = shapes.ball[body] + reach[env, pad]
+        if pose[2, 3] - radius < pads.highest[pad] and pose[2, 3] + radius > -_2 * pads.thickness[pad]:
+            for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
+                if lowest_of(shapes, part, pose, pads, pad, reach[env, pad]) < _INF:
+                    result = 1
+    near[(env * poses.shape[1] + pad) * poses.shape[2] + body] = result
+
+
+@wp.func
+def is_finite(pose: wp.mat44d) -> wp.bool:
+    total = wp.float64(0.0)
+    for i in range(3):
+        for j in range(4):
+            total += wp.abs(pose[i, j])
+    return wp.isfinite(total)
+
+
+@wp.func
+def total_of(value: wp.float64) -> wp.float64:
+    """Sum over the block; also a barrier."""
+    return wp.tile_sum(wp.tile(value))[0]
+
+
+@wp.func
+def count_of(value: wp.int32) -> wp.int32:
+    return wp.tile_sum(wp.tile(value))[0]
+
+
+@wp.func
+def least_of(value: wp.float64) -> wp.float64:
+    return wp.tile_min(wp.tile(value))[0]
+
+
+@wp.func
+def first_of(value: wp.int32) -> wp.int32:
+    return wp.tile_min(wp.tile(value))[0]
+
+
+@wp.func
+def pierced_at(
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, pad: wp.int32, level: wp.int32
+) -> wp.float64:
+    """Lowest z [m] of the body on lines on which it lies in the layer of one thickness behind the bonded face; inf if on none.
+
+    Lines on which it lies wholly behind that layer do not count, nor the pad's outermost lines: MuJoCo lets bodies some hundredths of a
+    millimetre into walls, and a case may be as wide as its gel.
+    """
+    bond = -pads.thickness[pad]
+    area = window(pads, placed, block, pad, level, bond)
+    i0, j0 = wp.max(area[0], 1), wp.max(area[2], 1)
+    nx = wp.min(area[1], pads.nx[pad, level] - 1) - i0
+    n = wp.max(nx, 0) * wp.max(wp.min(area[3], pads.ny[pad, level] - 1) - j0, 0)
+    lowest = infinity()
+    k = wp.int32(lane)
+    while k < n:
+        x = pads.lines[pads.first_x[pad, level] + i0 + k % nx][0]
+        y = pads.lines[pads.first_y[pad, level] + j0 + k // nx][0]
+        z = under(shapes, placed, block, x, y, False)
+        if z < bond and z < lowest:
+            if under(shapes, placed, block, x, y, True) > bond - pads.thickness[pad]:
+                lowest = z
+        k += lanes
+    return least_of(lowest)
+
+
+@wp.func
+def height_at(
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32
+) -> wp.vec2d:
+    """z [m] of the body over node i, j, and its gap to the gel; inf where there is none or it is below the bonded face."""
+    if i < 0 or j < 0 or i >= pads.nx[pad, level] or j >= pads.ny[pad, level]:
+        return wp.vec2d(_INF, _INF)
+    x, y = pads.lines[pads.first_x[pad, level] + i], pads.lines[pads.first_y[pad, level] + j]
+    z = under(shapes, placed, block, x[0], y[0], False)
+    if z < -pads.thickness[pad]:
+        return wp.vec2d(_INF, _INF)
+    return wp.vec2d(z, z - x[1] - y[1])
+
+
+@wp.func
+def vertex_of(before: wp.float64, middle: wp.float64, after: wp.float64, pitch: wp.float64) -> wp.vec2d:
+    """Drop below the middle of a parabola through three values at −1, 0, 1, and where; (0, 0) if it is none.
+
+    Where a neighbour is higher by half the pitch, it lies beyond an edge, through which no parabola goes.
+    """
+    curve = before + after - _2 * middle
+    if curve > _0 and wp.max(before, after) < middle + _HALF * pitch:
+        rise = after - before
+        return wp.vec2d(wp.float64(0.125) * rise * rise / curve, -_HALF * rise / curve)
+    return wp.vec2d(_0, _0)
+
+
+@wp.func
+def between_nodes(
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32,
+    middle: wp.float64, of: wp.int32,
+) -> wp.vec3d:  # fmt: skip
+    """Drop [m] below ``middle``, the z (``of`` 0) or gap (1) at node i, j, and the place of the least along x and y [nodes].
+
+    By parabolas through the neighbours along both axes.
+    """
+    beside = wp.vec4d()
+    k = wp.int32(0)
+    while k < 4:  # a loop that is not unrolled: the compiler's time goes by the code
+        step = wp.where(k % 2 == 0, -1, 1)
+        p, q = i + wp.where(k < 2, step, 0), j + wp.where(k < 2, 0, step)
+        beside[k] = height_at(shapes, pads, placed, block, pad, level, p, q)[of]
+        k += 1
+    across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
+    along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
+    return wp.vec3d(across[0] + along[0], across[1], along[1])
+
+
+@wp.func
+def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
+    """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
+    deepest = wp.max(_DEEPER * depth, depth + reach)
+    if depth > _0 and deepest < thickness:
+        k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
+        if k >= wp.float64(6.0):
+            deepest = depth * (_STEPS / k) * (_STEPS / k)
+    return wp.max(wp.min(deepest, thickness), wp.max(depth, _SHALLOWEST))
+
+
+@wp.func
+def measure_pair(
+    pose: wp.mat44d, reach: wp.float64, shapes: Shapes, pads: Pads, work: Work, block: wp.int32, lane: wp.int32, lanes: wp.int32,
+    pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
+):  # fmt: skip
+    """Fill one row."""
+    placed = work.placed
+    place_parts(shapes, pads, placed, block, lane, lanes, pose, pad, body, reach)
+    total_of(_0)
+    bond, thickness, highest = -pads.thickness[pad], pads.thickness[pad], pads.highest[pad]
+    bottom, width = bottom_of(placed, block), width_of(placed, block)
+    # Nodes up to there are counted by the law.
+    clear = wp.max(reach, (_HALF * _DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness))
+    last = wp.int32(_LAST)
+    while last < _FINEST and pads.pitch[last] > _HALF * width[0]:
+        last += 1
+    lowest = infinity()  # of the body over the pad
+    if bottom < bond:
+        lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, last)
+    pierced = lowest < _INF
+
+    mode, level, touching = wp.int32(_SEARCH), wp.int32(0), wp.int32(0)
+    left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+    zero = wp.float64(0.0)  # gap below which nodes count
+    depth, deepest, least = wp.float64(0.0), wp.float64(0.0), infinity()
+    refined_x, refined_y = wp.float64(0.0), wp.float64(0.0)
+    i0, j0, nx, n = wp.int32(0), wp.int32(0), wp.int32(1), wp.int32(0)
+    fx, fy = wp.int32(0), wp.int32(0)
+    may_zoom, busy = wp.int32(1), wp.int32(1)
+    while busy == 1:
+        pitch = pads.pitch[level]
+        wide = pitch <= _HALF * wp.min(width[0], width[1])  # so that nothing of the body fits between nodes
+        near = wp.where(level < last, _NEAR * pitch, _0)
+        area = window(pads, placed, block, pad, level, highest + wp.max(zero, wp.max(near, clear)))
+        fx, fy = wp.int32(pads.first_x[pad, level]), wp.int32(pads.first_y[pad, level])
+        step_x = pads.lines[fx + 1][0] - pads.lines[fx][0]
+        step_y = pads.lines[fy + 1][0] - pads.lines[fy][0]
+        x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
+        i0, j0 = area[0], area[2]
+        i1, j1 = area[1], area[3]
+        if left > -_INF:
+            i0 = wp.max(i0, wp.int32(wp.ceil((left - x0) / step_x)))
+            i1 = wp.min(i1, wp.int32(wp.floor((right - x0) / step_x)) + 1)
+            j0 = wp.max(j0, wp.int32(wp.ceil((front - y0) / step_y)))
+            j1 = wp.min(j1, wp.int32(wp.floor((rear - y0) / step_y)) + 1)
+        nx = wp.max(i1 - i0, 0)
+        n = nx * wp.max(j1 - j0, 0)
+        if level < last and n < _ENOUGH:  # so few cannot be enough
+            level += 1
+            continue
+        if n > work.gap.shape[1]:  # narrow bodies are looked at on finer grids as far as the memory goes
+            level -= 1
+            last = wp.int32(level)
+            continue
+        keep = _NEAR * pitch + clear
+        count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
+        own_least, own_low = infinity(), infinity()
+        a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
+        under_nodes(shapes, placed, block, lane, lanes, pads.lines, fx + i0, fy + j0, nx, n, work.gap)
+        i, j = i0 + lane, wp.int32(j0)
+        k = wp.int32(lane)
+        while k < n:
+            while i >= i0 + nx:
+                i -= nx
+                j += 1
+            z = work.gap[block, k]
+            gap = infinity()
+            if z >= bond and z < _INF:
+                gap = z - pads.lines[fx + i][1] - pads.lines[fy + j][1]
+                if z < own_low:
+                    own_low = z
+                    low_node = k
+                if gap < zero:
+                    count += 1
+                if gap < own_least:
+                    own_least = gap
+                    near_node = k
+                if gap < keep:
+                    a0, a1, b0, b1 = wp.min(a0, i), wp.min(a1, -i), wp.min(b0, j), wp.min(b1, -j)
+            work.gap[block, k] = gap
+            i += lanes
+            k += lanes
+        count = count_of(count)
+        if mode == _LAW:
+            if count >= _ENOUGH or level >= last:
+                busy = 0
+            level += 1
+            continue
+        least = least_of(own_least)
+        near_node = first_of(wp.where(own_least == least, near_node, _MANY))
+        low = least_of(own_low)
+        low_node = first_of(wp.where(own_low == low, low_node, _MANY))
+        a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
+        if mode == _ZOOM and count > 0:  # it does touch, between the nodes that were looked at
+            mode, may_zoom = wp.int32(_SEARCH), wp.int32(0)
+            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+            continue
+        i, j = wp.int32(0), wp.int32(0)  # of the least gap
+        if least < _INF:
+            j = near_node // nx
+            i = i0 + near_node - j * nx
+            j += j0
+        done = level >= last or count >= _ENOUGH
+        beyond = wp.bool(False)
+        if not done and wide and least >= near:
+            beyond = least >= reach + near
+            done = beyond
+            if not done and may_zoom == 1:
+                mode = wp.int32(_ZOOM)
+        if not done:
+            following = level + 1
+            if mode == _ZOOM:
+                left, right = pads.lines[fx + i][0] - step_x, pads.lines[fx + i][0] + step_x
+                front, rear = pads.lines[fy + j][0] - step_y, pads.lines[fy + j][0] + step_y
+            else:
+                # With half the spacing there are four times as many nodes: of few, at most half of enough.
+                if count < _ENOUGH // 8:
+                    following = wp.max(following, wp.min(last, _LAST))
+                if wide and width[1] == _INF and a0 < _MANY:
+                    left, right = pads.lines[fx + a0][0] - step_x, pads.lines[fx + a1][0] + step_x
+                    front, rear = pads.lines[fy + b0][0] - step_y, pads.lines[fy + b1][0] + step_y
+            level = following
+            continue
+        busy = 0
+        # The body's lowest point, and its least gap, between the nodes.
+        if not pierced and low < _INF:
+            q = low_node // nx
+            p = i0 + low_node - q * nx
+            q += j0
+            lowest = wp.max(low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0], bond)
+        if beyond or least == _INF:
+            least = _INF
+            continue
+        drop = between_nodes(shapes, pads, placed, block, pad, level, i, j, least, 1)
+        depth = drop[0] - least
+        refined_x = pads.lines[fx + i][0] + drop[1] * step_x
+        refined_y = pads.lines[fy + j][0] + drop[2] * step_y
+        deepest = deepest_of(depth, reach, thickness)
+        if least < _0:
+            touching = 1
+            level += 1  # as after the law's nodes
+        elif -depth >= reach:
+            least = _INF
+        else:
+            mode, level, busy = wp.int32(_LAW), wp.int32(0), wp.int32(1)
+            zero = _HALF * deepest - depth
+            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+    level -= 1
+
+    if least == _INF:
+        if lane == 0:
+            rows.valid[row] = 0
+            if pierced:
+                missing_row(rows, row, thickness + bond - lowest, lowest - bond)
+        return
+
+    # Moments of the overlap, or of that which a near body would have a little deeper.
+    shift = wp.float64(0.0)
+    if touching == 0:
+        shift = wp.min(_HALF * deepest, _JUST_TOUCHING) - depth
+    s, sx, sy, sz, szz, slope_x, slope_y = (
+        wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
+    )  # fmt: skip
+    clear_bins(work.bins, block, lane, lanes)
+    total_of(_0)
+    beyond_law = infinity()
+    k = wp.int32(lane)
+    while k < n:
+        gap = work.gap[block, k]
+        if gap < _INF:
+            overlap = shift - gap
+            if overlap > _0:
+                j = k // nx
+                u, v = pads.lines[fx + i0 + k - j * nx], pads.lines[fy + j0 + j]
+                s += overlap
+                sx += overlap * u[0]
+                sy += overlap * v[0]
+                sz += overlap * (u[1] + v[1])
+                szz += overlap * overlap
+                slope_x += overlap * u[2]
+                slope_y += overlap * v[2]
+            if _2 * (gap + depth) < deepest:
+                add_node(work.bins, block, wp.max(gap + depth, _0), deepest)
+            else:
+                beyond_law = wp.min(beyond_law, gap + depth)
+        k += lanes
+    beyond_law = least_of(beyond_law)
+    s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
+    slope_x, slope_y = total_of(slope_x), total_of(slope_y)
+    if lane == 0:
+        rows.valid[row] = 1
+        rows.depth[row] = depth
+        rows.deepest[row] = deepest
+        rows.clearance[row] = lowest - bond
+        if s > _0:
+            rows.centre[row] = wp.vec3d(sx / s, sy / s, sz / s - szz / s + shift)
+            rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
+        else:
+            place_of_gap(pads, pad, refined_x, refined_y, depth, row, rows)
+        tabulate(work.bins, block, beyond_law, deepest, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
+
+
+@wp.func
+def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows):
+    """Place and normal where the gap is least, of a body too sharp to have nodes of its own there."""
+    fx, fy = pads.first_x[pad, _LAST], pads.first_y[pad, _LAST]
+    i = wp.int32(wp.round((x - pads.lines[fx][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])))
+    j = wp.int32(wp.round((y - pads.lines[fy][0]) / (pads.lines[fy + 1][0] - pads.lines[fy][0])))
+    p = pads.lines[fx + wp.clamp(i, 0, pads.nx[pad, _LAST] - 1)]
+    q = pads.lines[fy + wp.clamp(j, 0, pads.ny[pad, _LAST] - 1)]
+    rest = p[1] + p[2] * (x - p[0]) + q[1] + q[2] * (y - q[0])
+    rows.centre[row] = wp.vec3d(x, y, rest - depth)
+    rows.normal[row] = wp.normalize(wp.vec3d(-p[2], -q[2], wp.float64(1.0)))
+
+
+@wp.func
+def missing_row(rows: Rows, row: wp.int32, depth: wp.float64, clearance: wp.float64):
+    """A row without a law: of a body that is not over the gel but through it, or (NaN) of a pose that is not finite."""
+    rows.valid[row] = 1
+    rows.depth[row] = depth
+    rows.clearance[row] = clearance
+    rows.deepest[row] = _NAN
+    rows.centre[row] = wp.vec3d(_NAN, _NAN, _NAN)
+    rows.normal[row] = wp.vec3d(_NAN, _NAN, _NAN)
+    for k in range(rows.force.shape[1]):
+        rows.force[row, k] = _NAN
+        rows.radius[row, k] = _NAN
+
+
+@wp.kernel
+def measure(
+    poses: wp.array3d(dtype=wp.mat44d),
+    reach: wp.array2d(dtype=wp.float64),
+    shapes: Shapes,
+    pads: Pads,
+    near: wp.array(dtype=wp.int32),
+    ends: wp.array(dtype=wp.int32),
+    blocks: wp.int32,
+    pairs: wp.int32,
+    work: Work,
+    rows: Rows,
+):
+    """Rows of all pairs that are near, in their order; ``ends``: running number of these. Rows beyond the memory are left out."""
+    block, lane = wp.tid()
+    lanes = wp.block_dim()
+    pair = wp.int32(block)
+    while pair < pairs:
+        row = ends[pair] - 1
+        if near[pair] != 0 and row < rows.depth.shape[0]:
+            body = pair % poses.shape[2]
+            rest = pair // poses.shape[2]
+            pad = rest % poses.shape[1]
+            env = rest // poses.shape[1]
+            pose = poses[env, pad, body]
+            if lane == 0:
+                rows.env[row] = env
+                rows.pad[row] = pad
+                rows.body[row] = body
+            if is_finite(pose):
+                measure_pair(pose, reach[env, pad], shapes, pads, work, block, lane, lanes, pad, body, row, rows)
+            elif lane == 0:
+                missing_row(rows, row, _NAN, _NAN)
+        pair += blocks

@@ -1,0 +1,329 @@
+"""Search for contacts by kernels: against the NumPy reference, and what a search must not depend on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from raytac.errors import InputError
+from raytac.gel.surface import make_grid
+from raytac.physics.rigid import load_law
+from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
+from raytac.physics.rigid.search import PadSearch
+from raytac.se3 import rotations
+from raytac.shapes.part import Part, mesh_part, primitive
+from raytac.shapes.relief import relief_part
+from raytac.shapes.underside import object_height, object_radius
+from raytac.specs import load_sensor
+from raytac.specs.sensor import GelpadSpec
+from raytac.world.forbidden_overlap import BondedFace
+from tests.physics.rigid.oracle import PadOverlap
+
+DOME = load_sensor("gelsight_mini").gelpad
+FLAT = replace(DOME, dome_radius=(math.inf, math.inf))
+PRIMITIVES = "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "torus"
+KINDS = (*PRIMITIVES, "plane", "ball_mesh", "ring_mesh", "open_mesh", "relief", "compound")
+REACH = 50e-6
+
+
+def part_of(kind: str, rng: np.random.Generator) -> Part:
+    """A part whose narrowest side the reference's grid resolves."""
+    length = rng.uniform
+    if kind == "sphere":
+        return primitive(kind, (length(2e-3, 12e-3),))
+    if kind == "capsule":
+        return primitive(kind, (length(1e-3, 6e-3), length(1e-3, 15e-3)))
+    if kind in ("ellipsoid", "box"):
+        return primitive(kind, tuple(length(1.5e-3, 20e-3, 3)))
+    if kind == "cylinder":
+        return primitive(kind, tuple(length(1.5e-3, 12e-3, 2)))
+    if kind == "cone":
+        return primitive(kind, (length(3e-3, 8e-3), length(3e-3, 10e-3), length(0.3e-3, 1e-3)))
+    if kind == "torus":
+        minor = length(1e-3, 3e-3)
+        return primitive(kind, (minor + length(1e-3, 6e-3), minor))
+    if kind == "plane":
+        return primitive(kind)
+    if kind == "ring_mesh":
+        mesh = trimesh.creation.annulus(2e-3, 6e-3, 5e-3, sections=40)
+        return mesh_part(mesh.vertices, mesh.faces)
+    if kind == "relief":
+        line = np.linspace(-1.0, 1.0, 41)
+        pattern = np.clip(1.2 - np.hypot(*np.meshgrid(line, line)), 0.0, None) * (1.0 + 0.3 * np.sin(7.0 * line))
+        return relief_part(0.4e-3 * pattern, 6e-3)
+    mesh = trimesh.creation.icosphere(3, 1.0)
+    if kind == "ball_mesh":
+        return mesh_part(mesh.vertices * length(3e-3, 9e-3, 3), mesh.faces)
+    bowl = mesh.faces[(mesh.vertices[mesh.faces][:, :, 2] < 0.4).all(axis=1)]
+    return mesh_part(5e-3 * mesh.vertices, bowl)
+
+
+def body_of(kind: str, rng: np.random.Generator) -> list[Part]:
+    def moved(part: Part, most: float) -> Part:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotations(rng.normal(size=(1, 3)))[0], rng.uniform(-most, most, 3)
+        return replace(part, object_from_part=pose)
+
+    if kind == "compound":
+        return [moved(part_of(one, rng), 4e-3) for one in rng.choice((*PRIMITIVES, "ball_mesh"), rng.integers(2, 5))]
+    part = part_of(kind, rng)
+    return [part] if kind in ("plane", "relief") or rng.random() < 0.5 else [moved(part, 3e-3)]
+
+
+def turn_of(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Any turn; planes and reliefs face the pad, flat faces often lie nearly flat on it."""
+    turn = rng.normal(size=3)
+    if kind == "plane":
+        turn = np.array([math.pi, 0.0, 0.0]) + rng.normal(0.0, 0.04, 3)
+    elif kind == "relief":
+        turn = rng.normal(0.0, 0.1, 3)
+    elif kind in ("box", "cylinder", "compound") and rng.random() < 0.4:
+        turn = rng.normal(0.0, 0.02, 3)
+    return rotations(turn[None])[0]
+
+
+def pressed(gelpad: GelpadSpec, count: int, seed: int) -> tuple[list[list[Part]], np.ndarray]:
+    """Bodies and poses (count, 4, 4) at which each overlaps the pad by 20 µm to 1.3 mm on nodes of 0.2 mm."""
+    rng, grid = np.random.default_rng(seed), make_grid(gelpad, 0.2e-3)
+    bodies, poses = [], []
+    while len(bodies) < count:
+        kind = KINDS[len(bodies) % len(KINDS)]
+        body, pose = body_of(kind, rng), np.eye(4)
+        pose[:3, :3], pose[:2, 3] = turn_of(kind, rng), rng.uniform(-9e-3, 9e-3, 2)
+        least = (object_height(body, pose[None], grid.x, grid.y)[0] - grid.rest).min()
+        if np.isfinite(least):
+            pose[2, 3] -= least + 10.0 ** rng.uniform(-4.7, -2.9)
+            bodies.append(body)
+            poses.append(pose)
+    return bodies, np.stack(poses)
+
+
+def search_one(gelpad: GelpadSpec, body: list[Part], poses: np.ndarray, reach: float = REACH) -> PadContacts:
+    """Contacts of one body at poses (n, 4, 4), each an environment."""
+    search = PadSearch([gelpad], [body], num_envs=len(poses))
+    return search.contacts(poses[:, None, None], np.arange(len(poses)), reach)
+
+
+def same(one: PadContacts, other: PadContacts) -> None:
+    for field in fields(PadContacts):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+@pytest.mark.parametrize("gelpad", [DOME, FLAT], ids=["dome", "flat"])
+def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    """250 random bodies on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %."""
+    bodies, poses = pressed(gelpad, 250, seed=7)
+    contacts = PadSearch([gelpad], bodies, num_envs=1).contacts(poses[None, None], np.array([0]), REACH)
+    np.testing.assert_array_equal(contacts.body, np.arange(len(bodies)))
+    # The law's integral on so many depths that it is exact.
+    monkeypatch.setattr(load_law, "_TABLE", 20_000)
+    monkeypatch.setattr(load_law, "_DEPTHS", np.linspace(0.0, 1.0, 20_000) ** 2)
+    overlap, grid, missed = PadOverlap(gelpad), make_grid(gelpad, 0.2e-3), 0
+    for k, body in enumerate(bodies):
+        touches = overlap.touches(body, poses[k : k + 1], object_radius(body))
+        name = f"{k} {body[0].kind}"
+        if not len(touches.env):  # it gives up steep tips between nodes of 0.8 mm
+            least = (object_height(body, poses[k : k + 1], grid.x, grid.y)[0] - grid.rest).min()
+            assert 0.0 <= contacts.depth[k] + least < 50e-6, name
+            missed += 1
+            continue
+        depth = touches.depth[0]
+        assert contacts.depth[k] == pytest.approx(depth, abs=1e-6), name
+        np.testing.assert_allclose(contacts.centre[k], touches.centre[0], atol=5e-6, err_msg=name)
+        np.testing.assert_allclose(contacts.normal[k], touches.normal[0], atol=1e-6, err_msg=name)
+        law = overlap.law(touches, 0)
+        depths = contacts.deepest[k] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2
+        at = np.flatnonzero((depths > 0.8 * depth) & (depths <= (1.0 + 1e-9) * min(depth, gelpad.thickness)))
+        assert len(at) and contacts.deepest[k] > depth
+        np.testing.assert_allclose(contacts.force[k, at], [law.force(d) for d in depths[at]], rtol=5e-3, err_msg=name)
+        np.testing.assert_allclose(contacts.radius[k, at], [law.contact_radius(d) for d in depths[at]], rtol=5e-3, err_msg=name)
+    assert missed <= 3
+
+
+@pytest.fixture(scope="module")
+def crowd() -> tuple[list[list[Part]], np.ndarray]:
+    """26 bodies at poses (8, 26, 4, 4), in contact, near and apart."""
+    bodies, poses = pressed(DOME, 26, seed=11)
+    moved = np.repeat(poses[None], 8, axis=0)
+    moved[..., 2, 3] += np.random.default_rng(1).choice([0.0, 20e-6, 1e-3, 2e-3, 30e-3], moved.shape[:2])
+    return bodies, moved
+
+
+def test_an_environment_is_as_it_is_alone_and_in_any_order(crowd: tuple[list[list[Part]], np.ndarray]) -> None:
+    bodies, poses = crowd
+    search, envs = PadSearch([DOME, FLAT], bodies, num_envs=8), np.arange(8)
+    both = np.stack([poses, poses[::-1]], axis=1)
+    together = search.contacts(both, envs, 1e-3)
+    assert len(together.env) > 100 and (together.depth < 0.0).any()
+    order = np.lexsort((together.body, together.pad, together.env))
+    np.testing.assert_array_equal(order, np.arange(len(order)))
+    rows = [search.contacts(both[b : b + 1], envs[b : b + 1], 1e-3) for b in range(8)]
+    same(together, PadContacts(**{f.name: np.concatenate([getattr(r, f.name) for r in rows]) for f in fields(PadContacts)}))
+    turned = search.contacts(both[::-1], envs[::-1], 1e-3)
+    order = np.lexsort((turned.body, turned.pad, turned.env))
+    same(together, PadContacts(**{f.name: getattr(turned, f.name)[order] for f in fields(PadContacts)}))
+
+
+def test_a_pose_that_is_not_finite_gives_a_row_of_nan_and_spoils_no_other() -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = 4e-3 - 0.2e-3
+    poses[1, 0, 3] = np.nan
+    found, ball = (
+        search_one(DOME, [primitive("sphere", (4e-3,))], poses),
+        search_one(DOME, [primitive("sphere", (4e-3,))], poses[:1]),
+    )
+    assert found.env.tolist() == [0, 1, 2]
+    for name in ("depth", "clearance", "deepest"):
+        assert np.isnan(getattr(found, name)[1])
+    assert np.isnan(found.force[1]).all() and np.isnan(found.centre[1]).all()
+    assert found.depth[0] == found.depth[2] == ball.depth[0]
+
+
+def ball_over(x: float, gap: float, radius: float = 4e-3) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, 0.0, radius + gap
+    return pose
+
+
+@pytest.mark.parametrize("gap", [2e-6, 0.1e-3, 0.7e-3, 1.9e-3])
+def test_a_gap_is_as_wide_as_it_is_and_has_the_law_of_the_contact_to_come(gap: float) -> None:
+    """A ball over a flat pad: closed form for the gap and its place; the law is that of the ball when it touches."""
+    ball = [primitive("sphere", (4e-3,))]
+    found = search_one(FLAT, ball, ball_over(3.33e-3, gap)[None], reach=2e-3)
+    assert found.depth[0] == pytest.approx(-gap, abs=1e-6)
+    np.testing.assert_allclose(found.centre[0], [3.33e-3, 0.0, gap], atol=30e-6)
+    np.testing.assert_allclose(found.normal[0], [0.0, 0.0, 1.0], atol=1e-12)
+    assert found.clearance[0] == pytest.approx(FLAT.thickness + gap, abs=1e-6)
+    assert found.deepest[0] == pytest.approx(max(2e-3 - gap, 10e-6), rel=1e-3)
+    touching = search_one(FLAT, ball, ball_over(3.33e-3, -0.4e-3)[None], reach=0.0)
+    depths = [one.deepest[0] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2 for one in (found, touching)]
+    if gap < 1e-3:
+        ours, theirs = (np.interp(0.4e-3, d, one.force[0]) for d, one in zip(depths, (found, touching), strict=True))
+        assert ours == pytest.approx(theirs, rel=0.02)
+    assert not len(search_one(FLAT, ball, ball_over(3.33e-3, gap)[None], reach=0.99 * gap).env)
+
+
+def test_what_is_beside_above_or_behind_the_pad_gives_no_row() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = [[40e-3, 0.0, 0.0], [0.0, 0.0, 20e-3], [0.0, 0.0, -30e-3], [18e-3, 0.0, 1e-3]]
+    assert not len(search_one(DOME, [primitive("sphere", (4e-3,))], poses, reach=1e-3).env)
+    up = np.eye(4)
+    up[2, 3] = 1e-3  # a half-space that looks up has no underside
+    assert not len(search_one(DOME, [primitive("plane")], up[None]).env)
+
+
+@pytest.mark.parametrize("radius", [0.06e-3, 0.15e-3, 0.3e-3])
+def test_a_thin_pin_is_seen_between_any_nodes(radius: float) -> None:
+    """Upright, of a length that its bounding ball is wide; the depth is that of its flat end."""
+    rng = np.random.default_rng(2)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :2, 3] = rng.uniform(-5e-3, 5e-3, (30, 2))
+    poses[:, 2, 3] = 10e-3 - 0.3e-3
+    found = search_one(FLAT, [primitive("cylinder", (radius, 10e-3))], poses)
+    assert found.env.tolist() == list(range(30))
+    np.testing.assert_allclose(found.depth, 0.3e-3, atol=1e-9)
+    np.testing.assert_allclose(found.centre[:, :2], poses[:, :2, 3], atol=0.1e-3)
+
+
+def test_a_blade_across_the_pad_is_seen_at_any_angle() -> None:
+    angles = np.linspace(0.03, 3.1, 13)  # at 45° exactly, its sides run through nodes
+    poses = np.tile(np.eye(4), (13, 1, 1))
+    poses[:, :3, :3] = rotations(angles[:, None] * [0.0, 0.0, 1.0])
+    poses[:, :3, 3] = 0.33e-3, 0.11e-3, 5e-3 - 0.2e-3
+    found = search_one(FLAT, [primitive("box", (4e-3, 0.1e-3, 5e-3))], poses)
+    np.testing.assert_allclose(found.depth, np.full(13, 0.2e-3), atol=1e-9)
+    np.testing.assert_allclose(found.centre, np.tile([0.33e-3, 0.11e-3, -0.2e-3], (13, 1)), atol=0.1e-3)
+
+
+def test_an_edge_is_as_deep_as_it_is() -> None:
+    """A cube on its edge, at angles at which a parabola through its faces would be off by hundreds of micrometres."""
+    angle, half = np.array([0.05, 0.2, 0.5, 0.785, 1.2]), 8e-3
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = rotations(angle[:, None] * [1.0, 0.0, 0.0])
+    poses[:, 2, 3] = half * (np.cos(angle) + np.sin(angle)) - 0.3e-3
+    found = search_one(FLAT, [primitive("box", (half, half, half))], poses)
+    slope = np.minimum(np.tan(angle), 1.0 / np.tan(angle))
+    assert (found.depth < 0.3e-3 + 20e-6).all()
+    assert (found.depth > 0.3e-3 - 0.5 * 0.82e-3 * slope - 1e-9).all()
+
+
+def test_the_hole_of_a_torus_and_the_hollow_of_a_cup_stay_open() -> None:
+    ring = np.eye(4)
+    ring[2, 3] = 1e-3 - 0.2e-3
+    torus = search_one(FLAT, [primitive("torus", (5e-3, 1e-3))], ring[None])
+    np.testing.assert_allclose(torus.centre[0, :2], 0.0, atol=1e-9)
+    area = np.pi * (5e-3 + math.sqrt(2 * 1e-3 * 0.1e-3)) ** 2 - np.pi * (5e-3 - math.sqrt(2 * 1e-3 * 0.1e-3)) ** 2
+    k = int(np.argmin(np.abs(torus.deepest[0] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2 - 0.2e-3)))
+    assert np.pi * torus.radius[0, k] ** 2 == pytest.approx(area, rel=0.05)
+    walls = [
+        primitive("box", size, translated(at))
+        for size, at in (
+            ((6e-3, 0.5e-3, 3e-3), (0.0, 5.5e-3, 0.0)),
+            ((6e-3, 0.5e-3, 3e-3), (0.0, -5.5e-3, 0.0)),
+            ((0.5e-3, 6e-3, 3e-3), (5.5e-3, 0.0, 0.0)),
+            ((0.5e-3, 6e-3, 3e-3), (-5.5e-3, 0.0, 0.0)),
+            ((6e-3, 6e-3, 0.5e-3), (0.0, 0.0, 2.5e-3)),
+        )
+    ]
+    cup = search_one(FLAT, walls, translated((0.0, 0.0, 3e-3 - 0.2e-3))[None])
+    assert cup.depth[0] == pytest.approx(0.2e-3, abs=1e-9)
+    assert np.pi * cup.radius[0, -1] ** 2 == pytest.approx(12e-3**2 - 10e-3**2, rel=0.25)
+
+
+def translated(at: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = at
+    return pose
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "cylinder", "capsule", "ball_mesh"])
+def test_clearance_tells_what_went_through_the_gel(kind: str) -> None:
+    """At 150 poses about the layer behind the bonded face, as ``BondedFace`` does."""
+    rng = np.random.default_rng(5)
+    size = {"sphere": (3e-3,), "box": (4e-3, 2e-3, 1e-3), "cylinder": (2e-3, 3e-3), "capsule": (1e-3, 3e-3)}
+    body = [part_of(kind, rng) if kind == "ball_mesh" else primitive(kind, size[kind])]
+    poses = np.tile(np.eye(4), (150, 1, 1))
+    poses[:, :3, :3] = rotations(rng.normal(size=(150, 3)))
+    poses[:, :3, 3] = rng.uniform([-0.015, -0.013, -0.03], [0.015, 0.013, 0.01], (150, 3))
+    expected = BondedFace(DOME).pierced(body, poses, object_radius(body))
+    found = search_one(DOME, body, poses, reach=0.1e-3)
+    through = np.zeros(150, bool)
+    through[found.env[found.clearance <= 0.0]] = True
+    np.testing.assert_array_equal(through, expected)
+    assert 10 < expected.sum() < 140
+
+
+def test_bad_arrays_are_refused() -> None:
+    search = PadSearch([DOME], [[primitive("sphere", (4e-3,))]], num_envs=2)
+    poses = np.tile(np.eye(4), (2, 1, 1, 1, 1))
+    with pytest.raises(InputError, match="pad_from_body"):
+        search.contacts(poses[:, :, 0], np.arange(2), 0.0)
+    with pytest.raises(InputError, match="envs"):
+        search.contacts(poses, np.arange(3), 0.0)
+    for reach in (-1e-3, np.nan, np.zeros((3, 1))):
+        with pytest.raises(InputError, match="reach"):
+            search.contacts(poses, np.arange(2), reach)
+    with pytest.raises(InputError, match=r"bodies\[0\]"):
+        PadSearch([DOME], [[]], num_envs=1)
+
+
+@pytest.mark.gpu
+def test_cuda_finds_what_the_cpu_finds(crowd: tuple[list[list[Part]], np.ndarray]) -> None:
+    bodies, poses = crowd
+    cpu, cuda = (
+        PadSearch([DOME], bodies, num_envs=8, device=device).contacts(poses[:, None], np.arange(8), 1e-3)
+        for device in ("cpu", "cuda")
+    )
+    for name in ("env", "pad", "body"):
+        np.testing.assert_array_equal(getattr(cuda, name), getattr(cpu, name))
+    for name, tolerance in (("depth", 1e-9), ("centre", 1e-8), ("normal", 1e-6), ("clearance", 1e-9), ("deepest", 1e-8)):
+        np.testing.assert_allclose(getattr(cuda, name), getattr(cpu, name), atol=tolerance, rtol=0.0, err_msg=name)
+    np.testing.assert_allclose(cuda.force, cpu.force, rtol=1e-4, atol=1e-9)
+    again = PadSearch([DOME], bodies, num_envs=8, device="cuda")
+    same(again.contacts(poses[:, None], np.arange(8), 1e-3), cuda)
+    alone = again.contacts(poses[3:4, None], np.array([3]), 1e-3)
+    same(alone, PadContacts(**{f.name: getattr(cuda, f.name)[cuda.env == 3] for f in fields(PadContacts)}))
