@@ -61,12 +61,7 @@ class PadReading:
         force_law_area: np.ndarray | None = None,
         solved: Any = None,
     ) -> None:
-        """Keep what is given; what is a function is called when it is first asked for.
-
-        Args:
-            surface: gel surface; ``wrench``, ``traction``: as the members of these names; None of both and of ``failed``: not known.
-            failed, unconverged, pad_from_object, world_from_pad, depth, force_law_area, solved: see the class.
-        """
+        """Keep what is given (see the class), and call a function when its result is first asked for; None is not known."""
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
