@@ -40,10 +40,8 @@ class ContactSampler:
     def __init__(self, correction: NormalCorrection, x: np.ndarray, y: np.ndarray) -> None:
         mesh = correction.surface.mesh
         self._closed_gap = correction.settings.closed_gap
-        self.waves_y, self.waves_x = (
-            correction.series_y.synthesis(y).astype(np.float32),
-            correction.series_x.synthesis(x).T.astype(np.float32),
-        )
+        self.waves_y = correction.series_y.synthesis(y).astype(np.float32)
+        self.waves_x = correction.series_x.synthesis(x).T.astype(np.float32)
         self.border_y = SplineAxis(mesh.lines_y).matrix(y).astype(np.float32)
         self.border_x = SplineAxis(mesh.lines_x).matrix(x).T.astype(np.float32)
         self._rise_y, self._rise_x = (m.astype(np.float32) for m in correction.surface.matrices(x, y))
@@ -113,16 +111,11 @@ class NormalCorrection:
         """Prepare the fine grid of lines ``x`` (Nx,), ``y`` (Ny,) [m], evenly spaced from edge to edge of the pad.
 
         Args:
-            surface: the coat.
-            gelpad: elasticity and thickness of the layer.
-            x, y: the lines.
             compliance: z of the coat's vertices over a force along z on each [m/N], (V, V), of the pad's mesh.
             continued: the same if the pad's sides may not move outwards.
-            settings: tolerances.
         """
         self.surface, self.x, self.y, self.settings = surface, x, y, settings
-        mesh = surface.mesh
-        self._compliance = compliance
+        mesh, self._compliance = surface.mesh, compliance
         self.sides = (compliance - continued).astype(np.float32)
         self._smooth_y, self._smooth_x = _smoothing(mesh.lines_y), _smoothing(mesh.lines_x).T
         self.series_x, self.series_y = CosineSeries(x), CosineSeries(y)
