@@ -70,11 +70,7 @@ class ElasticSurround:
         contact_rule: str = "unilateral",
         contact_scale: float = CONTACT_SCALE,
     ) -> None:
-        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0 for none; ``contact_scale`` in [0, 1) of the threshold rule.
-
-        Raises:
-            InputError: an unknown contact rule.
-        """
+        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0 for none; ``contact_scale`` in [0, 1) of the threshold rule."""
         if contact_rule not in CONTACT_RULES:
             raise InputError("contact_rule", value=contact_rule, rule="must be a known rule", choices=CONTACT_RULES)
         self.grid, self.contact_rule, self.contact_scale = grid, contact_rule, contact_scale

@@ -177,11 +177,7 @@ def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str 
 
 
 def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
-    """States of a press, in order, with the rigid pad's surface at the same poses.
-
-    Raises:
-        SpecError: the press does not fit this sensor.
-    """
+    """States of a press, in order, with the rigid pad's surface at the same poses; errors as of ``simulate_press``."""
     from raytac.physics.rigid.pad import RigidPad
 
     rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)

@@ -85,11 +85,7 @@ class ContactCells:
         return self.grid.rest.item(min(round((y - y0) / dy), ny - 1), min(round((x - x0) / dx), nx - 1))
 
     def sample(self, surface: GelSurface) -> ContactSamples:
-        """Average the indentation over the cells; an environment whose heights are not finite there has no contact.
-
-        Raises:
-            InputError: a surface on another grid.
-        """
+        """Average the indentation over the cells; an environment whose heights are not finite there has no contact."""
         if surface.grid is not self.grid and surface.grid.shape != self.grid.shape:
             rule = f"must be that of the first surface, {self.grid.shape}"
             raise InputError("surface.grid", value=surface.grid.shape, rule=rule)

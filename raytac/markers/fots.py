@@ -83,11 +83,7 @@ class FotsKernel:
     """Marker displacements from contact samples and contacts; recorded once for each number of environments, markers and contacts."""
 
     def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
-        """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced.
-
-        Raises:
-            BackendError: Dr.Jit cannot run on ``device``.
-        """
+        """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced; errors as of ``load_mitsuba``."""
         self.mi, self.device = load_mitsuba(device)
         self.nx, self.ny = len(x), len(y)
         self._packets = -(-self.nx // _PACKET)

@@ -92,11 +92,7 @@ class MarkerPattern:
         return self.rest.shape[1]
 
     def for_batch(self, batch: int) -> np.ndarray:
-        """``rest`` for ``batch`` environments, shape (B, M, 3).
-
-        Raises:
-            InputError: the pattern was shifted for another number of environments.
-        """
+        """``rest`` for ``batch`` environments, (B, M, 3); ``InputError`` if it was shifted for another number."""
         if len(self.rest) not in (1, batch):
             raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
         return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))

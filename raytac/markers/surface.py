@@ -22,11 +22,7 @@ class CoatPoints:
         self._bound: tuple[CoatMesh, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def interpolate(self, mesh: CoatMesh, rest: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Values of the mesh's vertices (B, V, n) at the markers at ``rest`` (B, M, 3) [m], shape (B, M, n).
-
-        Raises:
-            InputError: a marker lies off the mesh.
-        """
+        """Values of the mesh's vertices (B, V, n) at the markers at ``rest`` (B, M, 3) [m], shape (B, M, n)."""
         pattern = rest[:1] if rest.strides[0] == 0 else rest
         if self._bound is None or self._bound[0] is not mesh or not np.array_equal(self._bound[1], pattern):
             self._bound = mesh, np.array(pattern), *bind_to_coat(mesh, pattern[..., :2])

@@ -181,12 +181,9 @@ class PhysicsConfig(Protocol):
         """The pad of a press.
 
         Args:
-            spec: the sensor.
-            press: the scene.
             pitch: spacing of the grid of surfaces [m].
-            num_envs: number of environments B.
             device: ``auto``, ``cpu`` or ``cuda``.
-            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists``, see ``PressTargets``.
+            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of B environments, see ``PressTargets``.
 
         Raises:
             BackendError: what it needs is not installed or does not work here.

@@ -165,12 +165,7 @@ MOST_STEPS = 1_000_000
 
 
 def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part], depths: np.ndarray | None) -> None:
-    """Refuse stages that no pad of this thickness can follow.
-
-    Raises:
-        SpecError: names the scene's file and key.
-        InputError: ``depths`` [m] deeper than the pad.
-    """
+    """Refuse stages and ``depths`` [m] that no pad of this thickness can follow."""
     thickness = gelpad.thickness
     within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
     if scene.trajectory and not parts:
@@ -205,10 +200,7 @@ class PressPad(ABC):
         """Check the scene, and build grid and object.
 
         Args:
-            sensor: gives the gelpad.
-            scene: object and trajectory.
             pitch: spacing of the grid that surfaces are given on [m].
-            num_envs: number of environments B.
             own: targets of each environment, as ``PressTargets`` takes them; one that is not finite fails.
 
         Raises:

@@ -124,11 +124,7 @@ class Coupling:
     """
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[int], num_envs: int = 1) -> None:
-        """``bodies``: n bodies of the model that the solver acts on.
-
-        Raises:
-            InputError: a body that is not the model's, or is named twice.
-        """
+        """``bodies``: n different bodies of the model that the solver acts on; else ``InputError``."""
         wrong = [int(body) for body in bodies if not 0 < body < model.nbody]
         if wrong or len(set(bodies)) < len(bodies):
             raise InputError("bodies", value=list(bodies), rule=f"must be different bodies of the model, 1 to {model.nbody - 1}")

@@ -229,12 +229,8 @@ class PressController:
         assert self._weight > 0.0
         self._solver.set_gravity(float(self._force[0]) / self._weight)
         for _ in range(4 * self._control.force_steps):
-            self._solver.fail(self.failed)
-            self.failed |= self._solver.step(self.poses())
-            self.bar.update()
-            sound = ~self.failed
-            if (self._solver.speed()[sound] < self._control.rest_speed).all() and (
-                self._solver.normal_force()[sound] > 0.0
-            ).all():
+            self._step()
+            is_at_rest = (self._solver.speed() < self._control.rest_speed) & (self._solver.normal_force() > 0.0)
+            if (is_at_rest | self.failed).all():
                 return
         self.failed |= self._solver.speed() >= self._control.rest_speed

@@ -125,7 +125,6 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Spars
         # Unknowns that are their own image add up or cancel; an orbit is kept once, by its lowest unknown.
         order = np.argsort(row, axis=1, kind="stable")
         row, value = np.take_along_axis(row, order, 1), np.take_along_axis(value, order, 1)
-        row_of, column_of, values = [], [], []
         keep = row[:, 0] == free
         row, value = row[keep], value[keep]
         total = np.stack([np.where(row == row[:, k : k + 1], value, 0.0).sum(axis=1) for k in range(row.shape[1])], axis=1)
@@ -134,12 +133,8 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Spars
         norm = np.linalg.norm(total, axis=1)
         alive = norm > 0.5
         row, total = row[alive], total[alive] / norm[alive, None]
-        for k in range(row.shape[1]):
-            there = total[:, k] != 0.0
-            row_of.append(row[there, k])
-            column_of.append(np.flatnonzero(there))
-            values.append(total[there, k])
-        bases.append(_Sparse(np.concatenate(row_of), np.concatenate(column_of), np.concatenate(values), (3 * n, len(row))))
+        column, k = np.nonzero(total)
+        bases.append(_Sparse(row[column, k], column, total[column, k], (3 * n, len(row))))
     return bases
 
 
