@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.components import span
 from raytac.gel.gaussian import GaussianBlur, fast_gaussian_matrix
 from raytac.gel.matmul import product
 from raytac.gel.surface import GelSurface, PadGrid
@@ -142,10 +143,8 @@ class ElasticSurround:
 def _touched(overlap: np.ndarray) -> Piece:
     """Rows and columns in which the object overlaps the resting gel."""
     mask = overlap > 0.0
-    rows = np.flatnonzero(mask.any(axis=1))
-    band = slice(int(rows[0]), int(rows[-1]) + 1)
-    columns = np.flatnonzero(mask[band].any(axis=0))
-    return band, slice(int(columns[0]), int(columns[-1]) + 1)
+    rows = span(mask.any(axis=1))
+    return rows, span(mask[rows].any(axis=0))
 
 
 class WholeField:

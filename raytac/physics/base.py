@@ -130,18 +130,11 @@ class PadReading:
 class Pad(Protocol):
     """The gel with the object of a press scene before it; ``PressPad`` has what all pads share."""
 
-    @property
-    def scene(self) -> PressScene: ...
-
-    @property
-    def grid(self) -> PadGrid:
-        """Nodes of its surfaces."""
-        ...
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """Shape of the object; empty without one."""
-        ...
+    scene: PressScene
+    grid: PadGrid
+    """Nodes of its surfaces."""
+    parts: tuple[Part, ...]
+    """Shape of the object; empty without one."""
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
         """Readings along the trajectory: one before it, then ``steps_per_stage`` through each stage."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -134,7 +135,6 @@ class SoftReader:
         self._rest, self._fine_grid = grid.rest.astype(np.float32), grid
         if correction is not None and min(grid.pitch) <= 0.9 * correction.pitch:
             self._fine_grid = make_grid(gelpad, correction.pitch)
-        self._stages: tuple[NormalCorrection, ContactSampler, TangentialCorrection] | None = None
         self._warned = False
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
@@ -194,7 +194,7 @@ class SoftReader:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Height, contact mask and underside (Ny, Nx), coat vertices (V, 3) and residual of pad ``b``, of a ``plain`` height [m]."""
         assert self.correction is not None
-        normal, sampler, tangential = self._correction_stages()
+        normal, sampler, tangential = self._stages
         rest, upwards = self.mesh.coat.rest, self._upwards(state, b)
         smooth = None
         if len(state.objects) > 1:
@@ -243,17 +243,16 @@ class SoftReader:
                 stacklevel=2,
             )
 
-    def _correction_stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
+    @cached_property
+    def _stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
         """Stages of the correction, made at the first contact: the compliance takes a while."""
-        if self._stages is None:
-            assert self.correction is not None
-            x, y = self._fine_grid.x, self._fine_grid.y
-            compliance = coat_compliance(self.mesh, self._gelpad)[0]
-            continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
-            normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
-            tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
-            self._stages = normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
-        return self._stages
+        assert self.correction is not None
+        x, y = self._fine_grid.x, self._fine_grid.y
+        compliance = coat_compliance(self.mesh, self._gelpad)[0]
+        continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
+        normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
+        tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
+        return normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
 
     def _underside(
         self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.gel.components import span
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
 from raytac.physics.soft.correction.layer import CosineSeries, layer_shear
-from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection, span
+from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 
 __all__ = ["FrictionCorrection", "PlaneMotion", "TangentialContact", "plane_displacement", "plane_waves"]
@@ -176,7 +177,7 @@ class FrictionCorrection:
         if not loaded.any():
             return None
         margin = 2 + int(0.3 * np.abs(goal.at(place)[loaded]).max() / settings.tangential_pitch)
-        rows, columns = (span(np.asarray(loaded.any(axis=k)), margin) for k in (1, 0))
+        rows, columns = (span(loaded.any(axis=k), margin) for k in (1, 0))
         place, loaded = place[rows, columns], loaded[rows, columns]
         (to_cos_x, to_sin_x), (to_cos_y, to_sin_y) = (
             tuple(m[:, columns].T for m in self._analysis_x),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.gel.components import span
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.matmul import product, sandwich
 from raytac.physics.soft.coat_surface import CoatPlaces, CoatSurface
@@ -13,7 +14,7 @@ from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["ContactSampler", "NormalContact", "NormalCorrection", "span"]
+__all__ = ["ContactSampler", "NormalContact", "NormalCorrection"]
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class NormalCorrection:
         pressure = np.zeros(overlap.shape, np.float32)
         near = overlap > -self.settings.clear_gap
         if near.any():
-            rows, columns = (span(np.asarray(near.any(axis=k))) for k in (1, 0))
+            rows, columns = (span(near.any(axis=k)) for k in (1, 0))
             window = _Window(self, rows, columns)
             p, residual = window.solve(overlap[rows, columns].astype(np.float32), start[rows, columns])
             pressure[rows, columns] = p
@@ -230,9 +231,3 @@ def _smoothing(lines: np.ndarray) -> np.ndarray:
     for i in range(1, n - 1):
         out[i, i - 1 : i + 2] = 0.5 * cell[i] / (cell[i - 1] + cell[i]), 0.5, 0.5 * cell[i - 1] / (cell[i - 1] + cell[i])
     return out
-
-
-def span(used: np.ndarray, margin: int = 0) -> slice:
-    """Slice from the first to the last true entry, widened by ``margin``."""
-    at = np.flatnonzero(used)
-    return slice(max(int(at[0]) - margin, 0), int(at[-1]) + 1 + margin)
