@@ -49,7 +49,7 @@ _INSIDE = 1e-4
 """Greatest overlap of a body with a case or a link that is not reported [m]: rounding of a scene's lengths."""
 
 _REPORT = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "unconverged": 0, "newton": 0, "substeps": 0}
-"""What a world reports of ``SceneReport``, and its value after a reset, before any step."""
+"""Fields of ``SceneReport`` that a world reports, and their values after a reset, before any step."""
 
 
 class SoftPads:
