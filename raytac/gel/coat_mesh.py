@@ -9,7 +9,10 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["CoatMesh", "DeformedCoat"]
+__all__ = ["CoatMesh", "DeformedCoat", "bind_to_coat"]
+
+_OUTSIDE = -1e-6
+"""Barycentric coordinate from which a point counts as outside a triangle: rounding on a shared edge is not outside."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,3 +76,51 @@ class DeformedCoat:
     def displacement(self) -> np.ndarray:
         """Displacement of every vertex from rest [m], shape (B, V, 3)."""
         return self.positions - self.mesh.rest[None]
+
+
+def bind_to_coat(mesh: CoatMesh, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of the mesh at rest that contain the points ``xy`` [m], shape (…, 2), seen along z.
+
+    Returns vertex numbers (…, 3) and barycentric weights (…, 3).
+
+    Raises:
+        InputError: a point lies off the mesh.
+    """
+    points = np.asarray(xy, float).reshape(-1, 2)
+    corners = mesh.rest[mesh.faces][..., :2]
+    cell, cell_of_face = _cell(mesh, points), _cell(mesh, corners.mean(axis=1))
+    order = np.argsort(cell_of_face, kind="stable")
+    first, last = (np.searchsorted(cell_of_face[order], cell, side=side) for side in ("left", "right"))
+    best = np.full(len(points), -np.inf)
+    face, weights = np.zeros(len(points), dtype=int), np.zeros((len(points), 3))
+    for k in range(int((last - first).max(initial=0))):
+        candidate = order[np.minimum(first + k, len(order) - 1)]
+        w = _barycentric(corners[candidate], points)
+        least = np.where(first + k < last, w.min(axis=1), -np.inf)
+        better = least > best
+        face[better], weights[better], best[better] = candidate[better], w[better], least[better]
+    if (best < _OUTSIDE).any():
+        point = points[best < _OUTSIDE][0]
+        raise InputError("markers", value=[1e3 * float(v) for v in point], rule="a marker (x, y in mm) lies off the coat's mesh")
+    shape = np.asarray(xy).shape[:-1]
+    return mesh.faces[face].reshape(*shape, 3), weights.reshape(*shape, 3)
+
+
+def _cell(mesh: CoatMesh, points: np.ndarray) -> np.ndarray:
+    """Number of the cell between grid lines that contains each point, row by row."""
+    column, row = (
+        np.clip(np.searchsorted(line, points[:, k], side="right") - 1, 0, len(line) - 2)
+        for k, line in enumerate((mesh.lines_x, mesh.lines_y))
+    )
+    return row * (len(mesh.lines_x) - 1) + column
+
+
+def _barycentric(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights (N, 3) of points (N, 2) in triangles (N, 3, 2): areas of the parts over the whole."""
+    a, b, c = (triangles[:, k] - points for k in range(3))
+
+    def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+    parts = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1)
+    return parts / parts.sum(axis=1, keepdims=True)

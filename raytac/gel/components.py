@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-__all__ = ["find_edges", "find_runs", "join_runs"]
+__all__ = ["find_edges", "find_runs", "join_runs", "span"]
 
 
 def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -50,3 +51,9 @@ def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> lis
     for i, number in enumerate(parent):
         parent[i] = parent[number]
     return parent
+
+
+def span(used: ArrayLike, margin: int = 0) -> slice:
+    """Slice from the first to the last true entry, widened by ``margin``."""
+    at = np.flatnonzero(used)
+    return slice(max(int(at[0]) - margin, 0), int(at[-1]) + 1 + margin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.gel.coat_mesh import CoatMesh
+from raytac.gel.coat_mesh import CoatMesh, bind_to_coat
 from raytac.gel.surface import GelSurface, PadGrid
 
 __all__ = ["CoatTraction", "cell_areas", "foundation_traction"]
@@ -30,13 +30,13 @@ class CoatTraction:
     """
 
     def __init__(self, mesh: CoatMesh, grid: PadGrid) -> None:
-        self._corner, self._weight = _in_triangles(mesh, grid)
+        corner, weight = bind_to_coat(mesh, np.stack(np.meshgrid(grid.x, grid.y), axis=-1))
+        self._corner, self._weight = corner.reshape(-1, 3), np.maximum(weight, 0.0).reshape(-1, 3)
         share = self._weight * cell_areas(grid).ravel()[:, None]
         self._area = np.bincount(self._corner.ravel(), share.ravel(), len(mesh.rest))
         if not (self._area > 0.0).all():
-            rule = (
-                f"must be finer than the coat's cells: {int((self._area <= 0.0).sum())} of its vertices have no node around them"
-            )
+            lone = int((self._area <= 0.0).sum())
+            rule = f"must be finer than the coat's cells: {lone} of its vertices have no node around them"
             raise InputError("pitch", value=grid.pitch, rule=rule)
         self._shape = grid.shape
         self._faces = mesh.faces
@@ -54,31 +54,6 @@ class CoatTraction:
         out = np.zeros_like(forces)
         np.add.at(out, self._faces, np.broadcast_to(at_faces, (len(self._faces), 3, 3)))
         return out
-
-
-def _in_triangles(mesh: CoatMesh, grid: PadGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Triangle around each node at rest, and its barycentric coordinates; both (Ny · Nx, 3)."""
-    rows, columns = mesh.shape
-    x, y = (a.ravel() for a in np.meshgrid(grid.x, grid.y))
-    column = np.clip(np.searchsorted(mesh.lines_x, x, side="right") - 1, 0, columns - 2)
-    row = np.clip(np.searchsorted(mesh.lines_y, y, side="right") - 1, 0, rows - 2)
-    place = mesh.rest[:, :2]
-    middle = place[mesh.faces].mean(axis=1)
-    cell_of_face = (
-        (np.searchsorted(mesh.lines_y, middle[:, 1]) - 1) * (columns - 1) + np.searchsorted(mesh.lines_x, middle[:, 0]) - 1
-    )
-    # Each cell is cut into two triangles.
-    two = mesh.faces[np.argsort(cell_of_face, kind="stable")].reshape(-1, 2, 3)[row * (columns - 1) + column]
-    weights = []
-    for k in range(2):
-        a, b, c = (place[two[:, k, m]] for m in range(3))
-        whole = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-        at_b = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / whole
-        at_c = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / whole
-        weights.append(np.stack([1.0 - at_b - at_c, at_b, at_c], axis=1))
-    second = weights[1].min(axis=1) > weights[0].min(axis=1)
-    weight = np.where(second[:, None], weights[1], weights[0])
-    return np.where(second[:, None], two[:, 1], two[:, 0]), np.maximum(weight, 0.0)
 
 
 def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray) -> np.ndarray:

@@ -65,15 +65,9 @@ class MarkersConfig(ABC):
 
 
 def marker_motion_of(sensor: SensorSpec) -> MarkerMotionSpec:
-    """Fitted marker motion of a sensor.
-
-    Raises:
-        InputError: it was never fitted.
-    """
+    """Fitted marker motion of a sensor; raises ``InputError`` if it was never fitted."""
     if sensor.marker_motion is None:
-        rule = (
-            "has no marker motion: `raytac calibrate markers --sensor NAME` fits one and writes marker_motion.toml, "
-            "which the sensor's file names as marker_motion"
-        )
+        rule = "has no marker motion: `raytac calibrate markers --sensor NAME` fits one and writes marker_motion.toml, "
+        rule += "which the sensor's file names as marker_motion"
         raise InputError("sensor", value=sensor.name, rule=rule)
     return sensor.marker_motion

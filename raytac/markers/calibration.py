@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -221,12 +222,7 @@ class ModelError:
 
 
 def model_errors(
-    sensor: SensorSpec,
-    frames: Sequence[PressFrame],
-    grid: PadGrid,
-    *,
-    models: Sequence[str] | None = None,
-    device: str = "auto",
+    sensor: SensorSpec, frames: Sequence[PressFrame], grid: PadGrid, *, models: Sequence[str] | None = None, device: str = "auto"
 ) -> tuple[list[ModelError], dict[str, float]]:
     """Errors of every model by kind of load, and the median time of a frame of every model [ms] at the probes.
 
@@ -235,9 +231,7 @@ def model_errors(
     """
     models = models_without_coat() if models is None else models
     probed = probe_sensor(sensor)
-    moved: dict[str, list[np.ndarray]] = {}
-    pixels: dict[str, list[np.ndarray]] = {}
-    times: dict[str, list[float]] = {}
+    moved, pixels, times = (defaultdict(list) for _ in range(3))
     loads = [frame.load for frame in frames if frame.load in LOADS]
     for model in dict.fromkeys(("surface", *models)):
         tracker = MarkerTracker(probed, model, grid, device=device)
@@ -246,10 +240,10 @@ def model_errors(
             for frame in group:
                 start = time.perf_counter()
                 markers = tracker.update(frame.surface)
-                times.setdefault(model, []).append(1e3 * (time.perf_counter() - start))
+                times[model].append(1e3 * (time.perf_counter() - start))
                 if frame.load in LOADS:
-                    moved.setdefault(model, []).append(markers.displacement[0])
-                    pixels.setdefault(model, []).append(markers.displacement_px[0])
+                    moved[model].append(markers.displacement[0])
+                    pixels[model].append(markers.displacement_px[0])
     truth, truth_px = np.stack(moved["surface"]), np.stack(pixels["surface"])
     size = np.linalg.norm(truth, axis=-1)
     errors = []
@@ -261,16 +255,12 @@ def model_errors(
             if not rows.any():
                 continue
             far = size[rows] > 50e-6
-            errors.append(
-                ModelError(
-                    model=model,
-                    load=load,
-                    frames=int(rows.sum()),
-                    mean=float(error[rows].mean()),
-                    p95=float(np.percentile(error[rows], 95)),
-                    moved=float(error[rows][far].mean()) if far.any() else float("nan"),
-                    mean_px=float(error_px[rows].mean()),
-                    size=float(size[rows].mean()),
-                )
-            )
+            by_load = {
+                "mean": error[rows].mean(),
+                "p95": np.percentile(error[rows], 95),
+                "moved": error[rows][far].mean() if far.any() else float("nan"),
+                "mean_px": error_px[rows].mean(),
+                "size": size[rows].mean(),
+            }
+            errors.append(ModelError(model, load, int(rows.sum()), **{name: float(value) for name, value in by_load.items()}))
     return errors, {model: float(np.median(values)) for model, values in times.items()}

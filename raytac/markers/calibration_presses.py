@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,18 +14,8 @@ from raytac.gel.surface import GelSurface
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = [
-    "FIT",
-    "HELD_OUT",
-    "LOADS",
-    "QUICK_FIT",
-    "QUICK_HELD_OUT",
-    "Press",
-    "PressFrame",
-    "PressStates",
-    "press_frames",
-    "simulate_press",
-]
+__all__ = ["FIT", "HELD_OUT", "LOADS", "QUICK_FIT", "QUICK_HELD_OUT"]
+__all__ += ["Press", "PressFrame", "PressStates", "press_frames", "simulate_press"]
 
 LOADS = ("normal", "shear", "twist", "combined")
 """Kinds of load that errors are given for."""
@@ -79,22 +70,6 @@ class Press:
         return text + (f", twisted {math.degrees(self.twist):g} deg" if self.twist else "")
 
 
-def _presses(
-    name: str,
-    kind: str,
-    params: dict[str, float | int | str],
-    place: tuple[float, float],
-    depth: float,
-    shear: tuple[float, float],
-    twist_deg: float,
-    turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-) -> tuple[Press, Press]:
-    """An object sheared, and the same twisted."""
-    sheared = Press(f"{name}-shear", kind, params, place, depth, shear=shear, turned=turned)
-    twisted = Press(f"{name}-twist", kind, params, place, 0.8 * depth, twist=math.radians(twist_deg), turned=turned)
-    return sheared, twisted
-
-
 def _both(
     name: str,
     kind: str,
@@ -103,9 +78,17 @@ def _both(
     depth: float,
     shear: tuple[float, float],
     twist_deg: float,
+    turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
 ) -> Press:
     """An object sheared and twisted at once."""
-    return Press(name, kind, params, place, depth, shear=shear, twist=math.radians(twist_deg))
+    return Press(name, kind, params, place, depth, shear, math.radians(twist_deg), turned)
+
+
+def _presses(name: str, *press: Any) -> tuple[Press, Press]:
+    """The object of ``_both`` sheared, and the same twisted."""
+    both = _both(name, *press)
+    twisted = replace(both, name=f"{name}-twist", depth=0.8 * both.depth, shear=(0.0, 0.0))
+    return replace(both, name=f"{name}-shear", twist=0.0), twisted
 
 
 def _lying(angle_deg: float) -> tuple[float, float, float, float]:
@@ -194,11 +177,7 @@ def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str 
 
 
 def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
-    """States of a press, in order, with the rigid pad's surface at the same poses.
-
-    Raises:
-        SpecError: the press does not fit this sensor.
-    """
+    """States of a press, in order, with the rigid pad's surface at the same poses; errors as of ``simulate_press``."""
     from raytac.physics.rigid.pad import RigidPad
 
     rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)

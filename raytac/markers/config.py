@@ -9,7 +9,6 @@ from raytac.checks import check_known, check_whole
 from raytac.gel.surface import PadGrid
 from raytac.markers.base import MarkerModel, MarkersConfig, marker_motion_of
 from raytac.markers.contacts import ContactCells
-from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
@@ -20,21 +19,21 @@ __all__ = ["ForceField", "Fots", "FotsPublished", "Superposition", "SurfaceMarke
 class Fots(MarkersConfig):
     """FOTS: dilation, shear and twist by closed forms, around a disc that sticks if the sensor's marker motion has a ``punch``."""
 
+    takes_punch: ClassVar[bool] = True
+
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.fots import FotsModel
 
-        return FotsModel(self._motion(sensor), ContactCells.over(grid, self.contacts), device=device)
-
-    def _motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
-        return marker_motion_of(sensor)
+        motion = marker_motion_of(sensor)
+        motion = motion if self.takes_punch else replace(motion, punch=None)
+        return FotsModel(motion, ContactCells.over(grid, self.contacts), device=device)
 
 
 @dataclass(frozen=True)
 class FotsPublished(Fots):
     """FOTS as published: Gaussians with one λ for all contacts, whether or not the sensor's marker motion has a ``punch``."""
 
-    def _motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
-        return replace(marker_motion_of(sensor), punch=None)
+    takes_punch: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)

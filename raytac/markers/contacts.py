@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -84,15 +85,10 @@ class ContactCells:
         return self.grid.rest.item(min(round((y - y0) / dy), ny - 1), min(round((x - x0) / dx), nx - 1))
 
     def sample(self, surface: GelSurface) -> ContactSamples:
-        """Average the indentation over the cells; an environment whose heights are not finite there has no contact.
-
-        Raises:
-            InputError: a surface on another grid.
-        """
+        """Average the indentation over the cells; an environment whose heights are not finite there has no contact."""
         if surface.grid is not self.grid and surface.grid.shape != self.grid.shape:
-            raise InputError(
-                "surface.grid", value=surface.grid.shape, rule=f"must be that of the first surface, {self.grid.shape}"
-            )
+            rule = f"must be that of the first surface, {self.grid.shape}"
+            raise InputError("surface.grid", value=surface.grid.shape, rule=rule)
         (kx, ky), batch = self.nodes, surface.batch
         depth = np.zeros((batch, len(self.y), len(self.x)), dtype=np.float32)
         contact = np.zeros(depth.shape, bool)
@@ -159,10 +155,9 @@ def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 def contact_boxes(contact: np.ndarray) -> np.ndarray:
     """As ``ContactSamples.boxes``, of masks (B, ny, nx)."""
-    columns, rows = np.any(contact, axis=1), np.any(contact, axis=2)
-    edges = [columns.argmax(axis=1), columns.shape[1] - columns[:, ::-1].argmax(axis=1)]
-    edges += [rows.argmax(axis=1), rows.shape[1] - rows[:, ::-1].argmax(axis=1)]
-    return np.where(np.any(rows, axis=1)[:, None], np.stack(edges, axis=1), 0).astype(np.uint32)
+    lines = np.any(contact, axis=1), np.any(contact, axis=2)
+    edges = [edge for line in lines for edge in (line.argmax(axis=1), line.shape[1] - line[:, ::-1].argmax(axis=1))]
+    return np.where(np.any(lines[1], axis=1)[:, None], np.stack(edges, axis=1), 0).astype(np.uint32)
 
 
 @dataclass(frozen=True)
@@ -255,23 +250,13 @@ class ContactTracker:
         self._pose: list[_Pose | None] = [None] * batch
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Drop the history of environments: a mask (B,), a list, or None for all.
-
-        Raises:
-            InputError: an environment that does not exist, or a mask of the wrong length.
-        """
+        """Drop the history of environments; ``envs`` as in ``chosen_envs``."""
         for b in chosen_envs(envs, self.batch):
             self._contacts[b] = []
             self._pose[b] = None
 
     def update(self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None) -> Contacts:
-        """Contacts of ``surface``, whose ``samples`` are given; call once for every surface, in order.
-
-        ``envs``: environment of each row of the surface; None is all.
-
-        Raises:
-            InputError: a surface of another number of environments.
-        """
+        """Contacts of ``surface``, whose ``samples`` are given; arguments and errors as of ``MarkerTracker.update``."""
         chosen = range(self.batch) if envs is None else envs
         if surface.batch != len(chosen):
             raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")
@@ -342,19 +327,12 @@ def _detect(samples: ContactSamples) -> list[list[_Contact]]:
     for number, row, start, stop, w, wx in zip(
         join_runs(rows, starts, stops, ny), rows, starts, stops, total, along, strict=True
     ):
-        piece = pieces.get(number)
-        if piece is None:
-            piece = pieces[number] = [0.0] * 9
         line, length, middle = row % ny, stop - start, 0.5 * (start + stop)
-        piece[0] += w
-        piece[1] += wx
-        piece[2] += w * y[line]
-        piece[3] += length
-        piece[4] += length * middle
-        piece[5] += length * line
-        piece[6] += length * (middle * middle + length * length / 12.0)
-        piece[7] += length * middle * line
-        piece[8] += length * line * line
+        first = length, length * middle, length * line
+        second = length * (middle * middle + length * length / 12.0), length * middle * line, length * line * line
+        run = w, wx, w * y[line], *first, *second
+        piece = pieces.get(number)
+        pieces[number] = list(run) if piece is None else list(map(add, piece, run))
     dx, dy = cells.pitch
     for number, (w, wx, wy, count, mx, my, mxx, mxy, myy) in pieces.items():
         area = count * dx * dy / math.pi

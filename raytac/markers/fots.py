@@ -68,9 +68,7 @@ class FotsModel:
     needs_contacts = True
 
     def __init__(self, motion: MarkerMotionSpec, cells: ContactCells, *, device: str = "auto") -> None:
-        """Raises ``BackendError`` if Dr.Jit cannot run on ``device``."""
-        self.motion = motion
-        self._kernel = FotsKernel(cells.x, cells.y, device=device)
+        self.motion, self._kernel = motion, FotsKernel(cells.x, cells.y, device=device)
         self.device = self._kernel.device
 
     def displacement(
@@ -85,11 +83,7 @@ class FotsKernel:
     """Marker displacements from contact samples and contacts; recorded once for each number of environments, markers and contacts."""
 
     def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
-        """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced.
-
-        Raises:
-            BackendError: Dr.Jit cannot run on ``device``.
-        """
+        """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced; errors as of ``load_mitsuba``."""
         self.mi, self.device = load_mitsuba(device)
         self.nx, self.ny = len(x), len(y)
         self._packets = -(-self.nx // _PACKET)
@@ -100,25 +94,17 @@ class FotsKernel:
         self._numbers: tuple[MarkerMotionSpec, Any] | None = None
 
     def displacement(
-        self,
-        markers: np.ndarray,
-        depth: np.ndarray,
-        boxes: np.ndarray,
-        contacts: np.ndarray,
-        motion: MarkerMotionSpec,
+        self, markers: np.ndarray, depth: np.ndarray, boxes: np.ndarray, contacts: np.ndarray, motion: MarkerMotionSpec
     ) -> np.ndarray:
         """Displacement [m] of markers at rest, shape (B, M, 2), float32.
 
         Args:
             markers: positions at rest [m], (B, M, 2) or (B, M, 3), of which x and y are read.
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
-            boxes: columns [c0, c1) and rows [r0, r1) that hold the contact, (B, 4).
-            contacts: as ``Contacts.table``, (B, K, 12); its last two columns are not read.
+            boxes, contacts: as ``ContactSamples.boxes`` and ``Contacts.table``, whose last two columns are not read.
             motion: constants of the pad.
         """
-        mi = self.mi
-        batch, count = markers.shape[:2]
-        rows = contacts.shape[1]
+        (batch, count), rows = markers.shape[:2], contacts.shape[1]
         k = 1 << (rows - 1).bit_length()
         # Contacts, boxes and depths in one array need one upload, of whole packets. A grid's whole numbers are exact in float32.
         box, sample = batch * k * _ROW, batch * (k * _ROW + _PACKET)
@@ -126,7 +112,7 @@ class FotsKernel:
         frame[:box].reshape(batch, k, _ROW)[:, :rows] = contacts
         frame[box:sample].reshape(batch, _PACKET)[:] = boxes
         frame[sample:].reshape(batch, self.ny, -1)[..., : self.nx] = depth
-        inputs = self._on_device(markers), mi.Float(frame), self._constants(motion)
+        inputs = self._on_device(markers), self.mi.Float(frame), self._constants(motion)
         is_punch = motion.punch is not None
         key = batch, count, k, is_punch
         if key not in self._frozen:

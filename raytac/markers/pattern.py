@@ -62,16 +62,14 @@ class MarkerPattern:
             rule = "has no markers; give it a pattern ([markers] in its file), or take a sensor that has one, such as gelsight_mini_7x9"
             raise InputError("sensor", value=sensor.name, rule=rule)
         xy = marker_centres(spec)[None]
-        is_moved = shift is not None or turn is not None
         if turn is not None:
             c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
             xy = np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
         if shift is not None:
             xy = xy + np.asarray(shift, float)[:, None, :]
         if (np.abs(xy) > 0.5 * np.asarray(pad.size)).any():
-            raise InputError(
-                "shift", value=1e3 * float(np.abs(xy).max()), rule="takes a marker off the pad (largest |x|, |y| in mm)"
-            )
+            rule = "takes a marker off the pad (largest |x|, |y| in mm)"
+            raise InputError("shift", value=1e3 * float(np.abs(xy).max()), rule=rule)
         rest = np.concatenate([xy, rest_height(pad, xy[..., 0], xy[..., 1])[..., None]], axis=-1)
         camera = camera_of(sensor, resolution)
         pixel = camera.project(rest)
@@ -82,10 +80,9 @@ class MarkerPattern:
             at = tuple(round(float(v), 1) for v in pixel[b, m])
             width, height = camera.resolution
             rule = f"marker (row {row}, column {column}) lies outside the view: at pixel {at} of an image of {width} x {height}"
-            if is_moved:
-                raise InputError(
-                    "shift", value=tuple(1e3 * float(v) for v in xy[b, m]), rule=rule + " (value: its position in mm)"
-                )
+            if shift is not None or turn is not None:
+                place = tuple(1e3 * float(v) for v in xy[b, m])
+                raise InputError("shift", value=place, rule=rule + " (value: its position in mm)")
             raise SpecError(rule, file=sensor.source, key="markers.pitch_mm", value=[1e3 * p for p in spec.pitch])
         return cls(rest, pixel, camera, spec.radius)
 
@@ -95,11 +92,7 @@ class MarkerPattern:
         return self.rest.shape[1]
 
     def for_batch(self, batch: int) -> np.ndarray:
-        """``rest`` for ``batch`` environments, shape (B, M, 3).
-
-        Raises:
-            InputError: the pattern was shifted for another number of environments.
-        """
+        """``rest`` for ``batch`` environments, (B, M, 3); ``InputError`` if it was shifted for another number."""
         if len(self.rest) not in (1, batch):
             raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
         return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))

@@ -24,11 +24,7 @@ register = MARKERS.register
 
 
 def markers_config(markers: str | MarkersConfig) -> MarkersConfig:
-    """Configuration of a name, or the configuration itself.
-
-    Raises:
-        InputError: an unknown name, or something else than a name or a configuration.
-    """
+    """Configuration of a name, or the configuration itself; ``InputError`` for anything else."""
     config = MARKERS.config(markers)
     if not isinstance(config, MarkersConfig):
         raise InputError("markers", value=markers, rule="must be a known name or a MarkersConfig", choices=MARKERS.names)

@@ -76,8 +76,7 @@ class MarkerTracker:
         Args:
             sensor: gives the pattern, the camera and, for fitted models, the marker motion.
             markers: name of a marker model, or its configuration.
-            grid: grid of the surfaces to come.
-            num_envs: number of environments B.
+            grid: grid of the surfaces to come, of ``num_envs`` environments.
             resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
             device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
             seed: seed of the perturbation.
@@ -99,32 +98,23 @@ class MarkerTracker:
         self._contacts = ContactTracker(num_envs, config.contacts)
 
     def _place(self, envs: range | list[int]) -> None:
-        if not self._perturber.settings.moves_pattern:
-            if not hasattr(self, "pattern"):
-                self._set_pattern(MarkerPattern.of(self.sensor, self._resolution))
+        moves: dict[str, np.ndarray] = {}
+        if self._perturber.settings.moves_pattern:
+            for b in envs:
+                self._shift[b], self._turn[b] = self._perturber.placement(b)
+            moves = {"shift": self._shift, "turn": self._turn}
+        elif hasattr(self, "pattern"):
             return
-        for b in envs:
-            self._shift[b], self._turn[b] = self._perturber.placement(b)
-        self._set_pattern(MarkerPattern.of(self.sensor, self._resolution, shift=self._shift, turn=self._turn))
-
-    def _set_pattern(self, pattern: MarkerPattern) -> None:
-        self.pattern = pattern
+        self.pattern = pattern = MarkerPattern.of(self.sensor, self._resolution, **moves)
         self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models recognise it
         self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
         self._all = np.broadcast_to(True, self._rest.shape[:2])
-        self._grid_rest = self._height_at_rest()
-
-    def _height_at_rest(self) -> np.ndarray:
-        """z of the grid's rest surface at the pattern [m], (1 or B, M), by the interpolation of ``height_at``."""
-        xy = self.pattern.rest[..., :2]
-        return height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
+        xy = pattern.rest[..., :2]
+        self._grid_rest = height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
+        """z of the grid's rest surface at the pattern [m], (1 or B, M)."""
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Restart environments (a mask (B,), a list, or None for all): no history of contact, a new placement of the pattern.
-
-        Raises:
-            InputError: an environment that does not exist.
-        """
+        """Restart environments, as in ``chosen_envs``: no history of contact, a new placement of the pattern."""
         which = chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
@@ -161,10 +151,8 @@ class MarkerTracker:
         # the heights into the cache for the interpolation.
         heights = surface.height.reshape(count, -1)
         failed = ~np.isfinite(np.vecdot(heights, heights))
-        samples, contacts = None, None
-        if self._cells is not None:
-            samples = self._cells.sample(surface)
-            contacts = self._contacts.update(surface, samples, envs)
+        samples = None if self._cells is None else self._cells.sample(surface)
+        contacts = None if samples is None else self._contacts.update(surface, samples, envs)
         rest = self._rest if envs is None else self._rest[envs]
         moved = self.model.displacement(rest, surface, samples, contacts)
         if moved.shape[-1] == 3:

@@ -60,12 +60,7 @@ class PadReading:
         force_law_area: np.ndarray | None = None,
         solved: Any = None,
     ) -> None:
-        """Keep what is given; what is a function is called when it is first asked for.
-
-        Args:
-            surface: gel surface; ``wrench``, ``traction``: as the members of these names; None of both and of ``failed``: not known.
-            failed, unconverged, pad_from_object, world_from_pad, depth, force_law_area, solved: see the class.
-        """
+        """Keep what is given (see the class), and call a function when its result is first asked for; None is not known."""
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
@@ -129,18 +124,11 @@ class PadReading:
 class Pad(Protocol):
     """The gel with the object of a press scene before it; ``PressPad`` has what all pads share."""
 
-    @property
-    def scene(self) -> PressScene: ...
-
-    @property
-    def grid(self) -> PadGrid:
-        """Nodes of its surfaces."""
-        ...
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """Shape of the object; empty without one."""
-        ...
+    scene: PressScene
+    grid: PadGrid
+    """Nodes of its surfaces."""
+    parts: tuple[Part, ...]
+    """Shape of the object; empty without one."""
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
         """Readings along the trajectory: one before it, then ``steps_per_stage`` through each stage."""
@@ -180,12 +168,9 @@ class PhysicsConfig(Protocol):
         """The pad of a press.
 
         Args:
-            spec: the sensor.
-            press: the scene.
             pitch: spacing of the grid of surfaces [m].
-            num_envs: number of environments B.
             device: ``auto``, ``cpu`` or ``cuda``.
-            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists``, see ``PressTargets``.
+            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of B environments, see ``PressTargets``.
 
         Raises:
             BackendError: what it needs is not installed or does not work here.

@@ -19,14 +19,7 @@ from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = [
-    "CLEARANCE",
-    "PressPad",
-    "PressTargets",
-    "check_trajectory",
-    "per_environment",
-    "scene_parts",
-]
+__all__ = ["CLEARANCE", "PressPad", "PressTargets"]
 
 
 class PressTargets:
@@ -50,65 +43,71 @@ class PressTargets:
         shears: np.ndarray | None = None,
         twists: np.ndarray | None = None,
     ) -> None:
-        """Check shapes.
+        """Check shapes; None leaves what the scene has.
 
         Args:
             scene: gives the object's own rotation, which comes first.
             num_envs: number of environments B, at least 1.
-            offsets: added to the object's x, y [m], (B, 2); None is none.
-            depths: of every indent to a depth [m], (B,); None leaves the scene's, as for the next three.
+            offsets: added to the object's x, y [m], (B, 2).
+            depths: of every indent to a depth [m], (B,).
             rotations: turn of the object about its origin, axes of the pad frame, wxyz, of any length, (B, 4).
-            shears: target of every ``shear`` stage along x, y [m], (B, 2).
-            twists: target of every ``twist`` stage [rad], (B,).
+            shears, twists: target of every ``shear`` stage along x, y [m], (B, 2), and of every ``twist`` stage [rad], (B,).
 
         Raises:
             InputError: ``num_envs`` below 1, an argument of another shape, or a quaternion of zeros.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
-        self.offsets = per_environment("offsets", offsets, (num_envs, 2))
-        self.depths = None if depths is None else per_environment("depths", depths, (num_envs,))
-        self._shears = None if shears is None else per_environment("shears", shears, (num_envs, 2))
-        self._twists = None if twists is None else per_environment("twists", twists, (num_envs,))
-        turns = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
-        if rotations is not None:
-            turns = per_environment("rotations", rotations, (num_envs, 4))
-        given = [a for a in (self.offsets, self.depths, self._shears, self._twists, turns) if a is not None]
-        self.lost = ~np.all([np.isfinite(a.reshape(num_envs, -1)).all(axis=1) for a in given], axis=0)
-        turns = np.where(self.lost[:, None], [1.0, 0.0, 0.0, 0.0], turns)
+        given = {
+            "offsets": (offsets, 2),
+            "depths": (depths,),
+            "shears": (shears, 2),
+            "twists": (twists,),
+            "rotations": (rotations, 4),
+        }
+        own = {name: check_numbers(name, a, (num_envs, *tail)) for name, (a, *tail) in given.items() if a is not None}
+        self.lost = np.zeros(num_envs, bool)
+        for values in own.values():
+            self.lost |= ~np.isfinite(values.reshape(num_envs, -1)).all(axis=1)
+        self.offsets, self.depths = own.get("offsets", np.zeros((num_envs, 2))), own.get("depths")
+        self._own_targets = {"depth": self.depths, "shear": own.get("shears"), "twist": own.get("twists")}
+        identity = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
+        turns = np.where(self.lost[:, None], identity, own.get("rotations", identity))
         zero = ~turns.any(axis=1)
         if zero.any():
             rule = f"must not be all 0, in environment {int(zero.argmax())}"
             raise InputError("rotations", value=turns[zero.argmax()].tolist(), rule=rule)
         at_rest = np.asarray(scene.object.quaternion, float)
         self._scene, self._turns = scene, turns
-        own = rotation_of(at_rest / np.linalg.norm(at_rest))
-        self.rotations = own[None].repeat(num_envs, axis=0)
+        at_rest = rotation_of(at_rest / np.linalg.norm(at_rest))
+        self.rotations = at_rest[None].repeat(num_envs, axis=0)
         if rotations is not None:
-            self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ own
+            self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ at_rest
 
     def stage(self, stage: StageSpec, b: int) -> StageSpec:
         """A stage as environment ``b`` runs it; the scene's own in an environment that is lost."""
-        if self.lost[b]:
+        name = "depth" if stage.kind == "indent" else stage.kind
+        values = self._own_targets.get(name)
+        if values is None or self.lost[b] or getattr(stage, name) is None:
             return stage
-        if stage.kind == "indent" and stage.depth is not None and self.depths is not None:
-            return replace(stage, depth=float(self.depths[b]))
-        if stage.kind == "shear" and self._shears is not None:
-            return replace(stage, shear=(float(self._shears[b, 0]), float(self._shears[b, 1])))
-        if stage.kind == "twist" and self._twists is not None:
-            return replace(stage, twist=float(self._twists[b]))
-        return stage
+        value = values[b].tolist()
+        return replace(stage, **{name: tuple(value) if name == "shear" else value})
 
     def depth(self, stage: StageSpec) -> np.ndarray:
         """Final depth of an indent [m], (B,); 0 in a failed environment."""
-        return self._sound(np.full(len(self.lost), stage.depth) if self.depths is None else self.depths)
+        return self._final("depth", stage)
 
     def shear(self, stage: StageSpec) -> np.ndarray:
         """Final displacement of a shear [m], (B, 2); 0 in a failed environment."""
-        return self._sound(np.tile(stage.shear, (len(self.lost), 1)) if self._shears is None else self._shears)
+        return self._final("shear", stage)
 
     def twist(self, stage: StageSpec) -> np.ndarray:
         """Final angle of a twist [rad], (B,); 0 in a failed environment."""
-        return self._sound(np.full(len(self.lost), stage.twist) if self._twists is None else self._twists)
+        return self._final("twist", stage)
+
+    def _final(self, name: str, stage: StageSpec) -> np.ndarray:
+        values = self._own_targets[name]
+        values = np.array([getattr(stage, name)] * len(self.lost)) if values is None else values
+        return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)
 
     def start_error(self, b: int, error: InputError) -> InputError | SpecError:
         """``error`` of environment ``b`` at its start, under what it does in its own way, or else the scene's file and key."""
@@ -150,16 +149,13 @@ class PressTargets:
 
     def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
         """Name and value of what of its own took environment ``b`` where it is: in stages of ``kinds``, last first, then at the start."""
-        given = {"shear": ("shears", self._shears), "twist": ("twists", self._twists)}
-        for name, values in (given[kind] for kind in kinds if kind in given):
+        for kind in kinds:
+            values = self._own_targets.get(kind)
             if values is not None:
-                return name, values[b].tolist()
+                return f"{kind}s", values[b].tolist()
         if self.offsets[b].any():
             return "offsets", self.offsets[b].tolist()
         return ("rotations", self._turns[b].tolist()) if self._turns[b, 1:].any() else None
-
-    def _sound(self, values: np.ndarray) -> np.ndarray:
-        return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)
 
 
 CLEARANCE = 1e-3
@@ -168,23 +164,8 @@ MOST_STEPS = 1_000_000
 """States that a stage can be asked for."""
 
 
-def scene_parts(scene: PressScene) -> tuple[Part, ...]:
-    """Parts of the scene's object; raises ``SpecError`` with the scene's file and key."""
-    try:
-        return object_parts(scene.object)
-    except MeshError:  # names its own file
-        raise
-    except SpecError as error:
-        raise SpecError(error.rule, file=scene.source, key=error.key, value=error.value, choices=error.choices) from error
-
-
-def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part], depths: np.ndarray | None) -> None:
-    """Refuse stages that no pad of this thickness can follow.
-
-    Raises:
-        SpecError: names the scene's file and key.
-        InputError: ``depths`` [m] deeper than the pad.
-    """
+def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part], depths: np.ndarray | None) -> None:
+    """Refuse stages and ``depths`` [m] that no pad of this thickness can follow."""
     thickness = gelpad.thickness
     within = f"must be > 0 and less than the pad's thickness, {thickness * 1e3:.4g} mm"
     if scene.trajectory and not parts:
@@ -198,11 +179,6 @@ def check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part
         bad = depths[np.isfinite(depths) & ~((depths > 0.0) & (depths < thickness))]
         if len(bad):
             raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
-
-
-def per_environment(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """``values`` as an array, zeros for None; raises ``InputError`` for another shape, or what is no number."""
-    return np.zeros(shape) if values is None else check_numbers(name, values, shape)
 
 
 class PressPad(ABC):
@@ -224,12 +200,8 @@ class PressPad(ABC):
         """Check the scene, and build grid and object.
 
         Args:
-            sensor: gives the gelpad.
-            scene: object and trajectory.
             pitch: spacing of the grid that surfaces are given on [m].
-            num_envs: number of environments B.
-            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of each environment, see ``PressTargets``; not finite:
-                that environment fails.
+            own: targets of each environment, as ``PressTargets`` takes them; one that is not finite fails.
 
         Raises:
             InputError: arguments of the wrong shape, ``depths`` deeper than the pad.
@@ -238,8 +210,13 @@ class PressPad(ABC):
         self.sensor, self.scene, self.num_envs = sensor, scene, num_envs
         self.targets = PressTargets(scene, num_envs, **own)
         self.grid = make_grid(sensor.gelpad, pitch)
-        self.parts = scene_parts(scene)
-        check_trajectory(scene, sensor.gelpad, self.parts, self.targets.depths)
+        try:
+            self.parts = object_parts(scene.object)
+        except MeshError:  # names its own file
+            raise
+        except SpecError as error:
+            raise SpecError(error.rule, file=scene.source, key=error.key, value=error.value, choices=error.choices) from error
+        _check_trajectory(scene, sensor.gelpad, self.parts, self.targets.depths)
         self._has_started = False
 
     @abstractmethod
@@ -288,7 +265,7 @@ class PressPad(ABC):
             SpecError: a scene without object, or a stage that no pad can follow.
         """
         check_whole("steps", steps, 1, MOST_STEPS)
-        check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
+        _check_trajectory(replace(self.scene, trajectory=(stage,), source=None), self.sensor.gelpad, self.parts, None)
         if not self._has_started:
             self._start()
         yield from self._through(-1, stage, steps)

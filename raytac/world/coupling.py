@@ -101,10 +101,8 @@ class _Interval:
     wrench: np.ndarray
     contacts: Sequence[CoupledContact] = ()
     solver_bodies: dict[str, SolverBody] = field(default_factory=dict)
-    anchors: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Point of each contact in the frame of its body and in that of the other one (or the world)."""
-    rotations: list[np.ndarray] = field(default_factory=list)
-    """Rotation of the body relative to the other one at the beginning, of each contact."""
+    anchors: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+    """Point of each contact in the frame of its body and in that of the other one (or the world), and their relative rotation."""
     displacement: dict[str, np.ndarray] = field(default_factory=dict)
     """Displacement and rotation of each solver body since the beginning, (6,)."""
     speed: dict[str, np.ndarray] = field(default_factory=dict)
@@ -126,11 +124,7 @@ class Coupling:
     """
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[int], num_envs: int = 1) -> None:
-        """``bodies``: n bodies of the model that the solver acts on.
-
-        Raises:
-            InputError: a body that is not the model's, or is named twice.
-        """
+        """``bodies``: n different bodies of the model that the solver acts on; else ``InputError``."""
         wrong = [int(body) for body in bodies if not 0 < body < model.nbody]
         if wrong or len(set(bodies)) < len(bodies):
             raise InputError("bodies", value=list(bodies), rule=f"must be different bodies of the model, 1 to {model.nbody - 1}")
@@ -161,10 +155,9 @@ class Coupling:
         Raises:
             InputError: a wrench of the wrong shape or not finite, or a contact whose sides are not known.
         """
-        if np.shape(wrench) != (len(self.bodies), 6) or not np.isfinite(wrench).all():
-            raise InputError(
-                "wrench", value=np.asarray(wrench).tolist(), rule=f"must be finite, of shape {(len(self.bodies), 6)}"
-            )
+        shape = len(self.bodies), 6
+        if np.shape(wrench) != shape or not np.isfinite(wrench).all():
+            raise InputError("wrench", value=np.asarray(wrench).tolist(), rule=f"must be finite, of shape {shape}")
         solver_bodies = solver_bodies or {}
         interval = _Interval(np.array(wrench, float), tuple(contacts), dict(solver_bodies))
         for contact in contacts:
@@ -175,8 +168,7 @@ class Coupling:
                     raise InputError("contacts", value=side, rule="must be the name of a solver body", choices=solver_bodies)
             turn, origin = self._frame(data, interval, contact.body)
             turn2, origin2 = self._frame(data, interval, contact.other)
-            interval.anchors.append((turn.T @ (contact.point - origin), turn2.T @ (contact.point - origin2)))
-            interval.rotations.append(turn2.T @ turn)
+            interval.anchors.append((turn.T @ (contact.point - origin), turn2.T @ (contact.point - origin2), turn2.T @ turn))
         for name, body in solver_bodies.items():
             interval.displacement[name], interval.speed[name] = np.zeros(6), body.velocity.copy()
         self._intervals[b] = interval
@@ -200,17 +192,18 @@ class Coupling:
         ]
         count = len(interval.contacts)
         jacobian, solver_jacobian = np.zeros((6 * count, model.nv)), np.zeros((6 * count, 6 * len(names)))
-        displacement, stiffness, points = np.zeros(6 * count), np.zeros((6 * count, 6 * count)), []
+        displacement, stiffness, points, of_point = np.zeros(6 * count), np.zeros((6 * count,) * 2), [], np.zeros((6, model.nv))
         for k, contact in enumerate(interval.contacts):
             rows = slice(6 * k, 6 * k + 6)
-            points.append(self._point(data, interval, k))
+            point, displacement[rows] = self._motion(data, interval, k)
+            points.append(point)
             for side, sign in ((contact.body, 1.0), (contact.other, -1.0)):
                 if isinstance(side, int):
-                    jacobian[rows] += sign * self._jacobian(data, side, points[-1])
+                    mujoco.mj_jac(model, data, of_point[:3], of_point[3:], point, side)
+                    jacobian[rows] += sign * of_point
                 elif side is not None:
-                    first = 6 * names.index(side)
-                    solver_jacobian[rows, first : first + 6] += sign * _point_jacobian(points[-1] - self._centre(interval, side))
-            displacement[rows] = self._displacement(data, interval, k)
+                    first, centre = 6 * names.index(side), self._frame(data, interval, side)[1]
+                    solver_jacobian[rows, first : first + 6] += sign * _point_jacobian(point - centre)
             stiffness[rows, rows] = contact.stiffness
         solved = np.zeros((6 * count, model.nv))
         mujoco.mj_solveM(model, data, solved, jacobian)
@@ -245,26 +238,14 @@ class Coupling:
         displacement = interval.displacement.get(side, np.zeros(6))
         return rotations(displacement[3:]), interval.solver_bodies[side].centre + displacement[:3]
 
-    def _point(self, data: mujoco.MjData, interval: _Interval, k: int) -> np.ndarray:
-        turn, origin = self._frame(data, interval, interval.contacts[k].body)
-        return origin + turn @ interval.anchors[k][0]
-
-    def _displacement(self, data: mujoco.MjData, interval: _Interval, k: int) -> np.ndarray:
-        """Displacement (6,) of the body relative to the other side since the beginning, at the contact's point, world axes."""
-        contact = interval.contacts[k]
-        turn, _ = self._frame(data, interval, contact.body)
+    def _motion(self, data: mujoco.MjData, interval: _Interval, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Contact's point (3,), and displacement (6,) there of the body relative to the other side since the beginning, world axes."""
+        contact, (anchor, anchor2, rotation) = interval.contacts[k], interval.anchors[k]
+        turn, origin = self._frame(data, interval, contact.body)
         turn2, origin2 = self._frame(data, interval, contact.other)
-        displacement = self._point(data, interval, k) - (origin2 + turn2 @ interval.anchors[k][1])
-        return np.concatenate([displacement, turn2 @ rotation_vector(turn2.T @ turn @ interval.rotations[k].T)])
-
-    def _jacobian(self, data: mujoco.MjData, body: int, point: np.ndarray) -> np.ndarray:
-        jacobian = np.zeros((6, self.model.nv))
-        mujoco.mj_jac(self.model, data, jacobian[:3], jacobian[3:], point, body)
-        return jacobian
-
-    @staticmethod
-    def _centre(interval: _Interval, name: str) -> np.ndarray:
-        return interval.solver_bodies[name].centre + interval.displacement[name][:3]
+        point = origin + turn @ anchor
+        turned = turn2 @ rotation_vector(turn2.T @ turn @ rotation.T)
+        return point, np.concatenate([point - (origin2 + turn2 @ anchor2), turned])
 
 
 def _solve(
@@ -325,43 +306,26 @@ def coupling_inputs(scene: SoftScene, links: Mapping[str, int]) -> list[Coupling
     for b in range(scene.num_envs):
         contacts, solver_bodies = [], {name: motions[b] for name, motions in free.items()}
         for name in bonded:
-            _add_bonded_patch(scene, name, b, contacts, solver_bodies)
+            patch = scene.world.held_patch(name, b)
+            if patch is not None:  # a rigid body on a spring, the body's stiffness there; its forces balance but for inertia
+                solver_bodies[name] = SolverBody(patch.mass, patch.inertia, patch.centre, patch.velocity, np.zeros(6))
+                contacts.append(CoupledContact(name, STIFFENING * patch.stiffness, patch.centre))
         for (one, two), contact in pressing.items():
             if one == two:  # folds of one gel
                 continue
             sides = [links.get(name, name if name in solver_bodies else None) for name in (one, two)]
             if not contact.normal[b].any() or sides == [None, None] or (None in sides and any(side in bonded for side in sides)):
                 continue
-            first, other, sign = sides[0], sides[1], 1.0
-            if first is None:
-                first, other, sign = sides[1], None, -1.0
+            (first, other), sign = (sides, 1.0) if sides[0] is not None else (sides[::-1], -1.0)
             pads = [bounds[name][b] for name in (one, two) if name in bounds]
-            stiffness = _weakest(pads) if pads else np.diag([_HARD] * 3 + [0.0] * 3)
+            # Two pads in contact are springs in series, so the bound of either holds for both.
+            stiffness = min(pads, key=np.trace) if pads else np.diag([_HARD] * 3 + [0.0] * 3)
             assert first is not None
             contacts.append(
                 CoupledContact(first, stiffness, contact.place[b], other, sign * contact.normal[b], sign * contact.wrench[b])
             )
         inputs.append((wrench[b], contacts, solver_bodies))
     return inputs
-
-
-def _weakest(bounds: list[np.ndarray]) -> np.ndarray:
-    """Smallest bound: two pads in contact are springs in series, so the bound of either holds for both."""
-    return min(bounds, key=np.trace)
-
-
-def _add_bonded_patch(
-    scene: SoftScene, name: str, b: int, contacts: list[CoupledContact], solver_bodies: dict[str, SolverBody]
-) -> None:
-    """Add a bonded soft body: its patch in contact as a rigid body on a spring, which is the body's stiffness at that patch.
-
-    The forces on the patch are in balance; its inertial force is neglected.
-    """
-    patch = scene.world.held_patch(name, b)
-    if patch is None:
-        return
-    solver_bodies[name] = SolverBody(patch.mass, patch.inertia, patch.centre, patch.velocity, np.zeros(6))
-    contacts.append(CoupledContact(name, STIFFENING * patch.stiffness, patch.centre))
 
 
 def _free_bodies(scene: SoftScene, name: str) -> list[SolverBody]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import reduce
 from itertools import combinations
 
 import mujoco
@@ -22,12 +23,11 @@ from raytac.physics.base import PadReading
 from raytac.physics.configs import Ipc
 from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
-from raytac.physics.soft.mesh import PadMesh, pad_mesh
+from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
 from raytac.robots.frames import body_poses, site_poses
 from raytac.se3 import pose_of, quaternion
-from raytac.shapes.part import Part
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.press import PADS
@@ -48,17 +48,8 @@ _CELLS = 8
 _INSIDE = 1e-4
 """Greatest overlap of a body with a case or a link that is not reported [m]: rounding of a scene's lengths."""
 
-_AT_REST = {
-    "min_gap": np.inf,
-    "min_det": 1.0,
-    "blocked": 0.0,
-    "converged": True,
-    "unconverged": 0,
-    "newton": 0,
-    "substeps": 0,
-    "inside_robot": 0.0,
-}
-"""Report after a reset, before any step."""
+_REPORT = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "unconverged": 0, "newton": 0, "substeps": 0}
+"""Fields of ``SceneReport`` that a world reports, and their values after a reset, before any step."""
 
 
 class SoftPads:
@@ -74,13 +65,7 @@ class SoftPads:
         coupling: str,
         device: str,
     ) -> None:
-        """Put the pads of all environments into the solver where MuJoCo has them.
-
-        Args:
-            composed: the scene; ``models``, ``datas``: MuJoCo's of every environment.
-            physics: gives the mesh.
-            coupling: one of ``COUPLINGS``.
-            device: of the solver, ``auto``, ``cpu`` or ``cuda``.
+        """Put the pads of all environments into the solver where MuJoCo has them; ``coupling``: one of ``COUPLINGS``.
 
         Raises:
             BackendError: the solver is not installed, or the device does not work here.
@@ -90,12 +75,7 @@ class SoftPads:
         self.composed, self.model, self._models = composed, composed.model, models
         scene, level = composed.scene, physics.level or PADS[0]
         pads = [
-            ScenePad(
-                mounted.name,
-                spec,
-                level if isinstance(level, PadMesh) else pad_mesh(spec.gelpad, level),
-                correction=physics.correction,
-            )
+            ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), correction=physics.correction)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
@@ -164,7 +144,7 @@ class SoftPads:
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
             for key, values in self.report.items():
-                values[b] = _AT_REST[key]
+                values[b] = _REPORT.get(key, 0.0)
             if self._coupling is not None:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
@@ -197,11 +177,13 @@ class SoftPads:
             if since == interval or step == steps or early:
                 reports.append(self._follow(datas, failed, cases, driven, since * scene.timestep))
                 since = 0
-        failed |= ~reports[-1].last_converged
+        whole = reduce(SceneReport.then, reports)
+        failed |= ~whole.last_converged
         if (failed & ~self.soft.failed).any():
             self.soft.fail(failed)
-        self.report = _joined(reports) | {"inside_robot": self._depth_inside(datas, failed)}
-        self._unconverged += self.report["unconverged"]
+        self.report = {key: np.broadcast_to(getattr(whole, key), len(datas)).copy() for key in _REPORT}
+        self.report["inside_robot"] = self._depth_inside(datas, failed)
+        self._unconverged += whole.unconverged
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -261,12 +243,8 @@ class SoftPads:
     def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """MuJoCo's poses of cases and of its own bodies; an environment that failed keeps its last ones."""
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        driven = {}
-        for body in self._driven:
-            driven[body.spec.name] = np.where(
-                failed[:, None, None], self._last_driven[body.spec.name], body_poses(datas, body.index)
-            )
-        return cases, driven
+        now = {body.spec.name: body_poses(datas, body.index) for body in self._driven}
+        return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
 
     def _follow(
         self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: float
@@ -346,16 +324,14 @@ class SoftPads:
 
 def _solver_body(scene: TaskScene, index: int) -> SceneBody:
     body = scene.bodies[index]
-    parts = object_parts(body)
+    parts, friction = object_parts(body), body.friction_on_gel
     if body.kind == "plane":
-        return scene_body(body.name, (), "half_space", friction=body.friction_on_gel)
+        return scene_body(body.name, (), "half_space", friction=friction)
     if body.dynamics == "fixed" or (body.dynamics == "free" and body.owner == "mujoco"):
-        return scene_body(body.name, parts, "kinematic", friction=body.friction_on_gel)
+        return scene_body(body.name, parts, "kinematic", friction=friction)
     if body.dynamics == "free":
         density = body.density if body.mass is None else body.mass / enclosed_volume(object_surface(parts))
-        return scene_body(body.name, parts, "affine", density=density, friction=body.friction_on_gel)
-    bonded = None if body.held_by is None else _bonded_vertices(scene, index)
-    low, high = _extent(parts)
+        return scene_body(body.name, parts, "affine", density=density, friction=friction)
     return scene_body(
         body.name,
         parts,
@@ -363,9 +339,9 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
         density=body.density,
         youngs_modulus=body.youngs_modulus,
         poisson_ratio=body.poisson_ratio,
-        cell=float((high - low).max()) / _CELLS if body.cell is None else body.cell,
-        bonded=bonded,
-        friction=body.friction_on_gel,
+        cell=float(np.ptp(object_surface(parts).vertices, axis=0).max()) / _CELLS if body.cell is None else body.cell,
+        bonded=None if body.held_by is None else _bonded_vertices(scene, index),
+        friction=friction,
     )
 
 
@@ -373,11 +349,6 @@ def _pair_friction(scene: TaskScene) -> dict[tuple[str, str], float]:
     """Coefficients between bodies: the larger of both, as in MuJoCo; with pads the solver's own rule applies."""
     known = {b.name: PAIR_FRICTION if b.friction is None else b.friction for b in scene.bodies}
     return {(a, b): max(known[a], known[b]) for a, b in combinations(known, 2)}
-
-
-def _extent(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
-    vertices = object_surface(parts).vertices
-    return vertices.min(axis=0), vertices.max(axis=0)
 
 
 def _bonded_vertices(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -398,16 +369,3 @@ def _bonded_vertices(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.
         return inside
 
     return is_bonded
-
-
-def _joined(reports: Sequence[SceneReport]) -> dict[str, np.ndarray]:
-    """Join the reports of several steps."""
-    return {
-        "min_gap": np.min([r.min_gap for r in reports], axis=0),
-        "min_det": np.min([r.min_det for r in reports], axis=0),
-        "blocked": np.max([r.blocked for r in reports], axis=0),
-        "converged": np.all([r.converged for r in reports], axis=0),
-        "unconverged": np.sum([r.unconverged for r in reports], axis=0),
-        "newton": np.sum([r.newton for r in reports], axis=0),
-        "substeps": np.full(len(reports[0].failed), sum(r.substeps for r in reports)),
-    }

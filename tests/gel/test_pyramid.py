@@ -10,8 +10,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.gaussian import GaussianBlur, gaussian_matrix
-from raytac.gel.pyramid import CONTACT_SCALE, ElasticSurround
-from raytac.gel.pyramid_field import ComposedGaussians, LocalField, WholeField
+from raytac.gel.pyramid import CONTACT_SCALE, ComposedGaussians, ElasticSurround, LocalField, WholeField
 from raytac.gel.surface import GelSurface, make_grid, rest_height
 from raytac.shapes.part import primitive
 from raytac.shapes.underside import object_height

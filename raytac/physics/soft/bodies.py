@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -105,14 +106,14 @@ def scene_body(
         raise InputError("friction", value=friction, rule=f"of body {name!r} must be finite and >= 0")
     try:
         if kind == "half_space":
-            if len(parts) > 1 or (
-                parts and (parts[0].kind != "plane" or not np.array_equal(parts[0].object_from_part, np.eye(4)))
-            ):
+            is_plane = [part.kind == "plane" and np.array_equal(part.object_from_part, np.eye(4)) for part in parts]
+            if is_plane not in ([], [True]):
                 rule = f"of half-space {name!r} must be one plane in the body's own axes"
                 raise InputError("parts", value=[part.kind for part in parts], rule=rule)
             return SceneBody(ipc.HalfSpace(name), parts or (Part("plane"),), friction)
         if kind == "soft":
-            solid = _soft(name, parts, density, youngs_modulus, poisson_ratio, cell, bonded)
+            material = ipc.Material(young=youngs_modulus, poisson=poisson_ratio, density=density)
+            solid = _soft(name, parts, material, cell, bonded)
             return SceneBody(solid, (), friction, SoftSkin(parts, solid.mesh))
         surface = _checked_surface(name, parts, sag)
         if kind == "affine":
@@ -123,13 +124,7 @@ def scene_body(
 
 
 def _soft(
-    name: str,
-    parts: tuple[Part, ...],
-    density: float,
-    youngs_modulus: float,
-    poisson_ratio: float,
-    cell: float,
-    is_bonded: Callable[[np.ndarray], np.ndarray] | None,
+    name: str, parts: tuple[Part, ...], material: ipc.Material, cell: float, is_bonded: Callable[[np.ndarray], np.ndarray] | None
 ) -> ipc.SoftBody:
     if not 0.0 < cell < np.inf:
         raise InputError("cell", value=cell, rule=f"of soft body {name!r} must be a length > 0 [m]")
@@ -146,7 +141,6 @@ def _soft(
         if not 0 < len(bonded) < len(tets.vertices):
             rule = f"holds {len(bonded)} of the {len(tets.vertices)} vertices of {name!r}: it must hold some and leave some"
             raise InputError("bonded", value=is_bonded, rule=rule)
-    material = ipc.Material(young=youngs_modulus, poisson=poisson_ratio, density=density)
     return ipc.SoftBody(name, tets, material, bonded=bonded)
 
 
@@ -167,12 +161,10 @@ def object_body(
     height that is farthest from the pad.
 
     Args:
-        parts: of the object.
-        spec: kind of body, and a soft one's material.
+        parts, spec: shape; kind of body, and a soft one's material.
         rotations: ``pad_from_object`` of every environment, (B, 3, 3). One body serves all, so a rigid one keeps the triangles that any
             of them brings near the pad, and a soft one must be tilted the same in all.
-        weight: [N], of an affine body.
-        edge_length: of a soft body's tetrahedra [m].
+        weight, edge_length: of an affine body [N]; of a soft body's tetrahedra [m].
         sag: greatest distance of facets inside a curved part [m].
         lowest: height above the object's lowest point [m] beyond which a kinematic body's triangles are left out; 0 keeps all.
 
@@ -289,13 +281,9 @@ class SceneRegistry:
         """μ by pair of names: with a pad, the body's own if it has one, else the pad's gel's; between bodies, the larger of theirs."""
         mu = {}
         for pad in self.pads.values():
-            for other in self.pads.values():
-                if other.name > pad.name:
-                    mu[pad.name, other.name] = max(pad.sensor.gelpad.friction, other.sensor.gelpad.friction)
-            for body in self.bodies.values():
-                mu[pad.name, body.name] = pad.sensor.gelpad.friction if body.friction is None else body.friction
-        bodies = list(self.bodies.values())
-        for k, one in enumerate(bodies):
-            for two in bodies[k + 1 :]:
-                mu[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
+            gel = pad.sensor.gelpad.friction
+            mu |= {(pad.name, o.name): max(gel, o.sensor.gelpad.friction) for o in self.pads.values() if o.name > pad.name}
+            mu |= {(pad.name, body.name): gel if body.friction is None else body.friction for body in self.bodies.values()}
+        for one, two in combinations(self.bodies.values(), 2):
+            mu[one.name, two.name] = max(one.friction or 0.0, two.friction or 0.0)
         return mu

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh
-from raytac.gel.components import find_runs, join_runs
+from raytac.gel.components import find_runs, join_runs, span
 from raytac.gel.interpolate import cell_lengths
 from raytac.gel.surface import GelSurface
 from raytac.specs import PressScene
@@ -68,8 +68,7 @@ def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool
 def _narrowest(contact: np.ndarray, surface: GelSurface, mesh: CoatMesh) -> float:
     if not contact.any():
         return float("nan")
-    along, across = (np.flatnonzero(contact.any(axis=axis)) for axis in (0, 1))
-    box = slice(across[0], across[-1] + 1), slice(along[0], along[-1] + 1)
+    box = span(contact.any(axis=1)), span(contact.any(axis=0))
     contact, x, y = contact[box], surface.grid.x[box[1]], surface.grid.y[box[0]]
     row, start, stop = find_runs(contact[None])
     piece = np.array(join_runs(row.tolist(), start.tolist(), stop.tolist(), len(y)))

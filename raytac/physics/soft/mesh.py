@@ -58,19 +58,21 @@ class PadMesh:
             raise InputError("bonded", value=f"all {len(self.bonded)} vertices", rule="must leave vertices that can move")
 
 
-def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel) -> PadMesh:
-    """Mesh of a gelpad: six tetrahedra to a cell of a grid that follows the dome.
+def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
+    """Mesh of a gelpad, or the mesh itself: six tetrahedra to a cell of a grid that follows the dome.
 
     Cells are mirror images of their neighbours (``ipc.box_mesh``). If all were divided alike, nearly incompressible gel would lock
     (docs/soft-pad.md has the figures).
 
     Args:
         gelpad: size, thickness, dome, and the faces bonded to the case: the back, or the back and the sides.
-        level: a name of ``PAD_LEVELS``, or a level.
+        level: a name of ``PAD_LEVELS``, a level, or a mesh.
 
     Raises:
         InputError: an unknown level, or one that leaves less than two cells along an axis.
     """
+    if isinstance(level, PadMesh):
+        return level
     if isinstance(level, str):
         if level not in PAD_LEVELS:
             raise InputError("pad", value=level, rule="must be a known level", choices=PAD_LEVELS)

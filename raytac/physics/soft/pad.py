@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import CoatTraction
 from raytac.io.progress import Progress
@@ -17,9 +17,9 @@ from raytac.physics.press import CLEARANCE, PressPad
 from raytac.physics.soft.bodies import object_body
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.physics.soft.placement import PressPlacement
-from raytac.physics.soft.press_controller import PressController, StageStart
+from raytac.physics.soft.press_controller import PressController
 from raytac.physics.soft.press_solver import PressSolver
-from raytac.physics.soft.reading import SoftReader, SoftReading
+from raytac.physics.soft.reading import CoatState, SoftReader, SoftReading
 from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -32,12 +32,6 @@ _SAG = 0.1
 
 class SoftPad(PressPad):
     """Press scene on a sensor with a soft pad (see docs/soft-pad.md); used as ``RigidPad`` is.
-
-    .. code-block:: python
-
-        pad = SoftPad(sensor, scene, pitch=0.1e-3, level="medium")
-        for reading in pad.run(steps_per_stage=8):
-            surface = reading.surface
 
     Between readings the solver takes as many steps as it needs. An ``indent`` to a depth ends when the *coat* is at that depth:
     the barrier's clearance is added to the object's height; on the way the coat is there within some micrometres, and never deeper than
@@ -64,26 +58,21 @@ class SoftPad(PressPad):
         """Mesh the pad, make the object's surface and put both into the solver.
 
         Args:
-            sensor: gives the gelpad.
-            scene: object and trajectory.
             level: a name of ``PAD_LEVELS``, or a mesh of one's own.
-            correction: of what the mesh gets wrong below the size of its cells; None shows the plain finite-element surface.
-            control: tolerances and search of the solver and its controller.
+            correction, control: as in ``Ipc``.
             device: where the solver runs, ``cpu`` or ``cuda``.
-            settings: as of ``PressPad``.
+            sensor, scene, settings: as of ``PressPad``.
 
         Raises:
             InputError: an unknown level; else as ``PressPad``.
             RaytacError: the object overlaps the pad where it starts.
         """
         super().__init__(sensor, scene, **settings)
-        self.mesh = level if isinstance(level, PadMesh) else pad_mesh(sensor.gelpad, level)
+        self.mesh = pad_mesh(sensor.gelpad, level)
         self._reader = SoftReader(self.mesh, sensor.gelpad, self.grid, correction)
-        self._traction: CoatTraction | None = None
         self._last: SoftReading | None = None
         self.solver: PressSolver | None = None
         self._drive: PressController | None = None
-        self._begun: StageStart | None = None
         self._bar = Progress(desc="press", show=False)
         if self.parts:
             self._places = PressPlacement(scene, self.parts, sensor.gelpad, self.grid, self.targets)
@@ -120,11 +109,11 @@ class SoftPad(PressPad):
     def begin(self, index: int, stage: StageSpec, steps: int) -> None:
         assert self._drive is not None
         self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
-        self._begun = self._drive.start()
+        self._drive.begin()
 
     def advance(self, stage: StageSpec, fraction: float) -> None:
-        assert self._drive is not None and self._begun is not None
-        self._drive.advance(stage, fraction, self._begun)
+        assert self._drive is not None
+        self._drive.advance(stage, fraction)
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
         """As of ``PressPad``; a soft object is shown as it was at the last reading."""
@@ -140,8 +129,8 @@ class SoftPad(PressPad):
         else:
             coat = self._last = self._reader.read(self.solver.coat_state(self._drive.poses()), self._drive.failed)
             self._drive.failed = coat.failed
-            self._drive.set_clearance(coat.clearance)
-            poses, case, unconverged = coat.poses[0], self._drive.case(), self._drive.unconverged
+            self._drive.measured = coat.clearance
+            poses, case, unconverged = coat.poses[0], self._drive.case(), self.solver.unconverged.copy()
             depth = np.where(coat.failed, np.nan, self._places.origin[:, 2] - poses[:, 2, 3])
         case = np.tile(np.eye(4), (batch, 1, 1)) if case is None else case
         case[coat.failed] = np.nan
@@ -150,7 +139,7 @@ class SoftPad(PressPad):
             coat.surface,
             np.concatenate([coat.forces.sum(axis=1), torque], axis=1),
             coat.failed.copy(),
-            lambda _: self._traction_of(coat.forces),
+            lambda _: self._traction(coat.forces),
             unconverged=unconverged,
             pad_from_object=poses,
             world_from_pad=case,
@@ -158,20 +147,14 @@ class SoftPad(PressPad):
             solved=coat,
         )
 
-    def _traction_of(self, forces: np.ndarray) -> np.ndarray:
-        """Traction (B, Ny, Nx, 3) [Pa] of forces on the coat's vertices, at the place of the coat at rest."""
-        if self._traction is None:
-            self._traction = CoatTraction(self.mesh.coat, self.grid)
-        return self._traction(forces)
+    @cached_property
+    def _traction(self) -> CoatTraction:
+        return CoatTraction(self.mesh.coat, self.grid)
 
     def _at_rest(self) -> SoftReading:
         """The coat without an object."""
-        batch, lattice = self.num_envs, self.mesh.coat
-        rest = np.repeat(self.grid.rest[None].astype(np.float32), batch, axis=0)
-        coat = DeformedCoat(lattice, np.repeat(lattice.rest[None], batch, axis=0))
-        surface = GelSurface(self.grid, rest, np.zeros(rest.shape, bool), np.full((batch, 2), np.nan), None, coat)
-        none, forces = np.full(batch, np.nan), np.zeros_like(coat.positions)
-        return SoftReading(surface, coat.positions, forces, none, (), np.full(rest.shape, np.inf), none, np.zeros(batch, bool))
+        vertices = np.repeat(self.mesh.coat.rest[None], self.num_envs, axis=0)
+        return self._reader.read(CoatState(vertices, np.zeros_like(vertices), ()), np.zeros(self.num_envs, bool))
 
     @property
     def _deepest(self) -> float:

@@ -35,8 +35,13 @@ class PressPlacement:
         self._touches: dict[bytes, float] = {}
         start = np.asarray(scene.object.position[:2])
         centres = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
-        self.origin = np.array([self._first(b, x, y) for b, (x, y) in enumerate(centres.tolist())])
+        self.origin = np.zeros((len(centres), 3))
         """Object's origin at first touch, zero shear and twist, shape (B, 3) [m]."""
+        for b, (x, y) in enumerate(centres.tolist()):
+            try:
+                self.origin[b] = x, y, self._touch(b, x, y, 0.0)
+            except InputError as error:
+                raise targets.start_error(b, error) from error
         self._check_stages(scene)
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
@@ -69,12 +74,6 @@ class PressPlacement:
         pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
         law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
         return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
-
-    def _first(self, b: int, x: float, y: float) -> np.ndarray:
-        try:
-            return np.array([x, y, self._touch(b, x, y, 0.0)])
-        except InputError as error:
-            raise self._targets.start_error(b, error) from error
 
     def _check_stages(self, scene: PressScene) -> None:
         """Refuse shears and twists that end off the pad."""

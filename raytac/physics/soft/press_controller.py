@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from raytac.io.progress import Progress
@@ -13,21 +11,7 @@ from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.reading import SoftReader
 from raytac.specs.press import PressScene, StageSpec
 
-__all__ = ["PressController", "StageStart"]
-
-
-@dataclass(frozen=True)
-class StageStart:
-    """Position of B environments at the beginning of a stage."""
-
-    depth: np.ndarray
-    """[m], (B,)."""
-    shear: np.ndarray
-    """[m], (B, 2)."""
-    twist: np.ndarray
-    """[rad], (B,)."""
-    force: np.ndarray
-    """Normal force that is prescribed, or else the present one [N], (B,); a stage to a force begins from it."""
+__all__ = ["PressController"]
 
 
 class PressController:
@@ -38,12 +22,7 @@ class PressController:
     """
 
     def __init__(
-        self,
-        scene: PressScene,
-        solver: PressSolver,
-        reader: SoftReader,
-        placement: PressPlacement,
-        targets: PressTargets,
+        self, scene: PressScene, solver: PressSolver, reader: SoftReader, placement: PressPlacement, targets: PressTargets
     ) -> None:
         self._scene, self._solver, self._reader, self._placement = scene, solver, reader, placement
         self._targets, self.num_envs = targets, len(targets.lost)
@@ -60,15 +39,11 @@ class PressController:
         self._clear()
         self._solver.reset()
 
-    def start(self) -> StageStart:
-        """Position at which the next stage begins."""
+    def begin(self) -> None:
+        """Begin a stage where the object is now, at the prescribed force, or else the present one."""
         present = np.maximum(np.nan_to_num(self._solver.normal_force()), 0.0)
-        force = np.where(np.isfinite(self._force), self._force, present)
-        return StageStart(self._depth.copy(), self._shear.copy(), self._twist.copy(), force)
-
-    def set_clearance(self, clearance: np.ndarray) -> None:
-        """Take the clearance [m], (B,), of the state that was read last."""
-        self._measured = clearance
+        self._start = self._depth.copy(), self._shear.copy(), self._twist.copy()
+        self._start_force = np.where(np.isfinite(self._force), self._force, present)
 
     def poses(self) -> np.ndarray:
         """Prescribed ``pad_from_object`` (B, 4, 4): higher than the depth by the clearance."""
@@ -80,27 +55,27 @@ class PressController:
             return None
         return self._placement.case(self._clearance - self._depth, self._shear, self._twist)
 
-    def advance(self, stage: StageSpec, fraction: float, start: StageStart) -> None:
-        """Move from the present position to a ``fraction`` of a stage that began at ``start``."""
+    def advance(self, stage: StageSpec, fraction: float) -> None:
+        """Move from the present position to a ``fraction`` of the stage that was begun last."""
+        depth, shear, twist = self._start
         if stage.kind in ("shear", "twist"):
-            shear, twist = self._shear, self._twist
             if stage.kind == "shear":
-                shear = start.shear + fraction * (self._targets.shear(stage) - start.shear)
+                shear, twist = shear + fraction * (self._targets.shear(stage) - shear), self._twist
             else:
-                twist = start.twist + fraction * (self._targets.twist(stage) - start.twist)
+                shear, twist = self._shear, twist + fraction * (self._targets.twist(stage) - twist)
             self._move(self._depth, shear, twist, follow=True)
             self._settle()  # a shear unloads what lies behind the object
         elif stage.kind == "release":
             self._force[:] = np.nan
-            self._release(start.depth, fraction)
+            self._release(depth, fraction)
         elif stage.force is not None:
-            self._force[:] = start.force + fraction * (stage.force - start.force)
+            self._force[:] = self._start_force + fraction * (stage.force - self._start_force)
             self._load()
-            if not self._is_free and (self._force < start.force).any():
+            if not self._is_free and (self._force < self._start_force).any():
                 self._settle()
         else:
             self._force[:] = np.nan
-            depth = np.maximum(start.depth, 0.0)
+            depth = np.maximum(depth, 0.0)
             self._indent(depth + fraction * (self._targets.depth(stage) - depth), is_last=fraction == 1.0)
         self._converge()
 
@@ -112,24 +87,19 @@ class PressController:
         """Prescribed normal force [N]; NaN while a depth is prescribed."""
         self._clearance = np.full(batch, self._d_hat)
         """Clearance by which the object is raised [m]: first the barrier's reach, then as it was measured."""
-        self._measured = np.full(batch, np.nan)
-        """Clearance in the state that was read last [m]; NaN out of contact."""
+        self.measured = np.full(batch, np.nan)
+        """Clearance in the state that was read last [m], (B,), which the reader sets; NaN out of contact."""
         self._stiffness = np.full(batch, np.nan)
         self.failed: np.ndarray = self._targets.lost.copy()
         self._solver.unconverged[:] = 0
-
-    @property
-    def unconverged(self) -> np.ndarray:
-        """Steps since the start that did not meet the solver's tolerance, shape (B,)."""
-        return self._solver.unconverged.copy()
 
     def _indent(self, depth: np.ndarray, *, is_last: bool) -> None:
         """Drive the coat to a depth without overshoot; exactly there at the stage's end."""
         travel = depth - np.maximum(self._depth, -self._d_hat)
         # Follow the clearance, but never so fast that the object would stand still or turn back.
-        error = np.nan_to_num(self._measured - self._clearance)
+        error = np.nan_to_num(self.measured - self._clearance)
         self._clearance = self._clearance + np.clip(error, -self._d_hat, 0.5 * np.abs(travel))
-        exact = np.full(self.num_envs, is_last) | np.isnan(self._measured)  # at the first touch no clearance is known yet
+        exact = np.full(self.num_envs, is_last) | np.isnan(self.measured)  # at the first touch no clearance is known yet
         margin = np.where(exact, np.clip(travel, 0.0, self._d_hat), 0.0)
         self._move(depth - margin, self._shear, self._twist)
         if exact.any():
@@ -259,12 +229,8 @@ class PressController:
         assert self._weight > 0.0
         self._solver.set_gravity(float(self._force[0]) / self._weight)
         for _ in range(4 * self._control.force_steps):
-            self._solver.fail(self.failed)
-            self.failed |= self._solver.step(self.poses())
-            self.bar.update()
-            sound = ~self.failed
-            if (self._solver.speed()[sound] < self._control.rest_speed).all() and (
-                self._solver.normal_force()[sound] > 0.0
-            ).all():
+            self._step()
+            is_at_rest = (self._solver.speed() < self._control.rest_speed) & (self._solver.normal_force() > 0.0)
+            if (is_at_rest | self.failed).all():
                 return
         self.failed |= self._solver.speed() >= self._control.rest_speed

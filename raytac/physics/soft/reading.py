@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -54,9 +55,7 @@ class ContactObject:
 
     def shape(self, b: int, lowered: float = 0.0) -> tuple[Sequence[Part], np.ndarray]:
         """Parts and their pose (4, 4) over pad ``b``, ``lowered`` along z [m]."""
-        pose = self.poses[b].copy()
-        if self.surface is not None:
-            pose = np.eye(4)
+        pose = self.poses[b].copy() if self.surface is None else np.eye(4)
         pose[2, 3] -= lowered
         return (self.parts if self.surface is None else (mesh_part(self.surface[0][b], self.surface[1]),)), pose
 
@@ -77,6 +76,21 @@ class CoatState:
         for thing in self.objects:
             arrays += [thing.poses] if thing.surface is None else [thing.poses, thing.surface[0]]
         return np.all([np.isfinite(values).all(axis=(1, 2)) for values in arrays], axis=0)
+
+    def underside(
+        self, b: int, x: np.ndarray, y: np.ndarray, below: float, soft_below: float = np.inf, lowered: float = 0.0
+    ) -> np.ndarray:
+        """Underside over pad ``b`` at lines ``x``, ``y`` [m], (Ny, Nx), of what touches it, ``lowered`` [m]; inf where there is none.
+
+        What lies wholly above ``below`` may be missing, of soft objects above ``soft_below`` [m].
+        """
+        under = np.full((len(y), len(x)), np.inf)
+        for thing in self.objects:
+            if thing.touches(b):
+                parts, pose = thing.shape(b, lowered)
+                limit = below if thing.surface is None else soft_below
+                np.minimum(under, object_height(parts, pose[None], x, y, below=limit)[0], out=under)
+        return under
 
     def friction(self, b: int) -> float | None:
         """Coulomb's coefficient if a single rigid object touches pad ``b``, else None."""
@@ -114,23 +128,13 @@ class SoftReader:
     def __init__(
         self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid, correction: Correction | None = DEFAULT_CORRECTION
     ) -> None:
-        """Prepare a reader.
-
-        Args:
-            mesh: tetrahedra and coat of the pad.
-            gelpad: size and elasticity.
-            grid: nodes at which surfaces are given.
-            correction: of the mesh's error below the size of a cell; None shows the spline through the solver's vertices.
-        """
-        self.mesh, self.grid, self.correction = mesh, grid, correction
+        """Prepare to give surfaces on ``grid``; ``correction`` None: those of the spline through the solver's vertices."""
+        self.mesh, self.grid, self.correction, self._gelpad = mesh, grid, correction, gelpad
         self._surface = CoatSurface(mesh.coat, gelpad)
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
-        self._rest = grid.rest.astype(np.float32)
-        self._gelpad = gelpad
-        self._fine_grid = grid
+        self._rest, self._fine_grid = grid.rest.astype(np.float32), grid
         if correction is not None and min(grid.pitch) <= 0.9 * correction.pitch:
             self._fine_grid = make_grid(gelpad, correction.pitch)
-        self._stages: tuple[NormalCorrection, ContactSampler, TangentialCorrection] | None = None
         self._warned = False
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
@@ -190,7 +194,7 @@ class SoftReader:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Height, contact mask and underside (Ny, Nx), coat vertices (V, 3) and residual of pad ``b``, of a ``plain`` height [m]."""
         assert self.correction is not None
-        normal, sampler, tangential = self._correction_stages()
+        normal, sampler, tangential = self._stages
         rest, upwards = self.mesh.coat.rest, self._upwards(state, b)
         smooth = None
         if len(state.objects) > 1:
@@ -202,9 +206,9 @@ class SoftReader:
             height, touched = sampler.lay(self._rest + sampler.rise(contact), contact, under)
         else:
             height, touched = plain, sampler.touching(contact)
+        sideways = tangential.sideways(contact, state.vertices[b] - rest, load, state.friction(b))
         coat = np.empty_like(rest)
-        displacement = state.vertices[b] - rest
-        coat[:, :2] = rest[:, :2] + tangential.sideways(contact, displacement, load, state.friction(b))
+        coat[:, :2] = rest[:, :2] + sideways
         coat[:, 2] = self._height_at(height, coat[:, :2])
         return height, touched, under, coat, contact.residual
 
@@ -215,12 +219,7 @@ class SoftReader:
         if not (forces[:, 2] < 0.0).any():
             return places, float("nan")
         below = float(self.grid.rest.max()) + 10.0 * self.mesh.d_hat
-        under = np.full((len(self._clearance.y), len(self._clearance.x)), np.inf)
-        for thing in state.objects:
-            if thing.touches(b):
-                parts, pose = thing.shape(b)
-                height = object_height(parts, pose[None], self._clearance.x, self._clearance.y, below=below)[0]
-                np.minimum(under, height, out=under)
+        under = state.underside(b, self._clearance.x, self._clearance.y, below, below)
         if len(state.objects) > 1:
             smooth = self._clearance.heights(self._surface.rise(places, displacement[:, 2]))
             under[under < smooth - _BEHIND] = np.inf
@@ -244,29 +243,22 @@ class SoftReader:
                 stacklevel=2,
             )
 
-    def _correction_stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
+    @cached_property
+    def _stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
         """Stages of the correction, made at the first contact: the compliance takes a while."""
-        if self._stages is None:
-            assert self.correction is not None
-            x, y = self._fine_grid.x, self._fine_grid.y
-            compliance = coat_compliance(self.mesh, self._gelpad)[0]
-            continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
-            normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
-            tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
-            self._stages = normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
-        return self._stages
+        assert self.correction is not None
+        x, y = self._fine_grid.x, self._fine_grid.y
+        compliance = coat_compliance(self.mesh, self._gelpad)[0]
+        continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
+        normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
+        tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
+        return normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
 
     def _underside(
         self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
     ) -> np.ndarray:
         """Underside of the shown objects over a grid [m], (Ny, Nx); without what lies far below the ``smooth`` coat, if given."""
-        under = np.full(grid.shape, np.inf)
-        highest = float(grid.rest.max())
-        for thing in state.objects:
-            if thing.touches(b):
-                parts, pose = thing.shape(b, clearance)
-                below = highest if thing.surface is None else np.inf
-                np.minimum(under, object_height(parts, pose[None], grid.x, grid.y, below=below)[0], out=under)
+        under = state.underside(b, grid.x, grid.y, float(grid.rest.max()), lowered=clearance)
         if len(state.objects) > 1 and smooth is not None:
             under[under < smooth - _BEHIND] = np.inf
         return under

@@ -24,6 +24,8 @@ __all__ = ["SoftScene"]
 
 _GRAVITY = 0.0, 0.0, -9.81
 _ACCURACY = SceneSettings()
+_Poses = Mapping[str, ArrayLike]
+"""``world_from_body`` by name, (4, 4) or (B, 4, 4)."""
 
 
 class SoftScene:
@@ -46,7 +48,7 @@ class SoftScene:
         pads: Sequence[ScenePad],
         bodies: Sequence[SceneBody],
         world_from_pad: ArrayLike,
-        world_from_body: Mapping[str, ArrayLike],
+        world_from_body: _Poses,
         *,
         dt: float = 0.01,
         gravity: ArrayLike | None = None,
@@ -99,9 +101,8 @@ class SoftScene:
             linear_tolerance=accuracy.linear_tolerance,
         )
         solids = [self._at_start(body.solid, self._start[1][body.name][0]) for body in bodies]
-        gels = [
-            self._at_start(pad_body(pad.mesh, pad.sensor.gelpad, pad.name), self._start[0][0, k]) for k, pad in enumerate(pads)
-        ]
+        gels = [pad_body(pad.mesh, pad.sensor.gelpad, pad.name) for pad in pads]
+        gels = [self._at_start(gel, pose) for gel, pose in zip(gels, self._start[0][0], strict=True)]
         self._friction = mu = self._registry.friction() | dict(friction or {})
         try:
             self.world = ipc.World([*gels, *solids], self.settings, self.num_envs, device, mu, ignored)
@@ -125,16 +126,12 @@ class SoftScene:
         """Environments that are frozen until they are reset, (B,), bool."""
         return self._failed.copy()
 
-    # --- stepping --------------------------------------------------------------------------------------------------------------
-
-    def is_small(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None) -> bool:
+    def is_small(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: float | None = None) -> bool:
         """True if ``step`` with the same arguments would take a single substep."""
         part, refused = self._substeps.next_part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)
         return part == self._substeps.limits.most and not refused
 
-    def step(
-        self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None = None, dt: float | None = None
-    ) -> SceneReport:
+    def step(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: float | None = None) -> SceneReport:
         """Advance by ``dt`` [s] (None: the scene's).
 
         Cases move to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), and driven bodies to the poses given; others stay.
@@ -183,8 +180,6 @@ class SoftScene:
         return SceneReport(
             *(r.failed, r.converged, unconverged, r.converged, r.min_gap, r.min_det, r.blocked, r.newton, r.elastic, r.barrier, 1)
         )
-
-    # --- reading ---------------------------------------------------------------------------------------------------------------
 
     def wrench(self, pad: str) -> np.ndarray:
         """Contact force on a pad and torque about its origin, world axes, [N], [N m], (B, 6).
@@ -281,18 +276,12 @@ class SoftScene:
         for name, touching in self.world.touching(pad).items():
             body = self.bodies.get(name)
             if body is not None and not body.is_soft:
-                objects.append(
-                    ContactObject(body.parts, frame @ self.pose(name), None, touching, self._friction_between(pad, name))
-                )
+                # As in the solver, the last coefficient of a pair counts if it was given in both orders.
+                mu = [mu for pair, mu in self._friction.items() if set(pair) == {pad, name}][-1]
+                objects.append(ContactObject(body.parts, frame @ self.pose(name), None, touching, mu))
             elif name != pad:
                 objects.append(ContactObject((), frame @ self.pose(name), self.skin(name, pad), touching))
         return CoatState(self.coat(pad), self.coat_forces(pad), tuple(objects))
-
-    def _friction_between(self, pad: str, body: str) -> float:
-        """μ of a pair; as in the solver, the last counts if it was given in both orders."""
-        return [mu for pair, mu in self._friction.items() if set(pair) == {pad, body}][-1]
-
-    # --- state -----------------------------------------------------------------------------------------------------------------
 
     def save(self) -> SceneState:
         """The state of every environment."""
@@ -308,15 +297,11 @@ class SoftScene:
         self._failed = self._failed & ~mask | state.world.failed & mask
 
     def reset(
-        self,
-        envs: ArrayLike | None = None,
-        world_from_pad: ArrayLike | None = None,
-        world_from_body: Mapping[str, ArrayLike] | None = None,
+        self, envs: ArrayLike | None = None, world_from_pad: ArrayLike | None = None, world_from_body: _Poses | None = None
     ) -> None:
         """Return environments to rest, without history, at the initial poses or others (shapes as for the scene itself).
 
-        Raises:
-            OverlapError: bodies overlap at these poses; nothing has changed then.
+        Raises ``OverlapError`` if bodies overlap at these poses; nothing has changed then.
         """
         mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         if world_from_pad is None and world_from_body is None:
@@ -341,8 +326,6 @@ class SoftScene:
         state.world.failed[chosen] = True
         self.restore(state, chosen)
 
-    # --- inner -----------------------------------------------------------------------------------------------------------------
-
     def _contact_wrench(self, name: str) -> np.ndarray:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):
             wrench = self.world.wrench(name)
@@ -363,7 +346,7 @@ class SoftScene:
         rotation, position = self.world.frame(pad)
         return (points - position[:, None]) @ rotation
 
-    def _goal(self, world_from_pad: ArrayLike, driven: Mapping[str, ArrayLike] | None) -> Poses:
+    def _goal(self, world_from_pad: ArrayLike, driven: _Poses | None) -> Poses:
         pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         return Poses(pads, self._now.bodies | self._registry.named(driven or {}))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from typing import Protocol
 
 import numpy as np
@@ -42,13 +43,10 @@ class Substeps:
     ) -> None:
         self.limits = limits
         self._pads, self._bodies, self._query = pads, bodies, query
-        names, others = list(pads), list(bodies.values())
-        self.pairs: list[Pair] = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :]]
-        self.pairs += [(a, b.name) for a in names for b in others]
-        for k, a in enumerate(others):  # two free bodies are left to the solver; a half-space comes second
-            partners = [b for b in others[k + 1 :] if a.is_driven != b.is_driven]
-            flip = isinstance(a.solid, ipc.HalfSpace)
-            self.pairs += [(b.name, a.name) if flip else (a.name, b.name) for b in partners]
+        self.pairs: list[Pair] = [*combinations(pads, 2), *product(pads, bodies)]
+        for a, b in combinations(bodies.values(), 2):  # two free bodies are left to the solver; a half-space comes second
+            if a.is_driven != b.is_driven:
+                self.pairs.append((b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name))
 
     def next_part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
         """Part of a step of ``dt`` [s] that may be made next, and the environments that must be refused, with the pair that moves too far.
@@ -69,13 +67,11 @@ class Substeps:
 
     def refusal(self, b: int, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
         """The error of a motion of environment ``b`` that cannot be resolved."""
-        limits = self.limits
         where = f"in environment {b} " if len(self._query.failed) > 1 else ""
+        length, angle = 1e3 * self.limits.most * self.limits.step, np.degrees(self.limits.most * self.limits.turn)
         rule = (
-            f"{where}takes {' and '.join(pair or ())} too far against each other where they are near: "
-            f"at most {limits.most * limits.step * 1e3:.3g} mm "
-            f"or {np.degrees(limits.most * limits.turn):.3g} degrees in one step of {self._query.settings.dt} s; "
-            "move slower or in more steps"
+            f"{where}takes {' and '.join(pair or ())} too far against each other where they are near: at most {length:.3g} mm "
+            f"or {angle:.3g} degrees in one step of {self._query.settings.dt} s; move slower or in more steps"
         )
         return InputError("world_from_pad", value=f"displacements of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
@@ -108,20 +104,15 @@ class Substeps:
         start = now[name] if body.is_driven else self._query.pose(name)
         if isinstance(solid, ipc.SoftBody):
             vertices = np.einsum("bji,bnj->bni", start[:, :3, :3], self._query.world.positions(name) - start[:, None, :3, 3])
-            end = (
-                self._contact_end(solid, start, goal[name], remaining)
-                if body.is_driven
-                else self._free_end(name, start, remaining)
-            )
-            return BoxMotion(start, end, vertices.min(axis=1), vertices.max(axis=1))
-        vertices = solid.surface.vertices
-        end = goal[name] if body.is_driven else self._free_end(name, start, remaining)
-        return BoxMotion(start, end, ones * vertices.min(axis=0), ones * vertices.max(axis=0))
-
-    def _free_end(self, name: str, start: np.ndarray, remaining: float) -> np.ndarray:
-        """Pose of a free body after the ``remaining`` time [s] at its present momentum."""
-        motion = self._query.world.rigid_motion(name)
-        return _move(start, motion.centre, remaining * motion.velocity, remaining * motion.spin)
+            low, high = vertices.min(axis=1), vertices.max(axis=1)
+        else:
+            low, high = (ones * corner for corner in (solid.surface.vertices.min(axis=0), solid.surface.vertices.max(axis=0)))
+        if not body.is_driven:  # it keeps its momentum
+            motion = self._query.world.rigid_motion(name)
+            end = _move(start, motion.centre, remaining * motion.velocity, remaining * motion.spin)
+        else:
+            end = self._contact_end(solid, start, goal[name], remaining) if isinstance(solid, ipc.SoftBody) else goal[name]
+        return BoxMotion(start, end, low, high)
 
     def _contact_end(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, remaining: float) -> np.ndarray:
         """Pose of a driven soft body whose contact keeps its velocity; ``goal`` without contact."""
@@ -207,9 +198,7 @@ def _box_gaps(a: BoxMotion, b: BoxMotion) -> tuple[np.ndarray, ...]:
     """
     before, after = (inverse(p) @ t for p, t in ((b.start, a.start), (b.end, a.end)))
     start, end = (_transform(pose, a.corners()) for pose in (before, after))
-    b_start, b_end = (
-        _transform(inverse(pose), b.corners()) for pose in (before, after)
-    )  # of the second box, as the first sees it
+    b_start, b_end = (_transform(inverse(pose), b.corners()) for pose in (before, after))  # of b, in the frame of a
     longest, turn = np.linalg.norm(end - start, axis=2).max(axis=1), _relative_turn(before, after)
     error = np.maximum(_chord_error(start, end, turn), _chord_error(b_start, b_end, turn))[:, None]
     of_a = np.stack([_separation(start, b), _separation(end, b) - error])

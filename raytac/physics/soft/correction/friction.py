@@ -7,13 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.gel.components import span
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
 from raytac.physics.soft.correction.layer import CosineSeries, layer_shear
-from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection, span
+from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["FrictionCorrection", "PlaneMotion", "TangentialContact"]
+__all__ = ["FrictionCorrection", "PlaneMotion", "TangentialContact", "plane_displacement", "plane_waves"]
+
+
+Response = Callable[[np.ndarray], np.ndarray]
+"""A: displacement [m] of a traction [Pa], (2, n, m) each."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,22 @@ class TangentialContact:
     """Amplitudes of A τ over the whole pad [m], (2, Ky, Kx)."""
 
 
+Lines = tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]
+"""Cosines and sines over lines, (Kx, Nx) each, and (Ny, Ky) each."""
+
+
+def plane_waves(along_x: CosineSeries, along_y: CosineSeries, x: np.ndarray, y: np.ndarray) -> Lines:
+    """Waves of both series over lines ``x`` (Nx,), ``y`` (Ny,) [m], for ``plane_displacement``."""
+    over_x = tuple(np.ascontiguousarray(f(x).T, np.float32) for f in (along_x.synthesis, along_x.sines))
+    return over_x, tuple(f(y).astype(np.float32) for f in (along_y.synthesis, along_y.sines))
+
+
+def plane_displacement(waves: np.ndarray, lines: Lines) -> np.ndarray:
+    """Displacement along x and y [m], (2, Ny, Nx), of amplitudes (2, Ky, Kx) over the lines of ``plane_waves``."""
+    (cos_x, sin_x), (cos_y, sin_y) = lines
+    return np.stack([sandwich(cos_y, waves[0], sin_x), sandwich(sin_y, waves[1], cos_x)])
+
+
 class FrictionCorrection:
     """Exchanges the mesh's response to friction for the layer's (*defect correction*).
 
@@ -88,11 +109,8 @@ class FrictionCorrection:
     def __init__(self, normal: NormalCorrection, gelpad: GelpadSpec, compliance: np.ndarray) -> None:
         """Prepare the tangential grid.
 
-        Args:
-            normal: the normal stage, whose grid p lies on.
-            gelpad: elasticity and thickness of the layer.
-            compliance: displacement along x, y of each vertex over a force along x, y (first axis) on each [m/N], (2, 2, V, V), for a
-                mesh whose sides may not move outwards.
+        ``compliance``: displacement along x, y of each vertex over a force along x, y (first axis) on each [m/N], (2, 2, V, V), for a mesh
+        whose sides may not move outwards.
         """
         self._normal, self._settings = normal, normal.settings
         self._compliance = compliance.astype(np.float32)
@@ -105,21 +123,14 @@ class FrictionCorrection:
             k_axis / np.maximum(k, x.wave_numbers[1] * 1e-9) for k_axis in (x.wave_numbers[None, :], y.wave_numbers[:, None])
         )
         along, across = (law * y.hat[:, None] * x.hat for law in layer_shear(k, gelpad))
-        self._layer = tuple(
-            law.astype(np.float32)
-            for law in (
-                across + (along - across) * cos_x**2,
-                (along - across) * cos_x * cos_y,
-                across + (along - across) * cos_y**2,
-            )
-        )
+        excess = along - across
+        laws = across + excess * cos_x**2, excess * cos_x * cos_y, across + excess * cos_y**2
+        self._layer = tuple(law.astype(np.float32) for law in laws)
         self._analysis_x, self._analysis_y = (
             tuple(m.astype(np.float32) for m in (series.analysis, series.sine_analysis)) for series in (x, y)
         )
-        self._series = x, y
-        self._nodes = self._synthesis(self._x, self._y)
-        mesh = normal.surface.mesh
-        self._vertices = self._synthesis(mesh.lines_x, mesh.lines_y)
+        self._nodes = plane_waves(x, y, self._x, self._y)
+        self._vertices = plane_waves(x, y, normal.surface.mesh.lines_x, normal.surface.mesh.lines_y)
 
     def correct(
         self, contact: NormalContact, dragged: np.ndarray, touching: np.ndarray, load: np.ndarray, friction: float
@@ -140,7 +151,7 @@ class FrictionCorrection:
             if solution is None:
                 return np.zeros_like(dragged)
             waves = solution.waves
-        layer = self._displacement(waves, self._vertices).reshape(2, -1)
+        layer = plane_displacement(waves, self._vertices).reshape(2, -1)
         blend = self._blend(layer.T[touching], dragged[touching], load[touching])
         if blend == 0.0:
             return np.zeros_like(dragged)
@@ -166,7 +177,7 @@ class FrictionCorrection:
         if not loaded.any():
             return None
         margin = 2 + int(0.3 * np.abs(goal.at(place)[loaded]).max() / settings.tangential_pitch)
-        rows, columns = (span(np.asarray(loaded.any(axis=k)), margin) for k in (1, 0))
+        rows, columns = (span(loaded.any(axis=k), margin) for k in (1, 0))
         place, loaded = place[rows, columns], loaded[rows, columns]
         (to_cos_x, to_sin_x), (to_cos_y, to_sin_y) = (
             tuple(m[:, columns].T for m in self._analysis_x),
@@ -179,7 +190,7 @@ class FrictionCorrection:
             return np.stack([self._layer[0] * τx + self._layer[1] * τy, self._layer[1] * τx + self._layer[2] * τy])
 
         def respond(traction: np.ndarray) -> np.ndarray:
-            return self._displacement(amplitudes(traction), window)
+            return plane_displacement(amplitudes(traction), window)
 
         motion, bound = goal, friction * pressure_at(goal.at(place), place)
         largest = _largest_compliance(respond, bound > 0.0)
@@ -192,7 +203,7 @@ class FrictionCorrection:
                 traction, target, bound.astype(np.float32), 1.0 / largest, respond, settings.traction_iterations
             )
             waves = amplitudes(traction)
-            displacement = self._displacement(waves, window)
+            displacement = plane_displacement(waves, window)
             solution = TangentialContact(place, traction, bound, displacement, waves)
             mean = PlaneMotion.fit(np.moveaxis(displacement, 0, -1).reshape(-1, 2), place.reshape(-1, 2), bound.ravel())
             inside = place[bound > 0.0]
@@ -208,18 +219,6 @@ class FrictionCorrection:
             if not (bound > 0.0).any():
                 break
         return solution
-
-    def _synthesis(self, x: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Cosines and sines over lines: (Kx, Nx) each, and (Ny, Ky) each."""
-        along_x, along_y = self._series
-        over_x = tuple(np.ascontiguousarray(f(x).T, np.float32) for f in (along_x.synthesis, along_x.sines))
-        return over_x, tuple(f(y).astype(np.float32) for f in (along_y.synthesis, along_y.sines))
-
-    @staticmethod
-    def _displacement(waves: np.ndarray, lines: tuple) -> np.ndarray:
-        """Displacement [m], (2, Ny, Nx), of amplitudes over the lines of a ``_synthesis``."""
-        (cos_x, sin_x), (cos_y, sin_y) = lines
-        return np.stack([sandwich(cos_y, waves[0], sin_x), sandwich(sin_y, waves[1], cos_x)])
 
     def _blend(self, layer: np.ndarray, displacement: np.ndarray, weight: np.ndarray) -> float:
         """Weight of the correction in [0, 1]: less, the less the ``layer`` explains."""
@@ -255,12 +254,7 @@ class FrictionCorrection:
 
 
 def _projected_gradients(
-    τ: np.ndarray,
-    target: np.ndarray,
-    bound: np.ndarray,
-    step: float,
-    respond: Callable[[np.ndarray], np.ndarray],
-    iterations: int,
+    τ: np.ndarray, target: np.ndarray, bound: np.ndarray, step: float, respond: Response, iterations: int
 ) -> np.ndarray:
     """Traction |τ| <= ``bound`` (n, m) whose response approaches ``target`` (2, n, m).
 
@@ -284,7 +278,7 @@ def _project(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:
     return (traction * np.minimum(1.0, bound / np.maximum(size, 1e-12))).astype(np.float32)
 
 
-def _largest_compliance(respond: Callable[[np.ndarray], np.ndarray], inside: np.ndarray) -> float:
+def _largest_compliance(respond: Response, inside: np.ndarray) -> float:
     """Bound of displacement over traction [m/Pa], by power iteration; 0 if nothing can move."""
     trial = np.stack([inside, inside]).astype(np.float32)
     size = 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from raytac.physics.soft.mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["coat_compliance"]
+__all__ = ["coat_compliance", "rest_stiffness"]
 
 _SAME_PLACE = 1e-9
 """Vertices nearer than this are mirror images [m]."""
@@ -29,7 +29,7 @@ def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False,
     is the set of vertices equally many edges from the coat. A mesh that is its own mirror image is first split into its symmetric
     and antisymmetric parts, which is exact and halves the layers for each mirror.
     """
-    stiffness = _stiffness(mesh.tets.vertices, mesh.tets.tets, gelpad)
+    stiffness = rest_stiffness(mesh, gelpad)
     fixed = np.zeros((len(mesh.tets.vertices), 3), bool)
     fixed[mesh.bonded] = True
     if rollers:
@@ -60,8 +60,12 @@ class _Sparse:
         return np.bincount(self.row, self.value * vector[self.column], self.shape[0])
 
 
-def _stiffness(vertices: np.ndarray, tets: np.ndarray, gelpad: GelpadSpec) -> _Sparse:
-    """Stiffness of linear tetrahedra [N/m] over 3 n unknowns (x, y, z of each vertex in turn)."""
+def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
+    """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis: linear elasticity on constant-strain tetrahedra.
+
+    A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
+    """
+    vertices, tets = mesh.tets.vertices, mesh.tets.tets
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
     lame, shear = young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), 0.5 * young / (1.0 + nu)
     corners = vertices[tets]
@@ -121,7 +125,6 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Spars
         # Unknowns that are their own image add up or cancel; an orbit is kept once, by its lowest unknown.
         order = np.argsort(row, axis=1, kind="stable")
         row, value = np.take_along_axis(row, order, 1), np.take_along_axis(value, order, 1)
-        row_of, column_of, values = [], [], []
         keep = row[:, 0] == free
         row, value = row[keep], value[keep]
         total = np.stack([np.where(row == row[:, k : k + 1], value, 0.0).sum(axis=1) for k in range(row.shape[1])], axis=1)
@@ -130,12 +133,8 @@ def _halves(mesh: PadMesh, stiffness: _Sparse, fixed: np.ndarray) -> list[_Spars
         norm = np.linalg.norm(total, axis=1)
         alive = norm > 0.5
         row, total = row[alive], total[alive] / norm[alive, None]
-        for k in range(row.shape[1]):
-            there = total[:, k] != 0.0
-            row_of.append(row[there, k])
-            column_of.append(np.flatnonzero(there))
-            values.append(total[there, k])
-        bases.append(_Sparse(np.concatenate(row_of), np.concatenate(column_of), np.concatenate(values), (3 * n, len(row))))
+        column, k = np.nonzero(total)
+        bases.append(_Sparse(row[column, k], column, total[column, k], (3 * n, len(row))))
     return bases
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.gel.components import span
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.matmul import product, sandwich
 from raytac.physics.soft.coat_surface import CoatPlaces, CoatSurface
@@ -13,7 +14,7 @@ from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["ContactSampler", "NormalContact", "NormalCorrection", "span"]
+__all__ = ["ContactSampler", "NormalContact", "NormalCorrection"]
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,8 @@ class ContactSampler:
     def __init__(self, correction: NormalCorrection, x: np.ndarray, y: np.ndarray) -> None:
         mesh = correction.surface.mesh
         self._closed_gap = correction.settings.closed_gap
-        self.waves_y, self.waves_x = (
-            correction.series_y.synthesis(y).astype(np.float32),
-            correction.series_x.synthesis(x).T.astype(np.float32),
-        )
+        self.waves_y = correction.series_y.synthesis(y).astype(np.float32)
+        self.waves_x = correction.series_x.synthesis(x).T.astype(np.float32)
         self.border_y = SplineAxis(mesh.lines_y).matrix(y).astype(np.float32)
         self.border_x = SplineAxis(mesh.lines_x).matrix(x).T.astype(np.float32)
         self._rise_y, self._rise_x = (m.astype(np.float32) for m in correction.surface.matrices(x, y))
@@ -113,16 +112,11 @@ class NormalCorrection:
         """Prepare the fine grid of lines ``x`` (Nx,), ``y`` (Ny,) [m], evenly spaced from edge to edge of the pad.
 
         Args:
-            surface: the coat.
-            gelpad: elasticity and thickness of the layer.
-            x, y: the lines.
             compliance: z of the coat's vertices over a force along z on each [m/N], (V, V), of the pad's mesh.
             continued: the same if the pad's sides may not move outwards.
-            settings: tolerances.
         """
         self.surface, self.x, self.y, self.settings = surface, x, y, settings
-        mesh = surface.mesh
-        self._compliance = compliance
+        mesh, self._compliance = surface.mesh, compliance
         self.sides = (compliance - continued).astype(np.float32)
         self._smooth_y, self._smooth_x = _smoothing(mesh.lines_y), _smoothing(mesh.lines_x).T
         self.series_x, self.series_y = CosineSeries(x), CosineSeries(y)
@@ -154,7 +148,7 @@ class NormalCorrection:
         pressure = np.zeros(overlap.shape, np.float32)
         near = overlap > -self.settings.clear_gap
         if near.any():
-            rows, columns = (span(np.asarray(near.any(axis=k))) for k in (1, 0))
+            rows, columns = (span(near.any(axis=k)) for k in (1, 0))
             window = _Window(self, rows, columns)
             p, residual = window.solve(overlap[rows, columns].astype(np.float32), start[rows, columns])
             pressure[rows, columns] = p
@@ -237,9 +231,3 @@ def _smoothing(lines: np.ndarray) -> np.ndarray:
     for i in range(1, n - 1):
         out[i, i - 1 : i + 2] = 0.5 * cell[i] / (cell[i - 1] + cell[i]), 0.5, 0.5 * cell[i - 1] / (cell[i - 1] + cell[i])
     return out
-
-
-def span(used: np.ndarray, margin: int = 0) -> slice:
-    """Slice from the first to the last true entry, widened by ``margin``."""
-    at = np.flatnonzero(used)
-    return slice(max(int(at[0]) - margin, 0), int(at[-1]) + 1 + margin)

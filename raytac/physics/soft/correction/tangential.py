@@ -6,7 +6,7 @@ import numpy as np
 
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
-from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion
+from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion, plane_displacement, plane_waves
 from raytac.physics.soft.correction.layer import layer_compliance, layer_spread
 from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
@@ -35,8 +35,6 @@ class TangentialCorrection:
         """Prepare the grid of sideways displacements.
 
         Args:
-            normal: the normal stage.
-            gelpad: elasticity and thickness of the layer.
             compliance: displacements along x, y, z of the vertices over a force along z on each [m/N], (3, V, V).
             continued: the same over a force along x, y, z (first axis) if the pad's sides may not move outwards, (3, 3, V, V).
         """
@@ -52,10 +50,9 @@ class TangentialCorrection:
         k_y, k_x = (s.wave_numbers[np.ravel(k)] for s, k in zip((series_y, series_x), self._resolved, strict=True))
         k = np.hypot(k_x[None, :], k_y[:, None])
         ratio = layer_spread(k, gelpad) / layer_compliance(k, gelpad) / np.maximum(k, k_x[1])
-        columns, rows = len(k_x), len(k_y)
-        self._spread_x, self._spread_y = (ratio * k_x).astype(np.float32), (ratio * k_y[:, None]).astype(np.float32)
-        self._cos_x, self._sin_x = (f(self._x)[:, :columns].T.astype(np.float32) for f in (series_x.synthesis, series_x.sines))
-        self._cos_y, self._sin_y = (f(self._y)[:, :rows].astype(np.float32) for f in (series_y.synthesis, series_y.sines))
+        self._spread = np.stack([ratio * k_x, ratio * k_y[:, None]]).astype(np.float32)
+        over_x, over_y = plane_waves(series_x, series_y, self._x, self._y)
+        self._lines = tuple(np.asfortranarray(m[: len(k_x)]) for m in over_x), tuple(m[:, : len(k_y)] for m in over_y)
 
     def sideways(
         self, contact: NormalContact, displacement: np.ndarray, load: np.ndarray, friction: float | None = None
@@ -81,13 +78,7 @@ class TangentialCorrection:
 
     def _layer(self, contact: NormalContact, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """L: sideways displacement of the layer under the fine grid's pressure [m], (V, 2)."""
-        waves = contact.waves[self._resolved]
-        field = np.stack(
-            [
-                sandwich(self._cos_y, self._spread_x * waves, self._sin_x),
-                sandwich(self._sin_y, self._spread_y * waves, self._cos_x),
-            ]
-        )
+        field = plane_displacement(self._spread * contact.waves[self._resolved], self._lines)
         force = sandwich(self._normal.force_y, contact.pressure, self._normal.force_x).reshape(-1, 1)
         sides = product(self._sides.reshape(-1, len(force)), force).reshape(2, -1)
         return (sampled(field, self._x, self._y, x, y) - sides).T

@@ -11,7 +11,8 @@ import pytest
 
 from raytac.gel.surface import make_grid
 from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion
+from raytac.physics.soft.correction import friction
+from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion, plane_displacement
 from raytac.physics.soft.correction.layer import layer_shear
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.correction.normal import NormalCorrection
@@ -193,7 +194,7 @@ def test_a_linear_drag_of_the_mesh_is_exchanged_for_the_layers(contact, stage):
     """In contact the skin goes with the object, around it as the layer under the fine contact's friction does, whatever the mesh did."""
     shape, moved, touching, went, before = dragged(contact, 2e-4)
     solution = stage.solve(shape.pressure, motion(2e-4), 1e4)
-    layer = stage._displacement(solution.waves, stage._vertices).reshape(2, -1).T
+    layer = plane_displacement(solution.waves, stage._vertices).reshape(2, -1).T
     assert np.abs(before - moved[:, :2]).max() < 2e-6  # nothing was exchanged: no spread is in a drag
     assert np.abs(went - layer).max() < 4e-6
     assert np.abs(went - moved[:, :2])[~touching].max() > 2e-5
@@ -240,7 +241,9 @@ def test_a_contact_at_the_pads_border_is_exchanged_too(contact, stage, corner, m
 
 
 def test_a_contact_that_nothing_moves_is_left_alone(contact, stage, monkeypatch):
-    monkeypatch.setattr(stage, "_displacement", lambda waves, lines: np.zeros((2, len(lines[1][0]), lines[0][0].shape[1])))
+    monkeypatch.setattr(
+        friction, "plane_displacement", lambda waves, lines: np.zeros((2, len(lines[1][0]), lines[0][0].shape[1]))
+    )
     assert stage.solve(dome(contact[0]), motion(1e-4), 0.6) is None
 
 

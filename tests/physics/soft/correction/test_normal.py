@@ -12,7 +12,7 @@ from raytac.gel.interpolate import sampled
 from raytac.gel.surface import make_grid
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance, layer_spread
-from raytac.physics.soft.correction.mesh_compliance import coat_compliance
+from raytac.physics.soft.correction.mesh_compliance import coat_compliance, rest_stiffness
 from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection, _smoothing
 from raytac.physics.soft.correction.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
@@ -72,11 +72,9 @@ def test_cosines_pass_through_their_nodes():
 @pytest.mark.parametrize("rollers", [False, True])
 def test_the_coats_compliance_is_that_of_the_whole_stiffness(rollers, pushed):
     """Against a dense solve of the same stiffness: eliminating layers, and halves of a symmetric pad, loses nothing."""
-    from raytac.physics.soft.correction.mesh_compliance import _stiffness
-
     found = coat_compliance(MESH, GELPAD, rollers=rollers, along=(0, pushed))[1]
     assert np.abs(found[pushed] - found[pushed].T).max() == 0.0
-    sparse = _stiffness(MESH.tets.vertices, MESH.tets.tets, GELPAD)
+    sparse = rest_stiffness(MESH, GELPAD)
     dense = np.zeros(sparse.shape)
     dense[sparse.row, sparse.column] = sparse.value
     held = np.zeros((len(MESH.tets.vertices), 3), bool)
