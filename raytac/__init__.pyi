@@ -29,6 +29,7 @@ from .gel.surface import GelSurface as GelSurface
 from .gel.surface import PadGrid as PadGrid
 from .installation import foreign_ipc as foreign_ipc
 from .observe.settings import ObservationSettings as ObservationSettings
+from .robots.mount import mount as mount
 from .sensor.tactile_sensor import TactileSensor as TactileSensor
 from .specs.files import available as available
 from .specs.press import PressScene as PressScene

@@ -37,10 +37,10 @@ from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
-from raytac.world.compose import ComposedScene
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.pad_overlap import PadOverlap, Touches
+from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
@@ -88,7 +88,7 @@ class RigidPads:
     soft = None
     meshes: tuple[str, ...] = ()
 
-    def __init__(self, composed: ComposedScene, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
+    def __init__(self, composed: WorldModel, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
         """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here."""
         num_envs = len(datas)
         self.composed, self.model, self._models = composed, composed.model, models
@@ -96,12 +96,15 @@ class RigidPads:
             mounted.name: _Pad(mounted, spec, composed.model)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         }
-        self.bodies = tuple(composed.bodies.values())
+        self.bodies = composed.touched
         self._body_index = np.array([body.index for body in self.bodies], int)
         self._site_index = np.array([pad.site for pad in self.pads.values()], int)
-        self._planes = np.flatnonzero([body.spec.kind == "plane" for body in self.bodies])
+        self._planes = np.flatnonzero([body.is_plane for body in self.bodies])
+        frames = [body.parts[0].object_from_part if body.is_plane else np.eye(4) for body in self.bodies]
+        self._frame = np.array(frames).reshape(-1, 4, 4)
+        """Pose of a half-space in its body's frame; the identity of all else."""
         self._radius = np.array([object_radius(body.parts) for body in self.bodies])
-        self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
+        self._geom = [body.geoms[0] for body in self.bodies]
         self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
         self._laws: list[dict[tuple[str, int], tuple[LoadLaw, float]]] = [{} for _ in range(num_envs)]
         """By sensor and body, and the depth [m] up to which each is known."""
@@ -119,7 +122,7 @@ class RigidPads:
         """
         for sensor, pad, _, pad_from_body in self._poses([datas[b] for b in envs]):
             for row, i in np.argwhere(self._pierced(pad, pad_from_body)).tolist():
-                rule = f"{self.bodies[i].spec.name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
+                rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
                 raise OverlapError(f"environment {envs[row]}: {rule}")
         for b in envs:
             self._laws[b] = {}
@@ -131,12 +134,12 @@ class RigidPads:
 
         So are those in which a body goes through a pad: its contact, a spring, gives way to what is too fast or too heavy for it.
         """
-        scene, models = self.composed.scene, self._models
+        models = self._models
         before = {name: np.full((len(datas), len(self.bodies), 4, 4), np.nan) for name in self.pads}
         sound, touching = np.flatnonzero(~failed), []
         for b in sound.tolist():
             self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
-        for _ in range(round(scene.control_timestep / scene.timestep)):
+        for _ in range(round(self.composed.control_timestep / self.composed.timestep)):
             if not len(sound):
                 break
             for b in sound.tolist():
@@ -175,10 +178,10 @@ class RigidPads:
             near = self._near(pad, pad_from_body)
             for i in np.flatnonzero(near[0]).tolist():
                 if pad.face.pierced(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))[0]:
-                    overlaps.append((name, self.bodies[i].spec.name, np.inf))
+                    overlaps.append((name, self.bodies[i].name, np.inf))
                     continue
                 touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
-                overlaps += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
+                overlaps += [(name, self.bodies[i].name, float(depth)) for depth in touches.depth]
         return overlaps
 
     def reading(
@@ -234,7 +237,8 @@ class RigidPads:
         near = (at[..., 2] - radius < pad.highest) & (np.abs(at[..., :2]) - radius[:, None] < pad.reach).all(axis=-1)
         if len(self._planes):
             # A plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
-            normal, at = pad_from_body[:, self._planes][..., :3, 2], at[:, self._planes]
+            planes = pad_from_body[:, self._planes] @ self._frame[self._planes]
+            normal, at = planes[..., :3, 2], planes[..., :3, 3]
             lowest = normal[..., 2] * pad.highest - np.abs(normal[..., :2]) @ pad.reach
             near[:, self._planes] = lowest < np.vecdot(normal, at)
         return near
@@ -257,7 +261,7 @@ class RigidPads:
             before[name][envs] = pad_from_body
             for i, body in enumerate(self.bodies):
                 radius, now, pierced = float(self._radius[i]), pad_from_body[:, i], beyond[:, i]
-                pieces = pad.face.pieces(was[:, i], now, radius)
+                pieces = pad.face.pieces(was[:, i] @ self._frame[i], now @ self._frame[i], radius)
                 for row in np.flatnonzero(pieces > 1).tolist():
                     path = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
                     path = path[self._near(pad, np.repeat(path[:, None], len(self.bodies), axis=1))[:, i]]
