@@ -145,7 +145,7 @@ def test_a_compiled_model_knows_its_sensors_through_xml_and_prefixes():
         ({"middle": "gelsight_mini"}, "has no body 'middle_body'"),
     ):
         with pytest.raises(InputError, match=text):
-            mounted_sensors(model, given)
+            mounted_sensors(model, given)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"put some on the MjSpec with raytac\.mount"):
         mounted_sensors(mujoco.MjModel.from_xml_string(ROBOT))
 
