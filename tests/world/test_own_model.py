@@ -1,4 +1,4 @@
-"""A world of a user's own MuJoCo model: its dynamics stay its own, its bodies are touched in their true shape; what cannot be is refused."""
+"""A world of a user's own MuJoCo model: its dynamics stay its own, bodies are touched in their true shape; what cannot be is refused."""
 
 from __future__ import annotations
 
