@@ -152,6 +152,16 @@ class Bench:
             self.wrench.append(np.concatenate([(turn @ felt[:, :3, None])[..., 0], felt[:, 3:]], axis=1))
             self.cone = max(self.cone, cone_excess(self.model, self.data, self._gel))
 
+    def settle(self, most: float = 6.0) -> None:
+        """Run until the normal loads of a tenth of a second differ by less than 1e-6 of them from those before it."""
+        before, count = np.inf, max(round(0.1 / self.scene.control_timestep), 1)
+        for _ in range(round(most / 0.1)):
+            self.run(0.1)
+            load = float(np.mean(self.normal[-count:]))
+            if self.failed or abs(load - before) < 1e-6 * abs(load):
+                return
+            before = load
+
     def _steer(self, data: mujoco.MjData, time: float) -> None:
         opening = self.world.composed.opening
         if opening is not None:
@@ -293,13 +303,16 @@ def _object(body: BodySpec, pose: np.ndarray) -> ObjectSpec:
     return ObjectSpec(body.kind, dict(body.params), (float(pose[0, 3]), float(pose[1, 3]), 0.0), (w, x, y, z), mass)
 
 
-def press_depth(body: BodySpec, pose: np.ndarray, force: float) -> float:
-    """Depth [m] of a press with ``force`` [N] of the body where it is over the pad."""
+def press_depth(body: BodySpec, pose: np.ndarray, force: float, pitch: float = 0.1e-3) -> float:
+    """Depth [m] of a press with ``force`` [N] of the body where it is over the pad.
+
+    The press counts nodes, so that thin bodies need a finer ``pitch`` [m].
+    """
     scene = PressScene("hard", _object(body, pose), (StageSpec("indent", force=force),))
     watching = mujoco.get_mjcb_control()
     mujoco.set_mjcb_control(None)  # the press has a model of its own
     try:
-        pad = RigidPad(load_sensor(SENSOR), scene, pitch=0.1e-3)
+        pad = RigidPad(load_sensor(SENSOR), scene, pitch=pitch)
         return float(pad.peak(pad.run()).depth[0])
     finally:
         mujoco.set_mjcb_control(watching)

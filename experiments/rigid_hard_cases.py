@@ -50,6 +50,8 @@ UPRIGHT = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)
 """A cylinder's axis along y."""
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
 """Shipped objects of the random grasps."""
+THIN = 0.03e-3
+"""Pitch of a press of thin bodies [m]: by 0.1 mm the area of a blade of 1 mm is off by a tenth."""
 Row = dict[str, Any]
 Lengths = dict[str, float | int | str]
 
@@ -100,7 +102,7 @@ def main(args: Args) -> dict[str, Metric]:
 
         draw(done, out / "rigid_hard.png")
         common: dict[str, Metric] = {"experiment": "rigid_hard", "device": resolve_device(args.device, ray_tracing=False)}
-        common |= {"seed": args.seed, "full": args.full, **machine(), **versions()}
+        common |= {"seed": args.seed, "full": int(args.full), **machine(), **versions()}
         write_metrics(out / "metrics.json", common | metrics | {"wall_s": time.perf_counter() - start})
     print(f"{metrics['rigid_hard.passed']} of {metrics['rigid_hard.total']} cases pass; written: {out}")
     return metrics
@@ -108,7 +110,7 @@ def main(args: Args) -> dict[str, Metric]:
 
 def measured(name: str, case: Callable[[], Outcome]) -> Row:
     """The row of one case; one that the package refuses or breaks off has failed, and says why."""
-    begin = time.perf_counter()
+    begin, used = time.perf_counter(), time.process_time()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -124,6 +126,7 @@ def measured(name: str, case: Callable[[], Outcome]) -> Row:
         "checks": [asdict(check) | {"passed": check.passed} for check in outcome.checks],
         "curves": outcome.curves,
         "seconds": time.perf_counter() - begin,
+        "cpu_s": time.process_time() - used,
     }
 
 
@@ -153,7 +156,7 @@ def summary(rows: list[Row]) -> dict[str, Metric]:
     if reach:
         metrics["rigid_hard.max_penetration_of_bond_m"] = max(reach)
     for row in rows:
-        metrics[f"rigid_hard.{row['case']}.passed"] = row["passed"]
+        metrics[f"rigid_hard.{row['case']}.passed"] = int(row["passed"])
         for c in row["checks"]:
             if np.isfinite(c["value"]) and not c["name"].startswith("error"):
                 metrics[f"rigid_hard.{row['case']}.{c['name'].replace(' ', '_')}"] = c["value"]
@@ -278,7 +281,8 @@ def lift(mu: float, dt: float, factor: float) -> Outcome:
     outcome = Outcome()
     with Bench(within_grip([cube], dt, side + 1e-3)) as bench:
         bench.force = lambda t: press * min(t / 0.2, 1.0)
-        bench.run(0.6)
+        bench.run(0.4)
+        bench.settle()
         limit, begin = mu * float(np.mean(bench.normal[-10:], axis=0).sum()), float(bench.data.time)
         outcome.add("normal load, error", abs(limit / (2.0 * mu * press) - 1.0), 1e-3)
         bench.raised = lambda t: 8e-3 * min(max(t - begin, 0.0) / 0.5, 1.0)
@@ -325,7 +329,7 @@ def twist(dt: float, factor: float) -> Outcome:
         bench.push((0, 0, mass * G - load), (0, 0, 0.9 * limit))
         bench.run(1.0 * factor)
         settled = len(bench.time) - 1
-        bench.run(9.0 * factor)
+        bench.run(3.0 * factor)
         turned = np.unwrap(_yaw(bench.in_pad()))
         creep = float(np.abs(turned[settled:] - turned[settled]).max())
         outcome.add("creep of the rim at 90 %", 1e6 * radius * creep, 20.0, "um")
@@ -360,9 +364,10 @@ def grip(body: BodySpec, share: float, press: float, dt: float, factor: float) -
     outcome = Outcome()
     with Bench(within_grip([body], dt, float(high[1] - low[1]) + 1.5e-3)) as bench:
         bench.force = lambda t: press * min(t / 0.2, 1.0)
-        bench.run(0.6)
+        bench.run(0.4)
+        bench.settle()
         for k, name in enumerate(bench.names):
-            expected = press_depth(body, bench.in_pad(k)[-1], float(np.mean(bench.normal[-10:], axis=0)[k]))
+            expected = press_depth(body, bench.in_pad(k)[-1], float(np.mean(bench.normal[-10:], axis=0)[k]), THIN)
             outcome.add(f"depth on {name} against the press", _off(bench.depth(k), expected), 0.01)
         load = share * GEL.friction * float(np.mean(bench.normal[-10:], axis=0).sum())
         outcome.add("normal load, error", abs(load / (2.0 * share * GEL.friction * press) - 1.0), 0.01)
@@ -371,7 +376,7 @@ def grip(body: BodySpec, share: float, press: float, dt: float, factor: float) -
         bench.push((0.0, 0.0, -load))
         bench.run(0.7 * factor)
         settled = len(bench.time) - 1
-        bench.run(3.0 * factor)
+        bench.run(2.0 * factor)
         way = bench.in_pad()[:, :3, 3]
         outcome.add("creep", 1e6 * float(np.linalg.norm(way[settled:] - way[settled], axis=1).max()), 20.0, "um")
         carried = np.mean(bench.wrench[-round(0.2 / dt) :], axis=0)[:, :3].sum(axis=0)
@@ -399,7 +404,7 @@ def pad_on_pad(dt: float) -> Outcome:
 def two_bodies(dt: float) -> Outcome:
     """Two pucks beside each other on one pad."""
     size: Lengths = {"radius": 3e-3, "length": 6e-3}
-    mass = 0.05
+    mass = 0.02
     pucks = [
         BodySpec(f"puck{k}", "cylinder", size, position=(5e-3 * sign, 0.0, 3.05e-3), mass=mass) for k, sign in enumerate((-1, 1))
     ]
@@ -444,7 +449,10 @@ def thrown(dt: float) -> Outcome:
 
 
 def reversal(dt: float) -> Outcome:
-    """A block under 4 N that a spring drags 10 mm to one side and to the other, at its foot, so that it does not tip."""
+    """A block that a plunger over the pad's centre presses with 4 N and a spring drags 10 mm to one side and to the other, at its foot.
+
+    Were the load to move with the block, the dome's slope would add to the friction: 6 % of it 6 mm from the centre.
+    """
     mu, mass, load, stiffness, amplitude, pace = 0.5, 0.07, 4.0, 400.0, 10e-3, 20e-3
     half = 5e-3
     box: Lengths = {"length": 60e-3, "width": 40e-3, "height": 2.0 * half}
@@ -462,7 +470,8 @@ def reversal(dt: float) -> Outcome:
         pull = stiffness * (stage(float(bench.data.time)) - x)
         pulls.append(pull)
         places.append(x)
-        bench.push((pull, 0.0, mass * G - load), (0.0, -z * pull, 0.0))
+        # The line of the load stays over the pad's centre, that of the pull in the contact.
+        bench.push((pull, 0.0, mass * G - load), (0.0, -z * pull - x * load, 0.0))
 
     outcome = Outcome()
     with Bench(on_pad([block], dt)) as bench:
@@ -476,7 +485,9 @@ def reversal(dt: float) -> Outcome:
                 abs(float(np.abs(force[at]).mean()) / (mu * load) - 1.0) if at.any() else np.inf,
                 0.02,
             )
-        work = np.cumsum(np.array(pulls)[:-1] * np.diff(places)) - bench.kinetic(mass)[1 : len(places)]
+        first = round(begin / dt)
+        kinetic = bench.kinetic(mass)[first : len(places)]
+        work = np.cumsum(np.array(pulls)[first:-1] * np.diff(places[first:])) - (kinetic[1:] - kinetic[0])
         outcome.add("energy given back", float(max(-work.min(), 0.0) / max(work.max(), 1e-12)), 1e-3)
         bench.common(outcome)
         count = min(len(force), len(places))
