@@ -220,7 +220,8 @@ def refined(gap: np.ndarray) -> np.ndarray:
     inside = np.stack([(i > 0) & (i < nx - 1), (j > 0) & (j < ny - 1)])
     step = np.where(inside, [[1], [nx]], 0)
     middle, before, after = (gap.take(lowest + offset * step) for offset in (0, -1, 1))
-    curve = before + after - 2.0 * middle
+    with np.errstate(invalid="ignore"):  # where no body is
+        curve = before + after - 2.0 * middle
     bent = inside & np.isfinite(curve) & (curve > 0.0)
     rise = np.where(bent, after, 0.0) - np.where(bent, before, 0.0)
     return middle[0] - 0.125 * (rise * rise / np.where(bent, curve, 1.0)).sum(axis=0)

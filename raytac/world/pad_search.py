@@ -111,7 +111,8 @@ class PadSearch:
             overlap = np.maximum(-gap, 0.0)
             x, y = grid.x[None, :] - centre[0], grid.y[:, None] - centre[1]
             inside = overlap > 0.0
-            spread = np.array([(inside * xy).sum() for xy in (x * x, x * y, y * y)]) / overlap.sum()
+            if inside.any():
+                spread = np.array([(inside * xy).sum() for xy in (x * x, x * y, y * y)]) / overlap.sum()
         return {
             "row": row,
             "depth": depth,

@@ -491,8 +491,8 @@ class RigidPads:
 
 
 def _relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
-    """``pad_from_body`` (…, 4, 4) of poses that broadcast to the latter's shape."""
-    away = world_from_body.copy()
+    """``pad_from_body`` (…, 4, 4) of poses that broadcast."""
+    away = np.broadcast_to(world_from_body, np.broadcast_shapes(world_from_pad.shape, world_from_body.shape)).copy()
     away[..., :3, 3] -= world_from_pad[..., :3, 3]
     back = np.swapaxes(world_from_pad[..., :3, :3], -1, -2)
     away[..., :3, :] = back @ away[..., :3, :]

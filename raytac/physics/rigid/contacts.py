@@ -62,9 +62,10 @@ class LoadTables:
         self._deepest, self._thickness = contacts.deepest, thickness
         self._limit = contacts.depth + contacts.clearance
         force = contacts.force * np.reshape(factor, (-1, 1))
-        slope = np.empty_like(force)
-        slope[:, 1:-1] = 0.5 * (force[:, 2:] - force[:, :-2])
-        slope[:, 0], slope[:, -1] = 0.0, 2.0 * (force[:, -1] - force[:, -2]) - slope[:, -2]
+        slope, rise = np.zeros_like(force), np.diff(force)
+        # Bounded, so that a spline of rising entries rises everywhere (F. N. Fritsch, R. E. Carlson, SIAM J. Numer. Anal. 17, 1980).
+        slope[:, 1:-1] = np.minimum(0.5 * (rise[:, 1:] + rise[:, :-1]), 3.0 * np.minimum(rise[:, 1:], rise[:, :-1]))
+        slope[:, -1] = np.clip(2.0 * rise[:, -1] - slope[:, -2], 0.0, 3.0 * rise[:, -1])
         self._force, self._slope, self._radius = force, slope, contacts.radius
         self._rows = np.arange(len(force))
 
