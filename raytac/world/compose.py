@@ -55,11 +55,12 @@ def compose(scene: TaskScene, physics: str) -> WorldModel:
     spec.option.timestep = scene.timestep
     spec.option.gravity = scene.gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones have one coefficient for every direction. The noslip pass removes the creep of MuJoCo's soft friction, by which a
-    # grasped body slips within seconds.
+    # Elliptic cones have one coefficient for every direction. Between rigid bodies MuJoCo's soft friction creeps, the less the greater
+    # ``impratio``; a rigid pad's friction has its own stiffness.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
-    spec.option.noslip_iterations = 4
+    # A noslip pass removes that creep, but would undo the shear of a rigid pad's gel.
+    spec.option.noslip_iterations = 0 if physics == "rigid" else 4
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shapes: dict[str, tuple[Part, ...]] = {}
     for i, body in enumerate(scene.bodies):
