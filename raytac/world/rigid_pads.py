@@ -40,6 +40,7 @@ from raytac.specs.sensor import SensorSpec
 from raytac.world.compose import ComposedScene
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
+from raytac.world.hard_contacts import is_hard, write_hard_reference
 from raytac.world.pad_overlap import PadOverlap
 from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
 from raytac.world.pad_search import PadSearch, near_pad
@@ -110,6 +111,7 @@ class RigidPads:
         self._geom = np.array([int(composed.model.body_geomadr[body.index]) for body in self.bodies], int)
         self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
         self._mass_centre = composed.model.body_ipos[self._body_index]
+        self._hard = is_hard(composed.model)
         self._fall = float(np.linalg.norm(option.gravity))
         self._search = PadSearch(self._gels, [body.parts for body in self.bodies], num_envs=num_envs)
         self._wrench = np.zeros((num_envs, len(self.pads), 6))
@@ -192,6 +194,11 @@ class RigidPads:
         self._forget_apart(envs, contacts)
         rows, turn = self._rows(contacts, law, spring, motion, row, step[row])
         self._put(datas, contacts, rows, failed)
+        own = np.bincount(contacts.env, minlength=len(datas))
+        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
+            count = datas[b].ncon - int(own[b])
+            if count and not failed[b]:
+                write_hard_reference(datas[b], self._hard, count, length)
         sound = envs[~failed[envs]]
         if len(sound):
             drive(sound)
