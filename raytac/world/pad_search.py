@@ -97,7 +97,7 @@ class PadSearch:
         apart = apart[reach[apart] > 0.0]
         if len(apart):
             grid = self._grid(p, _GAP_PITCH)
-            gap = refined(object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest)
+            gap = refined(object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest, _GAP_PITCH)
             some = (gap < reach[apart]) & np.isfinite(gap)
             apart, shift = apart[some], np.maximum(gap[some], 0.0) + _SHALLOW
             if len(apart):
@@ -118,7 +118,7 @@ class PadSearch:
         grid = self._grid(p, pitch)
         under = object_height(self._bodies[i], poses[row][None], grid.x, grid.y)[0]
         depth = float(touches.depth[k]) - shift
-        clearance = float(refined(under[None])[0]) + gelpad.thickness
+        clearance = float(refined(under[None], pitch)[0]) + gelpad.thickness
         gap = under - grid.rest
         law = LoadLaw(np.maximum(gap + depth, 0.0), float(touches.cell[k]), gelpad)
         deepest = min(max(depth + clearance, 1e-5), gelpad.thickness)

@@ -39,6 +39,7 @@ from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import SensorSpec
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
+from raytac.world.hard_contacts import is_hard, write_hard_reference
 from raytac.world.pad_overlap import PadOverlap
 from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
 from raytac.world.pad_search import PadSearch, half_spaces, near_pad
@@ -113,6 +114,8 @@ class RigidPads:
         self._geom = np.array([body.geoms[0] for body in self.bodies], int)
         self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
         self._mass_centre = composed.model.body_ipos[self._body_index]
+        # A model of one's own keeps the contacts that it has.
+        self._hard = is_hard(composed.model) if composed.scene is not None else np.zeros(composed.model.ngeom, bool)
         self._fall = float(np.linalg.norm(option.gravity))
         self._search = PadSearch(self._gels, [body.parts for body in self.bodies], num_envs=num_envs)
         self._wrench = np.zeros((num_envs, len(self.pads), 6))
@@ -195,6 +198,11 @@ class RigidPads:
         self._forget_apart(envs, contacts)
         rows, turn = self._rows(contacts, law, spring, motion, row, step[row])
         self._put(datas, contacts, rows, failed)
+        own = np.bincount(contacts.env, minlength=len(datas))
+        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
+            count = datas[b].ncon - int(own[b])
+            if count and not failed[b]:
+                write_hard_reference(datas[b], self._hard, count, length)
         sound = envs[~failed[envs]]
         if len(sound):
             drive(sound)
