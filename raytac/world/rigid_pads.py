@@ -24,10 +24,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError, OverlapError
-from raytac.gel.pierced import without_pierced
-from raytac.gel.pyramid import ElasticSurround
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.gel.traction import foundation_traction
+from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.implicit_spring import NormalSpring, contact_rate, normal_spring
@@ -35,7 +32,7 @@ from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
 from raytac.physics.rigid.shear import ShearState
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
-from raytac.shapes.underside import object_height, object_radius
+from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import SensorSpec
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
@@ -44,6 +41,7 @@ from raytac.world.pad_overlap import PadOverlap
 from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
 from raytac.world.pad_search import PadSearch, half_spaces, near_pad
 from raytac.world.pad_steps import StepChoice
+from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
@@ -76,6 +74,20 @@ class _Motion:
     """Of bodies' origins relative to the pad [m/s], pad frame, (n, pads, bodies, 3)."""
     spin: np.ndarray
     """Angular velocity relative to the pad [rad/s], (n, pads, bodies, 3)."""
+
+
+@dataclass(frozen=True)
+class _Put:
+    """Contacts of one step that are among MuJoCo's."""
+
+    contacts: PadContacts
+    radius: np.ndarray
+    """Of contact [m], (n,)."""
+    rows: PadRows
+    turn: np.ndarray
+    """Matrices (n, 2, 2) from the rows' tangents to the pad's."""
+    speed: np.ndarray
+    """At which they close [m/s], (n,)."""
 
 
 class RigidPads:
@@ -122,9 +134,8 @@ class RigidPads:
         self._shear = ShearState(num_envs, len(self.pads), len(self.bodies))
         self._acceleration = np.zeros((num_envs, len(self.pads), len(self.bodies)))
         """At which contacts closed faster in their last step [m/s²]."""
-        self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
-        """Body that each pad showed deepest last; −1: none."""
-        self._shown: dict[str, tuple[PadGrid, ElasticSurround, float]] = {}
+        shapes = [body.parts for body in self.bodies]
+        self._surfaces = PadSurfaces({name: pad.spec.gelpad for name, pad in self.pads.items()}, shapes, num_envs)
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -140,8 +151,7 @@ class RigidPads:
         chosen = np.asarray(envs, int)
         self._shear.clear(chosen)
         self._wrench[chosen] = self._acceleration[chosen] = 0.0
-        for pressed in self._pressed.values():
-            pressed[chosen] = -1
+        self._surfaces.reset(chosen)
 
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
@@ -174,6 +184,51 @@ class RigidPads:
         models, some = self._models, [datas[b] for b in envs.tolist()]
         for b, data in zip(envs.tolist(), some, strict=True):
             mujoco.mj_step1(models[b], data)
+        put, ticks, step = self._insert(datas, envs, choice, done, before, failed)
+        sound = envs[~failed[envs]]
+        if len(sound):
+            drive(sound)
+        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
+            if failed[b]:
+                continue
+            models[b].opt.timestep = length
+            mujoco.mj_step2(models[b], datas[b])
+            models[b].opt.timestep = choice.timestep
+        if len(sound):
+            failed[sound] = lost([datas[b] for b in sound.tolist()])
+        self._after(datas, envs, put, failed)
+        return ticks
+
+    def add(self, datas: Sequence[mujoco.MjData], before: dict[str, np.ndarray], failed: np.ndarray) -> _Put:
+        """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``.
+
+        ``before``: poses (B, bodies, 4, 4) of bodies by pad, as this method left them the last time; NaN of none. The result is for
+        ``finish``, after ``mj_step2``. A step is as long as the model's: it is not divided where something moves fast.
+        """
+        envs, choice = np.flatnonzero(~failed), StepChoice(self.composed.timestep)
+        put, _, _ = self._insert(datas, envs, choice, np.zeros(len(envs), int), before, failed, whole=True)
+        return put
+
+    def finish(self, datas: Sequence[mujoco.MjData], put: _Put, failed: np.ndarray) -> None:
+        """Read the forces of contacts that ``add`` has put in, and let the gels shear, after ``mj_step2``."""
+        sound = np.flatnonzero(~failed)
+        if len(sound):
+            failed[sound] = lost([datas[b] for b in sound.tolist()])
+        self._after(datas, sound, put, failed)
+
+    def _insert(
+        self,
+        datas: Sequence[mujoco.MjData],
+        envs: np.ndarray,
+        choice: StepChoice,
+        done: np.ndarray,
+        before: dict[str, np.ndarray],
+        failed: np.ndarray,
+        *,
+        whole: bool = False,
+    ) -> tuple[_Put, np.ndarray, np.ndarray]:
+        """Put the pads' contacts among MuJoCo's, after ``mj_step1``; returns also the ticks and the length [s] of each step, (n,)."""
+        models, some = self._models, [datas[b] for b in envs.tolist()]
         motion = self._motion(some)
         poses = [(name, pad, motion.pad_from_body[:, k]) for k, (name, pad) in enumerate(self.pads.items())]
         self._mark_pierced(poses, envs, before, failed)
@@ -188,6 +243,8 @@ class RigidPads:
         speed = self._closing(contacts, motion, row)
         law = self._law(contacts)
         ticks = self._ticks(choice, done, contacts, row, compliance, speed, law, left)
+        if whole:
+            ticks[:] = choice.ticks
         step = choice.timestep * ticks / choice.ticks
         tau = np.array([gel.relaxation_time for gel in self._gels])[contacts.pad]
         spring = normal_spring(law, contacts.depth, speed, compliance, step[row], tau, self._fall)
@@ -203,19 +260,7 @@ class RigidPads:
             count = datas[b].ncon - int(own[b])
             if count and not failed[b]:
                 write_hard_reference(datas[b], self._hard, count, length)
-        sound = envs[~failed[envs]]
-        if len(sound):
-            drive(sound)
-        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
-            if failed[b]:
-                continue
-            models[b].opt.timestep = length
-            mujoco.mj_step2(models[b], datas[b])
-            models[b].opt.timestep = choice.timestep
-        if len(sound):
-            failed[sound] = lost([datas[b] for b in sound.tolist()])
-        self._after(datas, envs, contacts, law, spring, rows, turn, motion, row, speed, failed)
-        return ticks
+        return _Put(contacts, law.radius(np.maximum(spring.deepest, 0.0)), rows, turn, speed), ticks, step
 
     def _motion(self, datas: Sequence[mujoco.MjData]) -> _Motion:
         """Poses and velocities of the states given, after their velocities are known."""
@@ -372,17 +417,11 @@ class RigidPads:
         self,
         datas: Sequence[mujoco.MjData],
         envs: np.ndarray,
-        contacts: PadContacts,
-        law: LoadTables,
-        spring: NormalSpring,
-        rows: PadRows,
-        turn: np.ndarray,
-        motion: _Motion,
-        row: np.ndarray,
-        speed: np.ndarray,
+        put: _Put,
         failed: np.ndarray,
     ) -> None:
         """Read forces and let the gels shear by what bodies moved in the step."""
+        contacts, rows, turn = put.contacts, put.rows, put.turn
         self._wrench[envs] = 0.0
         force, moved = np.zeros((2, len(contacts), ROWS))
         for b, some in _runs(contacts.env):
@@ -394,13 +433,12 @@ class RigidPads:
             mujoco.mj_mulJacVec(self._models[b], data, velocity, data.qvel)
             moved[some] = velocity[-ROWS * (some.stop - some.start) :].reshape(-1, ROWS)
         at = contacts.env, contacts.pad, contacts.body
-        radius = law.radius(np.maximum(spring.deepest, 0.0))
         displacement = np.empty((len(contacts), 3))
         displacement[:, :2] = (turn @ moved[:, 1:3, None])[..., 0] * rows.step[:, None]
         displacement[:, 2] = moved[:, 3] * rows.step
         limit = force[:, :1] * rows.friction[:, [0, 2]]
-        self._shear.move(at, displacement, limit, contacts.centre, radius)
-        self._acceleration[at] = (-moved[:, 0] - speed) / rows.step
+        self._shear.move(at, displacement, limit, contacts.centre, put.radius)
+        self._acceleration[at] = (-moved[:, 0] - put.speed) / rows.step
         axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
         # MuJoCo's force is on the second body; the pad gets the opposite.
         push = -(force[:, None, :3] @ axes)[:, 0]
@@ -428,42 +466,10 @@ class RigidPads:
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
     ) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
-        pad, rows = self.pads[name], np.arange(len(datas)) if envs is None else np.asarray(envs)
-        datas, failed = [datas[b] for b in rows.tolist()], failed[rows]
-        if name not in self._shown or self._shown[name][0] is not grid:
-            self._shown[name] = grid, ElasticSurround(grid), float(grid.rest.max())
-        height = np.full((len(datas), *grid.shape), np.inf)
-        poses = np.full((len(datas), 4, 4), np.nan)
-        deepest, pressed = np.zeros(len(datas)), np.full(len(datas), -1)
-        highest = self._shown[name][2]
-        pad_from_body = _relative(site_poses(datas, pad.site)[:, None], body_poses(datas, self._body_index))
-        near = self._near(pad, pad_from_body) & ~failed[:, None]
-        for i in np.flatnonzero(near.any(axis=0)).tolist():
-            rows_near = np.flatnonzero(near[:, i])
-            under = object_height(self.bodies[i].parts, pad_from_body[rows_near, i], grid.x, grid.y, below=highest)
-            behind = under < -pad.spec.gelpad.thickness
-            if behind.any():
-                deep = np.flatnonzero(behind.any(axis=(1, 2)))
-                deep = deep[pad.face.pierced(self.bodies[i].parts, pad_from_body[rows_near[deep], i], float(self._radius[i]))]
-                under[behind] = np.inf
-                under[deep] = np.nan
-            depth = (grid.rest - under).max(axis=(1, 2))
-            deeper = depth > deepest[rows_near]
-            at = rows_near[deeper]
-            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at, i]
-            if len(rows_near) == len(datas):
-                height = np.minimum(height, under, out=under)
-            else:
-                height[rows_near] = np.minimum(height[rows_near], under)
-        height[failed] = np.nan
-        # From one body to another is no motion of either.
-        before = self._pressed[name][rows]
-        poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
-        self._pressed[name][rows] = np.where(failed, before, pressed)
-        surface = without_pierced(self._shown[name][1].surface(height, poses), pad.spec.gelpad)
-        failed = np.isnan(surface.height[:, 0, 0])
-        wrench = np.where(failed[:, None], np.nan, self.wrench(name)[rows])
-        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench))
+        rows = np.arange(len(datas)) if envs is None else np.asarray(envs)
+        some = [datas[b] for b in rows.tolist()]
+        poses = _relative(site_poses(some, self.pads[name].site)[:, None], body_poses(some, self._body_index))
+        return self._surfaces.reading(name, grid, poses, self.wrench(name)[rows], failed[rows], rows)
 
     def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
         """Every pad with ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
@@ -520,10 +526,3 @@ def _runs(envs: np.ndarray) -> Iterator[tuple[int, slice]]:
     bounds = [*np.flatnonzero(np.diff(envs, prepend=-1)).tolist(), len(envs)]
     for start, stop in pairwise(bounds):
         yield int(envs[start]), slice(start, stop)
-
-
-def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:
-    """Total forces of the pads distributed over their contacts (see ``foundation_traction``)."""
-    x, y = np.nan_to_num(surface.contact_centre).T
-    twist = wrench[:, 5] - (x * wrench[:, 1] - y * wrench[:, 0])
-    return foundation_traction(surface, wrench[:, :3], twist)
