@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["CASE_TRAVEL", "StepChoice"]
+from raytac.world.hard_contacts import HARD_MARGIN
+
+__all__ = ["StepChoice"]
 
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
@@ -14,8 +16,8 @@ _SWING = 0.02
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
 _PHASE = 0.1
 """… with this phase angle a step [rad]."""
-CASE_TRAVEL = 1e-3
-"""Greatest travel of a body beside a case in a step [m]."""
+_CASE_TRAVEL = 0.8 * HARD_MARGIN
+"""Greatest travel of a body beside a case in a step [m]: less than the gap from which their contact is known."""
 
 
 class StepChoice:
@@ -44,6 +46,11 @@ class StepChoice:
         # Up to the gel in one step, into it in short ones.
         before = np.where(speed > 0.0, np.maximum(np.maximum(-depth, 0.0) / quick, inside), np.inf)
         return np.where(depth > 0.0, inside, before)
+
+    @staticmethod
+    def beside_case(gap: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Longest steps [s] of bodies at gaps [m] from cases, at speeds [m/s]: up to the case in one step, along it in short ones."""
+        return np.maximum(gap, _CASE_TRAVEL) / np.maximum(speed, 1e-12)
 
     def rounded(self, longest: np.ndarray, done: np.ndarray) -> np.ndarray:
         """Ticks (n,) of the next step, which is not longer than ``longest`` (n,) [s], of environments that have done ``done`` (n,) ticks."""

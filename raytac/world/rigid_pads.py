@@ -126,6 +126,8 @@ class RigidPads:
         self._geom = np.array([body.geoms[0] for body in self.bodies], int)
         self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
         self._mass_centre = composed.model.body_ipos[self._body_index]
+        cases = [int(composed.model.geom(mounted.case).id) for mounted in composed.sensors]
+        self._case_centre, self._case_half = composed.model.geom_pos[cases], composed.model.geom_size[cases]
         # A model of one's own keeps the contacts that it has.
         self._hard = is_hard(composed.model) if composed.scene is not None else np.zeros(composed.model.ngeom, bool)
         self._fall = float(np.linalg.norm(option.gravity))
@@ -242,9 +244,9 @@ class RigidPads:
         contacts, row, compliance = contacts.of(movable), row[movable], compliance[movable]
         speed = self._closing(contacts, motion, row)
         law = self._law(contacts)
-        ticks = self._ticks(choice, done, contacts, row, compliance, speed, law, left)
-        if whole:
-            ticks[:] = choice.ticks
+        longest = np.minimum(self._beside_cases(choice, motion), choice.timestep)
+        self._in_gels(choice, longest, contacts, row, compliance, speed, law, left)
+        ticks = np.full(len(envs), choice.ticks) if whole else choice.rounded(longest, done)
         step = choice.timestep * ticks / choice.ticks
         tau = np.array([gel.relaxation_time for gel in self._gels])[contacts.pad]
         spring = normal_spring(law, contacts.depth, speed, compliance, step[row], tau, self._fall)
@@ -283,9 +285,7 @@ class RigidPads:
         """Distance (n, pads) [m] that the fastest body may come nearer to each pad in the time ``left`` (n,) [s]."""
         if not len(self.bodies):
             return np.zeros(motion.world_from_pad.shape[:2])
-        size = np.minimum(self._radius, 1.0)
-        speed = np.linalg.norm(motion.velocity, axis=-1) + np.linalg.norm(motion.spin, axis=-1) * size
-        return speed.max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
+        return self._speed(motion).max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
 
     def _closing(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> np.ndarray:
         """Speeds (n,) at which contacts close [m/s]."""
@@ -297,26 +297,39 @@ class RigidPads:
         thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
         return LoadTables(contacts, thickness, self._models.gel_stiffness[contacts.env, contacts.pad])
 
-    def _ticks(
+    def _beside_cases(self, choice: StepChoice, motion: _Motion) -> np.ndarray:
+        """Longest steps (n,) [s] in which no body's bounding ball enters a case far."""
+        if not len(self.bodies):
+            return np.full(len(motion.velocity), np.inf)
+        apart = np.abs(motion.pad_from_body[..., :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
+        gap = np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - self._radius
+        longest = choice.beside_case(gap, self._speed(motion))
+        longest[..., self._planes] = np.inf
+        return longest.min(axis=(1, 2))
+
+    def _speed(self, motion: _Motion) -> np.ndarray:
+        """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies relative to pads; of a half-space, within a metre."""
+        size = np.minimum(self._radius, 1.0)
+        return np.linalg.norm(motion.velocity, axis=-1) + np.linalg.norm(motion.spin, axis=-1) * size
+
+    def _in_gels(
         self,
         choice: StepChoice,
-        done: np.ndarray,
+        longest: np.ndarray,
         contacts: PadContacts,
         row: np.ndarray,
         compliance: np.ndarray,
         speed: np.ndarray,
         law: LoadTables,
         left: np.ndarray,
-    ) -> np.ndarray:
-        """Ticks of every environment's next step, (n,)."""
+    ) -> None:
+        """Shorten the ``longest`` steps (n,) [s] of environments to those that their contacts with gels allow."""
         thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
-        deeper = np.minimum(contacts.depth + np.maximum(speed, 0.0) * left[row], contacts.depth + 0.025 * thickness)
+        deeper = contacts.depth + np.minimum(np.maximum(speed, 0.0) * left[row], 0.025 * thickness)
         _, stiffness = law.force(deeper)
         rate = contact_rate(stiffness, compliance)
         acceleration = self._acceleration[contacts.env, contacts.pad, contacts.body]
-        longest = np.full(len(done), np.inf)
         np.minimum.at(longest, row, choice.longest(contacts.depth, speed, rate, acceleration, thickness))
-        return choice.rounded(np.minimum(longest, choice.timestep), done)
 
     def _forget_apart(self, envs: np.ndarray, contacts: PadContacts) -> None:
         """Clear the shear of contacts that have ended."""
@@ -358,7 +371,7 @@ class RigidPads:
         )
         pull = self._shear.begin(at, stiffness, contacts.centre)
         force = np.zeros((len(contacts), ROWS))
-        force[:, 0] = spring.force
+        force[:, 0] = spring.force - self._lift(contacts, spring, motion, row, friction, lever, damping, pull)
         force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
         force[:, 3] = -pull[:, 2]
         rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
@@ -371,6 +384,32 @@ class RigidPads:
             np.stack([spring.damping, damping], axis=1),
             step,
         ), turn
+
+    def _lift(
+        self,
+        contacts: PadContacts,
+        spring: NormalSpring,
+        motion: _Motion,
+        row: np.ndarray,
+        friction: np.ndarray,
+        lever: np.ndarray,
+        damping: np.ndarray,
+        pull: np.ndarray,
+    ) -> np.ndarray:
+        """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
+
+        Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+        """
+        at = row, contacts.pad, contacts.body
+        arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
+        velocity = motion.velocity[at] + np.cross(motion.spin[at], arm)
+        one, two = tangents(contacts.normal)
+        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
+        spin = np.vecdot(motion.spin[at], contacts.normal)
+        tangential = pull[:, :2] + damping[:, None] * slip
+        torque = pull[:, 2] / lever + damping * spin * lever
+        excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
+        return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
 
     @staticmethod
     def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
