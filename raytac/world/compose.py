@@ -20,6 +20,7 @@ from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, MountSpec, RobotSpec, TaskScene
+from raytac.world.hard_contacts import HARD_MARGIN
 from raytac.world.touched import TouchedBody
 from raytac.world.world_model import WorldModel, compiled_model
 
@@ -37,8 +38,10 @@ _PLANE = (2.0, 2.0, 0.1)
 """Half widths and grid spacing [m] of the picture of a half-space, which is unbounded."""
 _COLOUR = (0.72, 0.72, 0.7)
 _HARD = 0.2, 0.999
-"""Contacts of rigid bodies: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
+"""Contacts of rigid bodies beside soft pads: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
 (1 − d) F Δt² / (m 0.2²): 25 µm for a steel ball of 4 g under 1 N at 2 ms, some tenths of a millimetre with MuJoCo's default."""
+_HARDER = 0.9999
+"""Impedance d of contacts of rigid bodies beside rigid pads (``raytac.world.hard_contacts``)."""
 
 
 def compose(scene: TaskScene, physics: str) -> WorldModel:
@@ -55,11 +58,12 @@ def compose(scene: TaskScene, physics: str) -> WorldModel:
     spec.option.timestep = scene.timestep
     spec.option.gravity = scene.gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones have one coefficient for every direction. The noslip pass removes the creep of MuJoCo's soft friction, by which a
-    # grasped body slips within seconds.
+    # Elliptic cones have one coefficient for every direction. Between rigid bodies MuJoCo's soft friction creeps, the less the greater
+    # ``impratio``; a rigid pad's friction has its own stiffness.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
-    spec.option.noslip_iterations = 4
+    # A noslip pass removes that creep, but would undo the shear of a rigid pad's gel.
+    spec.option.noslip_iterations = 0 if physics == "rigid" else 4
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shapes: dict[str, tuple[Part, ...]] = {}
     for i, body in enumerate(scene.bodies):
@@ -82,6 +86,7 @@ def compose(scene: TaskScene, physics: str) -> WorldModel:
             shapes[body.name],
             scene.timestep,
             mirrored=physics == "ipc" and body.dynamics == "free" and body.owner == "ipc",
+            rigid_pads=physics == "rigid",
         )
     try:
         model = compiled_model(spec)
@@ -159,7 +164,9 @@ def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
         raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
 
 
-def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool) -> None:
+def _add_body(
+    spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool, rigid_pads: bool
+) -> None:
     mjs_body = spec.worldbody.add_body(name=body.name, pos=body.position, quat=body.quaternion, mocap=mirrored)
     free = body.dynamics == "free" and not mirrored
     if free:
@@ -173,8 +180,12 @@ def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timest
         geom.density = density
         geom.friction = (friction, 0.0, 0.0)
         geom.priority = 1
-        rate, impedance = _HARD[0] / timestep, _HARD[1]
-        geom.solref, geom.solimp = (-(rate**2), -2.0 * rate), (impedance, impedance, 1e-3, 0.5, 2.0)
+        if rigid_pads:
+            geom.solref, geom.solimp = (-_HARDER / timestep**2, -_HARDER / timestep), (_HARDER, _HARDER, 1e-3, 0.5, 2.0)
+            geom.margin = HARD_MARGIN
+        else:
+            rate, impedance = _HARD[0] / timestep, _HARD[1]
+            geom.solref, geom.solimp = (-(rate**2), -2.0 * rate), (impedance, impedance, 1e-3, 0.5, 2.0)
         geom.rgba = (*(_COLOUR if body.colour is None else body.colour), 1.0)
         if mirrored:
             geom.contype, geom.conaffinity = 0, 0

@@ -27,6 +27,7 @@ from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.pads import WORLD_PADS, WorldPads
+from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import WorldModel, compiled_model, own_world_model
 from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
@@ -137,17 +138,6 @@ class TactileWorld:
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
         self.coupling = coupling or (COUPLINGS[0] if self.scene is None else self.scene.coupling)
         self.num_envs, self.device, self.seed = num_envs, device, seed
-        self._sensor_settings: dict[str, Any] = {
-            "outputs": outputs,
-            "markers": markers,
-            "optics": optics,
-            "resolution": resolution,
-            "device": device,
-            "num_envs": num_envs,
-            "physics": self.physics,
-            "pitch": pitch,
-        }
-        self._sensors: dict[str, TactileSensor] = {}
         self.composed: WorldModel
         if isinstance(scene, (mujoco.MjSpec, mujoco.MjModel)):
             model = copy(compiled_model(scene))
@@ -157,6 +147,18 @@ class TactileWorld:
         else:
             assert self.scene is not None
             self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
+        self._frames = SensorFrames(
+            self.composed.sensors,
+            num_envs=num_envs,
+            seed=seed,
+            outputs=outputs,
+            markers=markers,
+            optics=optics,
+            resolution=resolution,
+            device=device,
+            physics=self.physics,
+            pitch=pitch,
+        )
         self.model = self.composed.model
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.models = EnvironmentModels(self.composed, num_envs)
@@ -174,10 +176,7 @@ class TactileWorld:
     @property
     def sensors(self) -> dict[str, TactileSensor]:
         """Every sensor by its name, made on first use."""
-        for i, (mounted, spec) in enumerate(zip(self.composed.sensors, self.composed.sensor_specs, strict=True)):
-            if mounted.name not in self._sensors:
-                self._sensors[mounted.name] = TactileSensor(spec, seed=self.seed + i, **self._sensor_settings)
-        return self._sensors
+        return self._frames.sensors
 
     @property
     def soft(self) -> SoftScene | None:
@@ -187,7 +186,7 @@ class TactileWorld:
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the sensors, without making them."""
-        return tuple(mounted.name for mounted in self.composed.sensors)
+        return self._frames.names
 
     def reset(
         self,
@@ -231,9 +230,7 @@ class TactileWorld:
             self._pads.reset(chosen, self.data)
         else:
             self._start_elsewhere(chosen, joints, starts, variation)
-        for sensor in self._sensors.values():
-            if sensor.markers is not None:
-                sensor.reset_markers(chosen)
+        self._frames.reset(chosen)
         return self.state()
 
     def _start_elsewhere(
@@ -343,20 +340,9 @@ class TactileWorld:
         Raises:
             InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
-        rows = None if envs is None else chosen_envs(envs, self.num_envs)
-        if rows is not None and not rows:
-            raise InputError("envs", value=envs, rule="must name one environment or more")
-        chosen = self.sensor_names if sensors is None else tuple(sensors)
-        for name in chosen:
-            if name not in self.sensor_names:
-                raise InputError("sensors", value=name, rule="must be a sensor of the scene", choices=self.sensor_names)
-        frames = {}
-        for name in chosen:
-            sensor = self.sensors[name]
-            reading = self._pads.reading(name, sensor.grid, self.data, self._failed, rows)
-            self._failed[slice(None) if rows is None else rows] |= reading.failed
-            frames[name] = sensor.update(reading, rows)
-        return frames
+        return self._frames.observe(
+            lambda name, grid, rows: self._pads.reading(name, grid, self.data, self._failed, rows), self._failed, sensors, envs
+        )
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or of a soft pad: vertices (B, n, 3) [m], world frame, and faces (F, 3).

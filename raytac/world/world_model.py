@@ -134,6 +134,9 @@ def _check_options(model: mujoco.MjModel) -> None:
             "set spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC, or cone='elliptic' in the file"
         )
         raise InputError("model.opt.cone", value="pyramidal", rule=rule)
+    if option.noslip_iterations:
+        rule = "must be 0: a gel sticks by its shear, which a noslip pass would undo"
+        raise InputError("model.opt.noslip_iterations", value=int(option.noslip_iterations), rule=rule)
     for bit in ("CONTACT", "CONSTRAINT"):
         if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}"):
             raise InputError("model.opt.disableflags", value=bit.lower(), rule="must not be disabled: the pads' contacts need it")
