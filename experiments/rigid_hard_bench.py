@@ -35,6 +35,8 @@ GRID = make_grid(GEL, 0.1e-3)
 COARSE = make_grid(GEL, 0.8e-3)
 """Nodes on which every sub-step is searched for the deepest ones; those are measured on ``GRID``."""
 DEEPEST = 20
+FAST = 25.0
+"""Force with which fingers close that are far from a body [N]: some 0.25 m/s against the servo's damping."""
 SERVO = 1e4
 """Gain of the floating gripper's opening [N/m]."""
 
@@ -238,20 +240,23 @@ class Grasps:
         self.penetration, self.cone = -np.inf, 0.0
         self.failed = self.broken = self.felt = 0
 
-    def close(self, poses: np.ndarray, force: np.ndarray, counted: int, seconds: float = 0.5) -> None:
-        """Close on bodies at poses (count, 4, 4) with forces (count,) [N]; the first ``counted`` environments count."""
+    def close(self, poses: np.ndarray, width: np.ndarray, force: np.ndarray, counted: int, seconds: float = 0.6) -> None:
+        """Close on bodies at poses (count, 4, 4), of ``width`` (count,) [m] between the pads, with ``force`` (count,) [N].
+
+        The first ``counted`` environments count.
+        """
         world, dt = self.world, self.scene.control_timestep
         opening, fingers = world.composed.opening, world.composed.fingers
         assert opening is not None
         world.reset(bodies={self._name: poses})
         begin = 0.6 * seconds
 
-        def steer(press: float, data: mujoco.MjData, time: float) -> None:
-            # The fingers close faster at first, as those of a user's program would.
-            data.ctrl[opening] = max(float(data.qpos[fingers].sum()) - max(press, 6.0 - 60.0 * time) / SERVO, 0.0)
+        def steer(wide: float, press: float, data: mujoco.MjData, time: float) -> None:
+            gap = float(data.qpos[fingers].sum())
+            data.ctrl[opening] = max(gap - (press if gap < wide + 2e-3 else FAST) / SERVO, 0.0)
             data.xfrc_applied[self._index, 2] = -0.2 * press if time > begin else 0.0
 
-        controls = [partial(steer, float(press)) for press in force]
+        controls = [partial(steer, *one) for one in zip(width.tolist(), force.tolist(), strict=True)]
         felt, failed = np.zeros(self.count, bool), np.zeros(self.count, bool)
         for step in range(round(seconds / dt)):
             state = world.step(controls)

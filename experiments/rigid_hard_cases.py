@@ -23,6 +23,7 @@ checks), ``table.txt`` and ``rigid_hard.png``; ``cases.json`` keeps the cases th
 from __future__ import annotations
 
 import fnmatch
+import re
 import time
 import traceback
 import warnings
@@ -116,9 +117,9 @@ def measured(name: str, case: Callable[[], Outcome]) -> Row:
             warnings.simplefilter("ignore", RuntimeWarning)
             outcome = case()
     except Exception as error:  # a case that cannot be run is a case that fails; the others go on
-        if not isinstance(error, RaytacError):
-            traceback.print_exc()
-        outcome = Outcome([Check(f"error: {str(error).splitlines()[0]}", 1.0, 0.0)])
+        text = (str(error).splitlines() or [""])[0]
+        where = "" if isinstance(error, RaytacError) else f" ({Path(traceback.extract_tb(error.__traceback__)[-1].filename).name})"
+        outcome = Outcome([Check(f"error: {type(error).__name__}: {text}{where}", 1.0, 0.0)])
     return {
         "case": name,
         "passed": outcome.passed,
@@ -159,7 +160,7 @@ def summary(rows: list[Row]) -> dict[str, Metric]:
         metrics[f"rigid_hard.{row['case']}.passed"] = int(row["passed"])
         for c in row["checks"]:
             if np.isfinite(c["value"]) and not c["name"].startswith("error"):
-                metrics[f"rigid_hard.{row['case']}.{c['name'].replace(' ', '_')}"] = c["value"]
+                metrics[f"rigid_hard.{row['case']}.{re.sub(r'[^A-Za-z0-9]+', '_', c['name'])}"] = c["value"]
     return metrics
 
 
@@ -513,7 +514,7 @@ def grasps(name: str, count: int, seed: int) -> Outcome:
     opening = min(2.0 * float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))) + 8e-3, 0.0799)
     grasp = Grasps(within_grip([body], 2e-3, opening), min(16, count))
     for first in range(0, count, grasp.count):
-        poses = np.empty((grasp.count, 4, 4))
+        poses, width = np.empty((grasp.count, 4, 4)), np.empty(grasp.count)
         for b in range(grasp.count):
             turn = rng.normal(size=4)
             place = rng.uniform(-6e-3, 6e-3, 2)
@@ -523,7 +524,8 @@ def grasps(name: str, count: int, seed: int) -> Outcome:
                 poses[b] = np.eye(4)
                 near, far = low, high
             poses[b, :3, 3] = [place[0], 0.0, place[1]] - 0.5 * (near + far)
-        grasp.close(poses, 10.0 ** rng.uniform(-0.5, 1.0, grasp.count), min(count - first, grasp.count))
+            width[b] = far[1] - near[1]
+        grasp.close(poses, width, 10.0 ** rng.uniform(-0.5, 1.0, grasp.count), min(count - first, grasp.count))
     outcome.penetration = grasp.penetration
     outcome.add("environments failed", grasp.failed, 0.0)
     outcome.add("beyond the bonded face", 1e3 * grasp.penetration, 0.0, "mm")
