@@ -97,7 +97,9 @@ class PadSearch:
         apart = apart[reach[apart] > 0.0]
         if len(apart):
             grid = self._grid(p, _GAP_PITCH)
-            gap = refined(object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest, _GAP_PITCH)
+            gap = refined(
+                object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest, _GAP_PITCH
+            )
             some = (gap < reach[apart]) & np.isfinite(gap)
             apart, shift = apart[some], np.maximum(gap[some], 0.0) + _SHALLOW
             if len(apart):

@@ -150,6 +150,10 @@ class RigidPads:
             for row, i in np.argwhere(self._pierced(pad, pad_from_body)).tolist():
                 rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
                 raise OverlapError(f"environment {envs[row]}: {rule}")
+        self.clear(envs)
+
+    def clear(self, envs: Sequence[int]) -> None:
+        """Forget what environments went through."""
         chosen = np.asarray(envs, int)
         self._shear.clear(chosen)
         self._wrench[chosen] = self._acceleration[chosen] = 0.0
@@ -304,7 +308,7 @@ class RigidPads:
         apart = np.abs(motion.pad_from_body[..., :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
         gap = np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - self._radius
         longest = choice.beside_case(gap, self._speed(motion))
-        longest[..., self._planes] = np.inf
+        longest[..., self._planes[0]] = np.inf
         return longest.min(axis=(1, 2))
 
     def _speed(self, motion: _Motion) -> np.ndarray:

@@ -143,7 +143,6 @@ class TactileWorld:
             model = copy(compiled_model(scene))
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             self.composed = own_world_model(model, **{**own, "allow_overlap": allow_overlap})
-            _refuse_colliding(self.composed)
         else:
             assert self.scene is not None
             self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
@@ -409,12 +408,3 @@ class TactileWorld:
                 if np.isinf(depth):
                     rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to"
                 raise InputError("body", value=body, rule=rule)
-
-
-def _refuse_colliding(composed: WorldModel) -> None:
-    """Raise ``InputError`` for a gel that MuJoCo collides too, which would push twice."""
-    for mounted in composed.sensors:
-        gel = composed.model.geom(mounted.gel)
-        if gel.contype or gel.conaffinity:
-            rule = "collides in MuJoCo, and its pad would push a second time: mount the sensor with collide=False"
-            raise InputError("gel", value=mounted.gel, rule=rule)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,7 +18,7 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 from raytac.world.touched import TouchChoice, TouchedBody, touched_bodies
 
-__all__ = ["WorldModel", "compiled_model", "own_world_model"]
+__all__ = ["WorldModel", "checked_states", "compiled_model", "own_world_model"]
 
 _OVERLAP = 1e-4
 """Greatest depth to which a gel may lie in the robot at the start [m]: rounding of a model's lengths."""
@@ -85,6 +86,7 @@ def own_world_model(
     control_timestep: float | None = None,
     keyframe: str | None = None,
     allow_overlap: Sequence[str] = (),
+    own_contact: bool = True,
 ) -> WorldModel:
     """A user's own model, with its own start, options and controls.
 
@@ -94,14 +96,18 @@ def own_world_model(
         control_timestep: of one step of the world [s], a whole multiple of the model's own; None is one of those.
         keyframe: the start; None is ``qpos0``.
         allow_overlap: geoms in which a gel may lie at the start.
+        own_contact: pads push by the gel's law, and MuJoCo must not collide the gels; else it must, and pads only look.
 
     Raises:
-        InputError: what those two refuse, an option with which pads cannot be stepped, a control step that is no multiple, an unknown
-            keyframe, or a gel that lies deeper than 0.1 mm in another geom that collides (by MuJoCo's distance, of convex hulls).
+        InputError: what those two refuse, a gel that collides or does not, an option with which pads cannot be stepped, a control step that
+            is no multiple, an unknown keyframe, or a gel that lies deeper than 0.1 mm in another geom that collides (by MuJoCo's
+            distance, of convex hulls).
         SpecError: a sensor's file is missing or wrong.
     """
-    _check_options(model)
     mounted = mounted_sensors(model, sensors)
+    if own_contact:
+        _check_options(model)
+    _check_collisions(model, mounted, own_contact)
     touched, timestep = touched_bodies(model, touches, mounted), float(model.opt.timestep)
     if control_timestep is None:
         control_timestep = timestep
@@ -143,6 +149,34 @@ def _check_options(model: mujoco.MjModel) -> None:
     for bit, why in (("OVERRIDE", "replaces the pads' stiffness by that of o_solref"), ("SLEEP", "lets bodies on pads sleep")):
         if option.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{bit}"):
             raise InputError("model.opt.enableflags", value=bit.lower(), rule=f"must not be enabled: it {why}")
+
+
+def _check_collisions(model: mujoco.MjModel, sensors: Sequence[MountedSensor], own_contact: bool) -> None:
+    for mounted in sensors:
+        gel = model.geom(mounted.gel)
+        collides = bool(gel.contype[0] or gel.conaffinity[0])
+        if collides and own_contact:
+            rule = "collides in MuJoCo, and its pad would push a second time: mount the sensor with collide=False"
+            raise InputError("gel", value=mounted.gel, rule=rule)
+        if not collides and not own_contact:
+            rule = "must collide in MuJoCo, whose forces are read: mount the sensor with collide=True"
+            raise InputError("gel", value=mounted.gel, rule=rule)
+
+
+def checked_states(
+    own: mujoco.MjModel, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData], count: int
+) -> list[mujoco.MjData]:
+    """One state or several as a list; raises ``InputError`` for another model than one's ``own``, or not ``count`` states."""
+    if model is not own:
+        raise InputError("model", value=type(model).__name__, rule="must be the model that this was made for")
+    datas: list[Any] = [data] if isinstance(data, mujoco.MjData) else list(data)
+    for one in datas:
+        sizes = (len(one.qpos), len(one.xpos)) if isinstance(one, mujoco.MjData) else None
+        if sizes != (own.nq, own.nbody):
+            raise InputError("data", value=type(one).__name__, rule="must be a MjData of the model that this was made for")
+    if len(datas) != count:
+        raise InputError("data", value=len(datas), rule=f"must be {count} states, as num_envs says")
+    return datas
 
 
 def _check_gels(world: WorldModel, allowed: Sequence[str]) -> None:
