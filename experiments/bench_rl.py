@@ -39,7 +39,7 @@ from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv
 from raytac.errors import InputError, RaytacError
 from raytac.gel import ElasticSurround, GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, versions
+from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, read_metrics, versions
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
 from raytac.report import machine
 from raytac.sensor import TactileSensor
@@ -121,8 +121,18 @@ def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:
                 for checkout in (ours, theirs) if k % 2 == 0 else (theirs, ours):
                     figures[mode][checkout].append(figure_of(checkout, mode, args))
                 own, other = (figures[mode][checkout][-1] for checkout in (ours, theirs))
-                print(f"round {k + 1} of {args.rounds}, {mode}: {own:.4g} against {other:.4g} steps/s, {own / other:.3g} times", flush=True)
-        metrics |= {"envs": args.envs, "steps": args.steps, "rounds": args.rounds, "commit": commit(ours), "against": name, **machine()}
+                print(
+                    f"round {k + 1} of {args.rounds}, {mode}: {own:.4g} against {other:.4g} steps/s, {own / other:.3g} times",
+                    flush=True,
+                )
+        metrics |= {
+            "envs": args.envs,
+            "steps": args.steps,
+            "rounds": args.rounds,
+            "commit": commit(ours),
+            "against": name,
+            **machine(),
+        }
         for mode, runs in figures.items():
             key = f"ball_rolling.rigid.{BALL_KEY}" if mode == BALL else f"push.{mode}.env_steps_per_s"
             prefix, ratios = key.rpartition(".")[0], np.array(runs[ours]) / np.array(runs[theirs])
