@@ -20,7 +20,7 @@ from raytac.world import SceneCamera
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fetch_pick_place.py"
 TITLES = {"l": "left finger", "r": "right finger"}
-ENLARGED = 10.0
+ENLARGED = 4.0
 """Factor of the drawn displacements of markers."""
 
 
@@ -38,7 +38,8 @@ def main(args: Args) -> None:
     ):
         done = runpy.run_path(str(EXAMPLE))
         world, frames, state = done["world"], done["frames"], done["state"]
-        camera = SceneCamera(world, resolution=(640, 480), distance=0.55, azimuth=130.0, elevation=-18.0)
+        camera = SceneCamera(world, resolution=(640, 480), distance=0.5, azimuth=130.0, elevation=-12.0)
+        world.model.vis.headlight.ambient[:], world.model.vis.headlight.diffuse[:] = 0.15, 0.15  # the package's scene has a light
         figure = Figure(figsize=(10.0, 3.0), layout="constrained")
         axes = figure.subplots(1, 3)
         axes[0].imshow(camera.draw())

@@ -159,7 +159,7 @@ def _checks(axes: Axes, rows: Sequence[Row]) -> None:
     axes.axvline(1.0, color="0.4", lw=0.8)
     axes.set(xscale="log", xlim=(0.6 * LEAST, 30 * MOST), xlabel="measured over its bound (what is 0, or a state, at the ends)")
     axes.set_yticks(range(len(names)), names)
-    axes.invert_yaxis()
+    axes.set_ylim(len(names) - 0.4, -0.6)
     for k, count in enumerate(counts):
         axes.text(20 * MOST, k, count, ha="right", va="center", fontsize=9)
 
