@@ -25,8 +25,8 @@ KINDS = (
     ("environments failed", "no state is lost"),
     ("beyond the bonded face", "bonded face"),
     ("friction beyond", "friction cone"),
-    ("energy", "energy"),
-    ("depth", "depth of the press"),
+    ("energy gained|energy given", "energy"),
+    ("against the press", "depth of the press"),
     ("carried", "load carried"),
     ("creep", "creep"),
     ("normal load|force on|force of", "normal load"),
@@ -75,14 +75,14 @@ def _creep(axes: Axes, rows: Sequence[Row]) -> None:
     shown = [row for row in rows if row["case"].startswith("lift") and row["curves"].get("creep")]
     for k, row in enumerate(shown[: len(STYLES) * 2]):
         mu = re.sub(r"lift_mu([\d.]+)_.*", r"μ = \1", row["case"])
-        creep = np.maximum(row["curves"]["creep"], 1e-3)
+        creep = np.maximum(row["curves"]["creep"], 1e-6)
         axes.plot(row["curves"]["time"], creep, ls=STYLES[k % len(STYLES)], lw=1.2, label=mu)
     axes.set_title("b   held at 90 % of the slip limit", loc="left")
     if not shown:
         axes.set_axis_off()
         return
     axes.axhline(20.0, color="0.4", lw=0.8)
-    axes.set(xlabel="time [s]", ylabel="creep of the load [µm]", yscale="log", ylim=(1e-3, None))
+    axes.set(xlabel="time [s]", ylabel="creep of the load [µm]", yscale="log", ylim=(5e-7, 100.0))
     axes.text(0.98, 23.0, "bound", transform=axes.get_yaxis_transform(), ha="right", fontsize=8, color="0.3")
     axes.legend(fontsize=8)
 
