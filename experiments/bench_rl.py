@@ -2,12 +2,18 @@
 
     python experiments/bench_rl.py --out runs/bench_rl
     python experiments/bench_rl.py --envs 16 --modes fots,table32 --steps 40
+    git worktree add ../raytac_b682ef2 b682ef2; python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
     python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
 
 Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``table32`` (32 x 32 images of the Taxim table), ``raytrace64``
 (64 x 64 ray-traced images). The policy is the multilayer perceptron of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
 a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
 policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
+
+``--against CHECKOUT`` runs this script and the other checkout's own, with its own scenes and steps, by turns: ``--rounds`` rounds, each in
+processes of their own, the order changing from round to round. ``push.<mode>.speedup_vs_<name>`` is the median over rounds of the ratio
+of both figures, ``name`` being the commit, and ``.speedup_least`` and ``.speedup_most`` are the extremes. With ``ball`` among the modes
+``experiments/ball_rolling.py`` with the rigid pad takes turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
 
 ``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
 heights are on the device when the clock starts; cut, difference to rest and hand-over to PyTorch (DLPack) are in the time, and the image
@@ -17,16 +23,23 @@ stays where it is. ``numpy_frames_per_s`` is what the same costs with arrays of 
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
+import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv
+from raytac.errors import InputError, RaytacError
 from raytac.gel import ElasticSurround, GelSurface
-from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, versions
+from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, read_metrics, versions
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
 from raytac.report import machine
 from raytac.sensor import TactileSensor
@@ -40,6 +53,9 @@ MODES: dict[str, ObservationSettings | None] = {
 }
 
 
+BALL, BALL_KEY = "ball", "steps_per_s"
+BALL_STEPS = 3000
+"""Control steps of a ball's run: all goals."""
 FRAMES = {"table": "taxim", "raytrace": "raytrace"}
 """Optical mode of each."""
 
@@ -60,11 +76,17 @@ class Args(CommonOptions):
     """Of these images."""
     sensor: str = "gelsight_mini"
     """That makes them."""
+    against: Path | None = None
+    """Checkout of another commit to take turns with."""
+    rounds: int = 3
+    """Of turns."""
 
 
 def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
     known = tuple(FRAMES) if args.frames else tuple(MODES)
+    if args.against is not None:
+        return compare(args, parse_names(args.modes or ",".join((*MODES, BALL)), "modes", (*MODES, BALL)))
     names = parse_names(args.modes or ",".join(name for name in known if name != "none"), "modes", known)
     device = resolve_device(args.device)
     parse_resolution(args.size)
@@ -79,6 +101,70 @@ def main(args: Args) -> dict[str, Metric]:
                 metrics |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
                 print(f"{name}: {metrics[f'push.{name}.env_steps_per_s']:.0f} environment steps/s")
     return metrics
+
+
+def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:
+    """Run this checkout and another one by turns and write the ratios of their figures."""
+    assert args.against is not None
+    if args.frames:
+        raise InputError("against", value=args.against, rule="is for environment steps, not for --frames")
+    if args.rounds < 1:
+        raise InputError("rounds", value=args.rounds, rule="must be 1 or more")
+    theirs, ours = args.against.resolve(), Path(__file__).resolve().parents[1]
+    if not (theirs / "experiments" / "bench_rl.py").is_file():
+        raise InputError("against", value=args.against, rule="must be a checkout of this project, with experiments/bench_rl.py")
+    name = commit(theirs)
+    figures: dict[str, dict[Path, list[float]]] = {mode: {ours: [], theirs: []} for mode in names}
+    with recorded(args, "bench_rl", owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
+        for k in range(args.rounds):
+            for mode in names:
+                for checkout in (ours, theirs) if k % 2 == 0 else (theirs, ours):
+                    figures[mode][checkout].append(figure_of(checkout, mode, args))
+                own, other = (figures[mode][checkout][-1] for checkout in (ours, theirs))
+                print(
+                    f"round {k + 1} of {args.rounds}, {mode}: {own:.4g} against {other:.4g} steps/s, {own / other:.3g} times",
+                    flush=True,
+                )
+        metrics |= {
+            "envs": args.envs,
+            "steps": args.steps,
+            "rounds": args.rounds,
+            "commit": commit(ours),
+            "against": name,
+            **machine(),
+        }
+        for mode, runs in figures.items():
+            key = f"ball_rolling.rigid.{BALL_KEY}" if mode == BALL else f"push.{mode}.env_steps_per_s"
+            prefix, ratios = key.rpartition(".")[0], np.array(runs[ours]) / np.array(runs[theirs])
+            metrics |= {key: float(np.median(runs[ours])), f"{key}_{name}": float(np.median(runs[theirs]))}
+            metrics[f"{prefix}.speedup_vs_{name}"] = float(np.median(ratios))
+            metrics |= {f"{prefix}.speedup_least": float(ratios.min()), f"{prefix}.speedup_most": float(ratios.max())}
+    return metrics
+
+
+def figure_of(checkout: Path, mode: str, args: Args) -> float:
+    """Steps a second that a checkout's own script measures, in a process of its own."""
+    with tempfile.TemporaryDirectory() as out:
+        if mode == BALL:
+            command = ["experiments/ball_rolling.py", "--physics", "rigid", "--steps", str(BALL_STEPS)]
+            key = f"ball_rolling.rigid.{BALL_KEY}"
+        else:
+            sizes = ["--envs", str(args.envs), "--steps", str(args.steps)]
+            command, key = ["experiments/bench_rl.py", "--modes", mode, *sizes], f"push.{mode}.env_steps_per_s"
+        command = [sys.executable, *command, "--device", args.device, "--seed", str(args.seed), "--out", str(Path(out, "run"))]
+        ended = subprocess.run(
+            command, cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)}, capture_output=True, text=True, check=False
+        )
+        if ended.returncode:
+            last = (ended.stderr.strip() or ended.stdout.strip() or "no message").splitlines()[-1]
+            raise RaytacError(f"{mode} in {checkout} ended with {ended.returncode}: {last}")
+        return float(read_metrics(Path(out, "run", "metrics.json"))[key])
+
+
+def commit(checkout: Path) -> str:
+    """Short name of a checkout's commit; the folder's name where git knows none."""
+    ended = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], cwd=checkout, capture_output=True, text=True, check=False)
+    return ended.stdout.strip() if ended.returncode == 0 else checkout.name
 
 
 def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:

@@ -129,11 +129,11 @@ def play(name: str, how: str, episodes: int, seed: int, timestep: float | None =
         lowest += [float(object_bounds(body.parts, pose)[0][2]) for pose in poses]
         cosines += np.vecdot(poses[:, :3, 2], upright[~state.failed]).tolist()
     force = np.array(forces)
-    table = any(one.spec.kind == "plane" for one in world.composed.bodies.values())
+    table = any(one.is_plane for one in world.composed.touched)
     return Played(
         float(((force[1:] < _NOTHING) & (force[:-1] > _PRESSED)).sum() / episodes),
         max(-1e3 * min(lowest), 0.0) if table else None,
-        float(np.degrees(np.arccos(min(min(cosines), 1.0)))) if pressed and body.spec.kind == "box" else None,
+        float(np.degrees(np.arccos(min(min(cosines), 1.0)))) if pressed and scene.body(body.name).kind == "box" else None,
         int(world.state().failed.sum()),
         int(out.success.sum()),
     )

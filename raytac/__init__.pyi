@@ -29,6 +29,7 @@ from .gel.surface import GelSurface as GelSurface
 from .gel.surface import PadGrid as PadGrid
 from .installation import foreign_ipc as foreign_ipc
 from .observe.settings import ObservationSettings as ObservationSettings
+from .robots.mount import mount as mount
 from .sensor.tactile_sensor import TactileSensor as TactileSensor
 from .specs.files import available as available
 from .specs.press import PressScene as PressScene
@@ -38,6 +39,8 @@ from .specs.sensor_file import load_sensor as load_sensor
 from .specs.task import TaskScene as TaskScene
 from .specs.task_file import load_scene as load_scene
 from .specs.task_file import load_task as load_task
+from .world.pad_stepper import PadStepper as PadStepper
+from .world.tactile_reader import TactileReader as TactileReader
 from .world.world import TactileWorld as TactileWorld
 
 __version__: str

@@ -17,8 +17,8 @@ from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.physics.soft.availability import check_solver, quiet_solver
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import sensor_spec
 from raytac.specs import PADS, PressScene, TaskScene, load_scene
+from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import COUPLINGS
 
 if TYPE_CHECKING:

@@ -38,7 +38,9 @@ class ActionControl:
     def __init__(self, world: TactileWorld, motion: Motion, action: str) -> None:
         """Start with the targets where the tool is. Raises ``InputError`` for a scene without an arm that has motors."""
         if world.arm is None or world.arm.motors is None:
-            raise InputError("scene", value=world.scene.name, rule="needs an arm with torque motors")
+            raise InputError(
+                "scene", value=None if world.scene is None else world.scene.name, rule="needs an arm with torque motors"
+            )
         self.world, self.arm, self.motion, self.action = world, world.arm, motion, action
         self._posture = world.composed.start[self.arm.qpos].copy()
         self._law = JointImpedance(self.arm, frequency=motion.frequency)
@@ -85,7 +87,7 @@ class ActionControl:
 
     def controller(self, actions: np.ndarray) -> BatchController:
         """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1]."""
-        dt = self.world.scene.control_timestep
+        dt = self.world.composed.control_timestep
         if self.action == "pose":
             before = self._target.copy()
             self._move_pose(actions)

@@ -144,7 +144,7 @@ class TaskBatch:
     @property
     def control_timestep(self) -> float:
         """Duration of a step [s]."""
-        return self.world.scene.control_timestep
+        return self.world.composed.control_timestep
 
     # --- state, for policies that are written by hand ---------------------------------------------------------------------------
 

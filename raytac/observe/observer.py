@@ -20,8 +20,8 @@ from raytac.observe.randomization import CameraDrift, Randomization, randomised_
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.observe.spaces import ArraySpec, array_specs
 from raytac.sensor import TactileSensor
-from raytac.sensor.options import sensor_spec
 from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor_file import sensor_spec
 
 
 class TactileObserver:

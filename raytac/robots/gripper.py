@@ -9,10 +9,10 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from raytac.robots.mount import RobotModel, case_depth, mount_sensor
+from raytac.robots.mount import RobotModel, case_depth, mount
 from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.sensor_file import load_sensor
+from raytac.specs.sensor_file import sensor_spec
 
 __all__ = ["FACING", "FRAME_JOINTS", "GripperSettings", "add_opening_servo", "floating_gripper"]
 
@@ -58,7 +58,7 @@ def floating_gripper(
         position, quaternion: pose of the frame where all six joints are 0, world frame [m], wxyz.
         settings: mechanics of the gripper; None is ``GripperSettings()``.
     """
-    loaded = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    loaded = sensor_spec(sensor)
     settings = GripperSettings() if settings is None else settings
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -105,7 +105,7 @@ def floating_gripper(
             mass=settings.finger_mass,
             rgba=(0.3, 0.3, 0.32, 1.0),
         )
-        mounted.append(mount_sensor(spec, loaded, f"{side}_finger", pose(FACING, np.zeros(3)), name=side, kind="body"))
+        mounted.append(mount(spec, loaded, body=f"{side}_finger", pose=pose(FACING, np.zeros(3)), name=side))
         spec.body(f"{side}_body").gravcomp = 1.0
     add_opening_servo(spec, ("left_slide", "right_slide"), settings)
     spindle = spec.add_equality(

@@ -1,26 +1,39 @@
-"""Mount a tactile sensor on a body or a site of any MJCF robot."""
+"""Mount a tactile sensor on a body or a site of any MJCF robot, and find the sensors of a compiled model again."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
+from raytac.checks import check_truth
 from raytac.errors import InputError
 from raytac.robots.frames import world_from_site
-from raytac.se3 import check_pose, pose, quaternion
-from raytac.specs.sensor import SensorSpec
+from raytac.se3 import check_pose, quaternion
+from raytac.se3 import pose as rigid
+from raytac.specs.sensor import GelpadSpec, SensorSpec
+from raytac.specs.sensor_file import sensor_spec
 
-__all__ = ["MountedSensor", "RobotModel", "case_depth", "mount_sensor", "standing_on"]
+__all__ = ["MountedSensor", "RobotModel", "SensorChoice", "case_depth", "mount", "mounted_sensors", "standing_on"]
 
 _WALL = 0.8e-3
 """Thickness of a case's walls and back [m]: a guess, with which the Mini's inside gives its outside of 32 × 28 mm."""
 _CASE_DENSITY = 1000.0
 """Mean density of a case with its camera [kg/m³]: a guess, by which the GelSight Mini weighs 22 g without its gel."""
+_MARK = "raytac:"
+"""A sensor leaves a custom text of this name and its own in the model, which holds the name or path of its file. The text outlives
+``MjSpec.compile``, ``to_xml`` and ``attach``, whose prefix it then carries."""
+_IN_CODE = "made in code"
+"""Text of a sensor that was mounted as a specification, which no file has."""
+_TOUCH_RADIUS = 3e-3
+"""Contact radius [m] and mass [kg] for which MuJoCo's own contact of a gel is as stiff as the gel (a guess: a finger's tip, a cube)."""
+_TOUCH_MASS = 0.05
 
 
 @dataclass(frozen=True)
@@ -35,7 +48,11 @@ class MountedSensor:
     case: str
     """Geom of the case; it collides."""
     gel: str
-    """Geom of the gel block; for pictures only, since the pad's physics computes its contact."""
+    """Geom of the gel block. It collides only where ``mount`` was told so, since the pad's physics computes its contact."""
+    nominal: str
+    """Site at the pad as designed, on the body that carries the sensor: it stays there when a world mounts the pad with an error."""
+    spec: SensorSpec
+    """The sensor."""
 
     def world_from_pad(self, data: mujoco.MjData) -> np.ndarray:
         """Pose (4, 4) of the pad frame after the last ``mj_kinematics`` or ``mj_step``."""
@@ -52,7 +69,7 @@ class RobotModel:
     spec: mujoco.MjSpec
     sensors: tuple[MountedSensor, ...]
     site: str
-    """Site that the joints move: the one sensor's pad as designed, or the midpoint of two pads, where z is the direction of the fingers."""
+    """Site that the joints move: the one sensor's ``nominal``, or the midpoint of two pads, where z is the direction of the fingers."""
     opening: str | None
     """Position actuator of the gap between two pads [m]; None without a gripper."""
     joints: tuple[str, ...]
@@ -66,71 +83,149 @@ def case_depth(sensor: SensorSpec) -> float:
 
 def standing_on(sensor: SensorSpec) -> np.ndarray:
     """``mount_from_pad`` (4, 4) of a sensor whose back stands on the mount's origin, axes parallel: the pad looks along the mount's +z."""
-    return pose(np.eye(3), np.array([0.0, 0.0, case_depth(sensor)]))
+    return rigid(np.eye(3), np.array([0.0, 0.0, case_depth(sensor)]))
 
 
-def mount_sensor(
+def mount(
     spec: mujoco.MjSpec,
-    sensor: SensorSpec,
-    at: str,
-    mount_from_pad: np.ndarray | None = None,
+    sensor: str | Path | SensorSpec,
     *,
+    site: str | None = None,
+    body: str | None = None,
     name: str = "sensor",
-    kind: Literal["body", "site"] | None = None,
+    pose: ArrayLike | None = None,
     mass: float | None = None,
+    collide: bool = False,
 ) -> MountedSensor:
-    """Put ``sensor`` on a robot, rigidly: a body at the pad frame with the case, the gel block and a site.
+    """Put a sensor on a robot, rigidly: a body at the pad frame with the case, the gel block and a site.
+
+    .. code-block:: python
+
+        spec = mujoco.MjSpec.from_file("my_arm.xml")
+        left = raytac.mount(spec, "gelsight_mini_9x11", site="left_tip", name="left")
+        right = raytac.mount(spec, "gelsight_mini", body="right_finger", pose=finger_from_pad, name="right")
+        world = raytac.TactileWorld(spec, touches=["cube"])
 
     The case is a box from the outside of the back to the gel's bonded face, the inside of ``sensor.case`` plus walls of 0.8 mm
-    (a guess); the gel is a box from there to z = 0. Both carry their mass. ``spec`` is changed in place and compiles as before.
+    (a guess); it collides. The gel is a box from there to z = 0. Both carry their mass. ``spec`` is changed in place and compiles as
+    before.
 
     Args:
         spec: robot, before it is compiled.
-        sensor: the sensor to mount.
-        at: name of a body or a site of ``spec``.
-        mount_from_pad: pose (4, 4) of the pad frame in the frame of that body or site; None: ``standing_on(sensor)``.
-        name: prefix of the four names, unique in ``spec``: several sensors on a robot need several names.
-        kind: ``body`` or ``site``, where both have the same name.
+        sensor: name of a shipped sensor, path of a sensor file, or a specification.
+        site, body: name of what carries the sensor, one of the two.
+        name: prefix of the sensor's names in the model; several sensors on a robot need several names.
+        pose: pose (4, 4) of the pad frame in the frame of that site or body; None: ``standing_on(sensor)``, the back of the case on the
+            origin, the pad looking along +z.
         mass: mass of sensor and gel [kg]; None: the gel's by its density, the case's by a mean density of 1000 kg/m³ (a guess).
+        collide: MuJoCo collides the gel block too, for loops that only a ``TactileReader`` looks at. Its contacts have the gel's
+            friction, and about its stiffness at one point under a body of 50 g: MuJoCo's scales with masses and the number of points.
 
     Raises:
-        InputError: ``at`` names nothing or two things, a pose is no rigid transform, ``name`` is taken or empty, ``mass`` is not
-            finite or leaves nothing for the case.
+        InputError: a site or body that is not there, neither or both, a pose that is no rigid transform, a ``name`` that is taken or
+            empty, a ``mass`` that is not finite or leaves nothing for the case.
+        SpecError: the sensor's file is missing or wrong.
     """
     if not isinstance(spec, mujoco.MjSpec):
         raise InputError("spec", value=type(spec).__name__, rule="must be a mujoco.MjSpec, from which a model is compiled later")
-    anchor = _find(spec, at, kind)
-    placement = standing_on(sensor) if mount_from_pad is None else check_pose("mount_from_pad", mount_from_pad)
-    if not name:
+    loaded, carrier = sensor_spec(sensor), _carrier(spec, site, body)
+    placement = standing_on(loaded) if pose is None else check_pose("pose", pose)
+    if not isinstance(name, str) or not name:
         raise InputError("name", value=name, rule="must not be empty: it is the prefix of the sensor's names")
-    names = MountedSensor(name, body=f"{name}_body", site=f"{name}_pad", case=f"{name}_case", gel=f"{name}_gel")
-    existing = [("body", spec.bodies, names.body), ("site", spec.sites, names.site), ("geom", spec.geoms, names.case)]
-    for what, elements, new in [*existing, ("geom", spec.geoms, names.gel)]:
-        if new in _names(elements):
-            raise InputError("name", value=name, rule=f"must be new: the robot has a {what} {new!r} already")
-    child = _sensor_spec(sensor, placement, *_masses(sensor, mass))
-    if isinstance(anchor, mujoco.MjsSite):
-        spec.attach(child, prefix=f"{name}_", site=anchor)
+    mounted = _named(name, loaded)
+    taken = [("body", spec.bodies, (mounted.body,)), ("site", spec.sites, (mounted.site, mounted.nominal))]
+    for what, elements, new in [*taken, ("geom", spec.geoms, (mounted.case, mounted.gel))]:
+        for one in sorted(set(new) & set(_names(elements))):
+            raise InputError("name", value=name, rule=f"must be new: the robot has a {what} {one!r} already")
+    child = _sensor_model(loaded, placement, *_masses(loaded, mass), collide=check_truth("collide", collide))
+    if isinstance(carrier, mujoco.MjsSite):
+        spec.attach(child, prefix=f"{name}_", site=carrier)
     else:
-        spec.attach(child, prefix=f"{name}_", frame=anchor.add_frame())
-    return names
+        spec.attach(child, prefix=f"{name}_", frame=carrier.add_frame())
+    source = _IN_CODE if isinstance(sensor, SensorSpec) else str(sensor.resolve() if isinstance(sensor, Path) else sensor)
+    spec.add_text(name=f"{_MARK}{name}", data=source)
+    return mounted
 
 
-def _find(spec: mujoco.MjSpec, at: str, kind: str | None) -> mujoco.MjsBody | mujoco.MjsSite:
-    if kind not in (None, "body", "site"):
-        raise InputError("kind", value=kind, rule="must say what `at` is the name of", choices=("body", "site"))
-    body = spec.body(at) if kind != "site" else None
-    site = spec.site(at) if kind != "body" else None
-    if body is not None and site is not None:
-        raise InputError(
-            "at", value=at, rule="is the name of a body and of a site: say which by `kind`", choices=("body", "site")
-        )
-    if body is None and site is None:
-        bodies = [] if kind == "site" else _names(spec.bodies)
-        sites = [] if kind == "body" else _names(spec.sites)
-        rule = f"must be the name of a {kind or 'body or site'} of the robot"
-        raise InputError("at", value=at, rule=rule, choices=[*bodies, *sites])
-    return body if site is None else site
+SensorChoice = Sequence[str | MountedSensor] | Mapping[str, str | Path | SensorSpec]
+"""Sensors of a model: names that ``mount`` gave, its results, or what sensor each name is."""
+
+
+def mounted_sensors(model: mujoco.MjModel, sensors: SensorChoice | None = None) -> tuple[MountedSensor, ...]:
+    """Sensors of a compiled model.
+
+    Args:
+        model: model on which ``mount`` put sensors before it was compiled.
+        sensors: names of those that are wanted, or what ``mount`` returned; a mapping says what sensor each name is, which a model
+            needs whose sensors were mounted as specifications. None is every sensor that the model says it has.
+
+    Raises:
+        InputError: no sensor, a name that the model does not have or that is given twice, or a sensor that only its maker knows.
+        SpecError: a sensor's file is missing or wrong.
+    """
+    marked = _marked(model)
+    if sensors is None:
+        chosen: list[Any] = list(marked)
+    elif isinstance(sensors, str) or not isinstance(sensors, (Mapping, Sequence)):
+        raise InputError("sensors", value=sensors, rule="must be names, results of mount, or a mapping of names to sensors")
+    else:
+        chosen = list(sensors)
+    if not chosen:
+        rule = "must be one sensor or more: put some on the MjSpec with raytac.mount before it is compiled"
+        raise InputError("sensors", value=() if sensors is None else sensors, rule=rule, choices=marked)
+    result = []
+    for one in chosen:
+        if isinstance(one, MountedSensor):
+            mounted = one
+        elif isinstance(one, str):
+            given = sensors[one] if isinstance(sensors, Mapping) else None
+            mounted = _named(one, _known_sensor(one, marked) if given is None else sensor_spec(given))
+        else:
+            raise InputError("sensors", value=one, rule="must be a name or a result of mount", choices=marked)
+        for kind, part in (("BODY", mounted.body), ("SITE", mounted.site), ("GEOM", mounted.case), ("GEOM", mounted.gel)):
+            if mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind}"), part) < 0:
+                rule = f"must be a sensor of the model, which has no {kind.lower()} {part!r}"
+                raise InputError("sensors", value=mounted.name, rule=rule, choices=marked)
+        if mounted.name in (other.name for other in result):
+            raise InputError("sensors", value=mounted.name, rule="must not name a sensor twice")
+        result.append(mounted)
+    return tuple(result)
+
+
+def _marked(model: mujoco.MjModel) -> dict[str, str]:
+    """Names of the sensors that a model says it has, and of their files."""
+    result, data = {}, bytes(model.text_data)
+    for i in range(model.ntext):
+        prefix, mark, name = (mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TEXT, i) or "").partition(_MARK)
+        if mark:
+            first = int(model.text_adr[i])
+            result[prefix + name] = data[first : first + int(model.text_size[i]) - 1].decode()
+    return result
+
+
+def _known_sensor(name: str, marked: Mapping[str, str]) -> SensorSpec:
+    source = marked.get(name, _IN_CODE)
+    if name not in marked and marked:
+        raise InputError("sensors", value=name, rule="must be a sensor of the model", choices=marked)
+    if source == _IN_CODE:
+        rule = f"was mounted as a specification, which the model does not hold: say sensors={{{name!r}: specification}}"
+        raise InputError("sensors", value=name, rule=rule)
+    return sensor_spec(source)
+
+
+def _named(name: str, spec: SensorSpec) -> MountedSensor:
+    return MountedSensor(name, f"{name}_body", f"{name}_pad", f"{name}_case", f"{name}_gel", f"{name}_nominal", spec)
+
+
+def _carrier(spec: mujoco.MjSpec, site: str | None, body: str | None) -> mujoco.MjsBody | mujoco.MjsSite:
+    if (site is None) == (body is None):
+        rule = "must be the name of what carries the sensor, or `body` must: one of the two"
+        raise InputError("site", value=(site, body), rule=rule, choices=_names(spec.sites))
+    what, name, elements = ("site", site, spec.sites) if body is None else ("body", body, spec.bodies)
+    carrier = (spec.site if body is None else spec.body)(name) if isinstance(name, str) else None
+    if carrier is None:
+        raise InputError(what, value=name, rule=f"must be the name of a {what} of the robot", choices=_names(elements))
+    return carrier
 
 
 def _names(elements: Iterable[Any]) -> list[str]:
@@ -154,21 +249,23 @@ def _case_size(sensor: SensorSpec) -> tuple[float, float, float]:
     return length + 2.0 * _WALL, width + 2.0 * _WALL, case_depth(sensor) - thickness
 
 
-def _sensor_spec(sensor: SensorSpec, mount_from_pad: np.ndarray, case_mass: float, gel_mass: float) -> mujoco.MjSpec:
+def _sensor_model(
+    sensor: SensorSpec, mount_from_pad: np.ndarray, case_mass: float, gel_mass: float, *, collide: bool
+) -> mujoco.MjSpec:
     """The sensor alone, its pad frame at ``mount_from_pad``."""
     spec = mujoco.MjSpec()
-    body = spec.worldbody.add_body(name="body", pos=mount_from_pad[:3, 3], quat=quaternion(mount_from_pad[:3, :3]))
+    placed = {"pos": mount_from_pad[:3, 3], "quat": quaternion(mount_from_pad[:3, :3])}
+    body = spec.worldbody.add_body(name="body", **placed)
     (length, width), thickness = sensor.gelpad.size, sensor.gelpad.thickness
     case, back = np.array(_case_size(sensor)), -case_depth(sensor)
     box = mujoco.mjtGeom.mjGEOM_BOX
     body.add_geom(
         name="case", type=box, size=case / 2.0, pos=(0.0, 0.0, back + case[2] / 2.0), mass=case_mass, rgba=(0.1, 0.1, 0.12, 1.0)
     )
-    gel = np.array([length, width, thickness])
-    body.add_geom(
+    gel = body.add_geom(
         name="gel",
         type=box,
-        size=gel / 2.0,
+        size=np.array([length, width, thickness]) / 2.0,
         pos=(0.0, 0.0, -thickness / 2.0),
         mass=gel_mass,
         rgba=(0.75, 0.75, 0.78, 1.0),
@@ -176,5 +273,22 @@ def _sensor_spec(sensor: SensorSpec, mount_from_pad: np.ndarray, case_mass: floa
         conaffinity=0,
         group=2,
     )
+    if collide:
+        _let_collide(gel, sensor.gelpad)
     body.add_site(name="pad", size=(1e-3,) * 3, group=4)
+    spec.worldbody.add_site(name="nominal", size=(1e-3,) * 3, group=4, **placed)
     return spec
+
+
+def _let_collide(gel: mujoco.MjsGeom, gelpad: GelpadSpec) -> None:
+    """Give a gel block MuJoCo's contact: 2 E* a of a flat punch of radius a, for a body of the mass m, and Coulomb's friction.
+
+    In MuJoCo's form by time constant T and impedance d a contact of the mass m is a spring of K = m / ((1 − d) d² T²) at rest.
+    """
+    gel.contype = gel.conaffinity = 1
+    gel.priority, gel.condim = 1, 4
+    gel.friction = (gelpad.friction, 3.0 * math.pi / 16.0 * gelpad.friction * _TOUCH_RADIUS, 1e-4)
+    impedance = 0.95
+    stiffness = 2.0 * gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2) * _TOUCH_RADIUS
+    time = math.sqrt(_TOUCH_MASS / ((1.0 - impedance) * impedance**2 * stiffness))
+    gel.solref, gel.solimp = (time, 1.0), (impedance, impedance, 1e-3, 0.5, 2.0)

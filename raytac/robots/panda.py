@@ -15,10 +15,10 @@ import numpy as np
 from raytac.assets import asset_root
 from raytac.errors import InputError
 from raytac.robots.gripper import FACING, GripperSettings, add_opening_servo
-from raytac.robots.mount import RobotModel, case_depth, mount_sensor, standing_on
+from raytac.robots.mount import RobotModel, case_depth, mount, standing_on
 from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.sensor_file import load_sensor
+from raytac.specs.sensor_file import sensor_spec
 
 __all__ = ["JOINTS", "MAX_TORQUE", "MAX_VELOCITY", "READY", "one_sensor_panda", "two_finger_panda"]
 
@@ -39,8 +39,6 @@ _TCP: Final = 0.1034
 """Point between the finger tips in the hand's frame, along z [m] (franka_ros, franka_hand.xacro)."""
 _FINGER: Final = 0.0584
 """Finger frames in the hand's frame, along z [m] (the same)."""
-_TOOL: Final = "tool"
-"""Site at the pad as designed, axes parallel to link7's; it stays there when a world mounts the pad with an error."""
 
 
 def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> RobotModel:
@@ -61,13 +59,12 @@ def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
         raise InputError(
             "model", value=str(model), rule="must be an arm without a hand for a sensor on the flange (panda_nohand.xml)"
         )
-    loaded = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    loaded = sensor_spec(sensor)
     flange_from_pad = standing_on(loaded)
     link7_from_flange = pose(np.eye(3), np.array(_FLANGE))
     link7_from_pad = link7_from_flange @ flange_from_pad
-    mounted = mount_sensor(spec, loaded, "link7", link7_from_pad, kind="body")
-    spec.body("link7").add_site(name=_TOOL, pos=link7_from_pad[:3, 3], group=4)
-    return RobotModel(spec, (mounted,), _TOOL, None, JOINTS)
+    mounted = mount(spec, loaded, body="link7", pose=link7_from_pad)
+    return RobotModel(spec, (mounted,), mounted.nominal, None, JOINTS)
 
 
 def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> RobotModel:
@@ -93,7 +90,7 @@ def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
     else:
         _need(spec, model, bodies=("hand", "left_finger", "right_finger"), joints=("finger_joint1", "finger_joint2"))
         _replace_servo(spec)
-    loaded = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    loaded = sensor_spec(sensor)
     depth = case_depth(loaded)
     finger_from_pad = pose(FACING, np.array([0.0, 0.0, _TCP - _FINGER]))
     mounted = []
@@ -111,7 +108,7 @@ def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
             mass=0.0,
             rgba=(0.3, 0.3, 0.32, 1.0),
         )
-        mounted.append(mount_sensor(spec, loaded, f"{hand}{side}_finger", finger_from_pad, name=side, kind="body"))
+        mounted.append(mount(spec, loaded, body=f"{hand}{side}_finger", pose=finger_from_pad, name=side))
     site = f"{hand}tcp"
     if spec.site(site) is None:
         spec.body("hand").add_site(name=site, pos=(0.0, 0.0, _TCP), group=4)

@@ -15,7 +15,7 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.optics.registry import OPTICS
-from raytac.specs import PressScene, SensorSpec, load_press, load_sensor, validate_sensor
+from raytac.specs import PressScene, load_press
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticsConfig
@@ -64,16 +64,6 @@ def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, i
     for side in resolution:
         check_whole("resolution", side, 1, LARGEST_SIDE)
     return int(resolution[0]), int(resolution[1])
-
-
-def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
-    """The specification itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
-    if not isinstance(sensor, (str, Path, SensorSpec)):
-        raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
-    if not isinstance(sensor, SensorSpec):
-        return load_sensor(sensor)
-    validate_sensor(sensor)
-    return sensor
 
 
 def press_scene(scene: str | Path | PressScene) -> PressScene:

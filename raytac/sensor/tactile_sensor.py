@@ -31,10 +31,10 @@ from raytac.sensor.options import (
     checked_outputs,
     checked_resolution,
     press_scene,
-    sensor_spec,
     warn_of_other_shape,
 )
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
+from raytac.specs.sensor_file import sensor_spec
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig

@@ -56,6 +56,8 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "density_kg_m3": Number("[100, 10000]"),
         "friction": Number("[0, 10]"),
         "bonded": Text(choices=BONDED, default="back"),
+        "hysteresis": Number("[0, 1]", default=0.1),
+        "relaxation_time_s": Number("[0, 1]", default=0.002),
     },
     "coat": {
         "reflectance": Number("[0, 1]", length=3),
@@ -133,6 +135,12 @@ class GelpadSpec:
     """Coulomb friction coefficient μ against the object."""
     bonded: str = "back"
     """Faces that are bonded to the case, one of ``BONDED``; used by the soft pad alone."""
+    hysteresis: float = 0.1
+    """α, share of the energy that the gel loses in a cycle of rolling; used by the rigid pad in worlds alone. 0.1 is a guess: silicone
+    elastomers lose some per cent to some tens of per cent."""
+    relaxation_time: float = 0.002
+    """τ [s] of the gel's internal damping (Kelvin and Voigt): it carries E (ε + τ dε/dt); used by the rigid pad in worlds alone. Not
+    measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")

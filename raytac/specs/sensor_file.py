@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from raytac.errors import InputError
 from raytac.specs.files import available, find_file, name_of
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.sensor import (
@@ -23,7 +24,7 @@ from raytac.specs.sensor import (
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.toml import Table, Text, read_toml, split_unit
 
-__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "sensor_files", "with_lights"]
+__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "sensor_files", "sensor_spec", "with_lights"]
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
@@ -45,6 +46,16 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
             work (see ``validate_sensor``).
     """
     return _read_sensor(find_file("sensor", name_or_path))
+
+
+def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
+    """The specification itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
+    if not isinstance(sensor, (str, Path, SensorSpec)):
+        raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
+    if not isinstance(sensor, SensorSpec):
+        return load_sensor(sensor)
+    validate_sensor(sensor)
+    return sensor
 
 
 def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:

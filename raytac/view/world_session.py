@@ -51,12 +51,13 @@ class WorldSession:
         self._sensors = world.sensors
         self._grids = {name: strided(sensor.grid) for name, sensor in self._sensors.items()}
         label = next(iter(self._sensors.values())).label
-        self.title = f"{world.scene.name} · {world.scene.robot.model.rsplit('/', 1)[-1]} · {label}"
+        scene = world.scene
+        self.title = f"{scene.name} · {scene.robot.model.rsplit('/', 1)[-1]} · {label}" if scene is not None else label
         self.controls: tuple[Control, ...] = self._steering.controls
         self.pads = tuple(coat_pad(name, sensor, self._grids[name]) for name, sensor in self._sensors.items())
         self._body_of: dict[str, int] = {}
         """Body of the model that carries a solid, by the solid's name."""
-        self._soft = [body.name for body in world.scene.bodies if body.dynamics == "soft"]
+        self._soft = [] if scene is None else [body for body in scene.bodies if body.dynamics == "soft"]
         gels = (gel_solid(sensor.spec, f"{name}_gel") for name, sensor in self._sensors.items())
         self.solids = (*self._geoms(), *gels, *self._soft_bodies())
         self.camera = self._camera()
@@ -120,12 +121,10 @@ class WorldSession:
             yield Solid(name, vertices @ pose[:3, :3].T + pose[:3, 3], faces, colour, alpha, hides)
 
     def _soft_bodies(self) -> Iterator[Solid]:
-        specs = {body.name: body for body in self._world.scene.bodies}
-        for name in self._soft:
-            vertices, faces = self._world.mesh(name)
-            colour = specs[name].colour
-            shown = _SOFT_COLOUR if colour is None else tuple(round(255 * v) for v in colour)
-            yield Solid(f"soft/{name}", vertices[0], faces, shown, hides_pads=True)  # type: ignore[arg-type]
+        for body in self._soft:
+            vertices, faces = self._world.mesh(body.name)
+            shown = _SOFT_COLOUR if body.colour is None else tuple(round(255 * v) for v in body.colour)
+            yield Solid(f"soft/{body.name}", vertices[0], faces, shown, hides_pads=True)  # type: ignore[arg-type]
 
     def _camera(self) -> CameraPlace:
         pads = np.array([self._state.world_from_pad[name][0, :3, 3] for name in self._sensors])
@@ -142,7 +141,7 @@ class WorldSession:
             pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
             bodies[body] = pose
         poses = {name: bodies[body] for name, body in self._body_of.items()}
-        reshaped = {f"soft/{name}": self._world.mesh(name)[0][0] for name in self._soft}
+        reshaped = {f"soft/{body.name}": self._world.mesh(body.name)[0][0] for body in self._soft}
         time_ms = {"physics": self._physics_ms}
         for name, frame in frames.items():
             poses[f"{name}_gel"] = poses[f"{name}_coat_mesh"] = state.world_from_pad[name][0]
@@ -192,7 +191,7 @@ class Steering:
 
     def __init__(self, world: TactileWorld) -> None:
         """Read what the robot is; nothing moves."""
-        self._world, self._dt = world, world.scene.control_timestep
+        self._world, self._dt = world, world.composed.control_timestep
         self._model, arm = world.model, world.arm
         self.missing = ""
         """Why the robot's pose cannot be steered, for people; empty if it can, or if there is nothing to steer."""

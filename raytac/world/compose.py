@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,15 +13,18 @@ from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.physics.objects import object_parts
 from raytac.robots.arm import Arm
 from raytac.robots.gripper import floating_gripper
-from raytac.robots.mount import MountedSensor, RobotModel, mount_sensor
+from raytac.robots.mount import RobotModel, mount
 from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
 from raytac.se3 import pose_of, quaternion
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
-from raytac.specs.sensor_file import load_sensor
-from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, RobotSpec, TaskScene
+from raytac.specs.sensor_file import sensor_spec
+from raytac.specs.task import PAIR_FRICTION, ROBOTS, BodySpec, MountSpec, RobotSpec, TaskScene
+from raytac.world.hard_contacts import HARD_MARGIN
+from raytac.world.touched import TouchedBody
+from raytac.world.world_model import WorldModel, compiled_model
 
-__all__ = ["ComposedBody", "ComposedScene", "compose"]
+__all__ = ["compose"]
 
 _GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -35,53 +38,13 @@ _PLANE = (2.0, 2.0, 0.1)
 """Half widths and grid spacing [m] of the picture of a half-space, which is unbounded."""
 _COLOUR = (0.72, 0.72, 0.7)
 _HARD = 0.2, 0.999
-"""Contacts of rigid bodies: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
+"""Contacts of rigid bodies beside soft pads: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
 (1 − d) F Δt² / (m 0.2²): 25 µm for a steel ball of 4 g under 1 N at 2 ms, some tenths of a millimetre with MuJoCo's default."""
+_HARDER = 0.9999
+"""Impedance d of contacts of rigid bodies beside rigid pads (``raytac.world.hard_contacts``)."""
 
 
-@dataclass(frozen=True)
-class ComposedBody:
-    """Body of the scene in the model."""
-
-    spec: BodySpec
-    parts: tuple[Part, ...]
-    """Shape that pads sense, body frame [m]."""
-    index: int
-    """Index of the body in the model."""
-    mocap: int
-    """Index into ``mocap_pos`` of a body that another simulator moves, else −1."""
-    qpos: int
-    """Address of its free joint's seven positions, else −1."""
-
-    @property
-    def is_free(self) -> bool:
-        """True if MuJoCo moves it."""
-        return self.qpos >= 0
-
-
-@dataclass(frozen=True)
-class ComposedScene:
-    """Compiled scene, and the indices of its parts."""
-
-    scene: TaskScene
-    model: mujoco.MjModel
-    sensors: tuple[MountedSensor, ...]
-    sensor_specs: tuple[SensorSpec, ...]
-    arm: Arm | None
-    """Joints that move the robot's site; None without joints."""
-    opening: int | None
-    """Actuator of the gap between two pads; None without one."""
-    fingers: np.ndarray
-    """Addresses in ``qpos`` of the joints whose sum is that gap."""
-    bodies: dict[str, ComposedBody]
-    """Rigid bodies by name; soft ones are not MuJoCo's."""
-    start: np.ndarray
-    """Positions (nq,) at the start."""
-    ctrl: np.ndarray
-    """Controls (nu,) at the start: the keyframe's, or those with which position actuators keep the start and motors are idle."""
-
-
-def compose(scene: TaskScene, physics: str) -> ComposedScene:
+def compose(scene: TaskScene, physics: str) -> WorldModel:
     """Build and compile the model of a scene.
 
     With ``physics="ipc"`` bodies that belong to IPC are mocap bodies that touch nothing, and soft ones are left out.
@@ -90,16 +53,17 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
         SpecError: a soft body with the rigid pad, a body or robot that cannot be built; names the scene's file and key.
         InputError: MuJoCo refuses the model.
     """
-    robot, specs = _robot(scene)
+    robot = _robot(scene)
     spec: mujoco.MjSpec = robot.spec
     spec.option.timestep = scene.timestep
     spec.option.gravity = scene.gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones have one coefficient for every direction. The noslip pass removes the creep of MuJoCo's soft friction, by which a
-    # grasped body slips within seconds.
+    # Elliptic cones have one coefficient for every direction. Between rigid bodies MuJoCo's soft friction creeps, the less the greater
+    # ``impratio``; a rigid pad's friction has its own stiffness.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
-    spec.option.noslip_iterations = 4
+    # A noslip pass removes that creep, but would undo the shear of a rigid pad's gel.
+    spec.option.noslip_iterations = 0 if physics == "rigid" else 4
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shapes: dict[str, tuple[Part, ...]] = {}
     for i, body in enumerate(scene.bodies):
@@ -122,36 +86,38 @@ def compose(scene: TaskScene, physics: str) -> ComposedScene:
             shapes[body.name],
             scene.timestep,
             mirrored=physics == "ipc" and body.dynamics == "free" and body.owner == "ipc",
+            rigid_pads=physics == "rigid",
         )
     try:
-        model = spec.compile()
-    except ValueError as error:
-        raise InputError("scene", value=scene.name, rule=f"MuJoCo refuses it: {' '.join(str(error).split())}") from error
-    bodies = {b.name: _composed(model, b, shapes[b.name]) for b in scene.bodies if b.dynamics != "soft"}
+        model = compiled_model(spec)
+    except InputError as error:
+        raise InputError("scene", value=scene.name, rule=error.rule) from error
+    bodies = {b.name: _touched(model, b, shapes[b.name]) for b in scene.bodies if b.dynamics != "soft"}
     arm = Arm(model, robot.site, robot.joints) if robot.joints else None
     opening = None if robot.opening is None else int(model.actuator(robot.opening).id)
     fingers = _fingers(model, opening)
     start, ctrl = _start(scene, model, arm, opening, fingers, bodies)
-    return ComposedScene(scene, model, robot.sensors, specs, arm, opening, fingers, bodies, start, ctrl)
+    steps = scene.timestep, scene.control_timestep
+    return WorldModel(
+        model, robot.sensors, tuple(bodies.values()), *steps, start, ctrl, scene=scene, arm=arm, opening=opening, fingers=fingers
+    )
 
 
-def _robot(scene: TaskScene) -> tuple[RobotModel, tuple[SensorSpec, ...]]:
-    """The robot of a scene, not compiled, and the sensors on it."""
+def _robot(scene: TaskScene) -> RobotModel:
+    """The robot of a scene, not compiled, with the sensors on it."""
     robot = scene.robot
-    sensor = robot.sensor if isinstance(robot.sensor, SensorSpec) else load_sensor(robot.sensor)
+    sensor = sensor_spec(robot.sensor)
     if robot.model == "panda_one_sensor":
-        robot_model = one_sensor_panda(sensor)
-    elif robot.model == "panda_two_fingers":
-        robot_model = two_finger_panda(sensor)
-    elif robot.model == "floating_gripper":
-        robot_model = floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
-    elif robot.model == "fixed_sensor":
+        return one_sensor_panda(sensor)
+    if robot.model == "panda_two_fingers":
+        return two_finger_panda(sensor)
+    if robot.model == "floating_gripper":
+        return floating_gripper(sensor, position=robot.position, quaternion=robot.quaternion)
+    if robot.model == "fixed_sensor":
         spec = mujoco.MjSpec()
-        mounted = mount_sensor(spec, sensor, "world", pose_of(robot.position, robot.quaternion))
-        robot_model = RobotModel(spec, (mounted,), mounted.site, None, ())
-    else:
-        robot_model = _own_robot(scene, robot, sensor)
-    return robot_model, (sensor,) * len(robot_model.sensors)
+        mounted = mount(spec, sensor, body="world", pose=pose_of(robot.position, robot.quaternion))
+        return RobotModel(spec, (mounted,), mounted.nominal, None, ())
+    return _own_robot(scene, robot, sensor)
 
 
 def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> RobotModel:
@@ -164,15 +130,27 @@ def _own_robot(scene: TaskScene, robot: RobotSpec, sensor: SensorSpec) -> RobotM
     if not robot.mounts:
         raise SpecError("a robot from a file needs a sensor", file=scene.source, key="robot.mount")
     mounted = []
-    for i, mount in enumerate(robot.mounts):
-        placement = None if mount.position is None else pose_of(mount.position, mount.quaternion)
+    for i, one in enumerate(robot.mounts):
+        placement = None if one.position is None else pose_of(one.position, one.quaternion)
         try:
-            kind = mount.kind if mount.kind in ("body", "site") else None
-            mounted.append(mount_sensor(spec, sensor, mount.at, placement, name=mount.name, kind=kind))  # type: ignore[arg-type]
+            mounted.append(mount(spec, sensor, **_carrier(spec, one), name=one.name, pose=placement))
         except InputError as error:
-            key = f"robot.mount[{i}].{error.name if error.name in ('at', 'name', 'kind') else 'position_mm'}"
+            key = f"robot.mount[{i}].{error.name if error.name in ('at', 'name') else 'position_mm'}"
             raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
-    return RobotModel(spec, tuple(mounted), mounted[0].site, None, robot.arm_joints)
+    return RobotModel(spec, tuple(mounted), mounted[0].nominal, None, robot.arm_joints)
+
+
+def _carrier(spec: mujoco.MjSpec, one: MountSpec) -> dict[str, Any]:
+    """The site or body that a scene names, as ``mount`` takes it."""
+    names = {"body": [b.name for b in spec.bodies if b.name], "site": [s.name for s in spec.sites if s.name]}
+    names = {kind: there for kind, there in names.items() if one.kind in (None, kind)}
+    kinds = [kind for kind, there in names.items() if one.at in there]
+    if len(kinds) > 1:
+        raise InputError("at", value=one.at, rule="is the name of a body and of a site: say which by `kind`", choices=kinds)
+    if not kinds:
+        rule = f"must be the name of a {one.kind or 'body or site'} of the robot"
+        raise InputError("at", value=one.at, rule=rule, choices=[name for there in names.values() for name in there])
+    return {kinds[0]: one.at}
 
 
 def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
@@ -186,7 +164,9 @@ def _parts(scene: TaskScene, index: int) -> tuple[Part, ...]:
         raise SpecError(error.rule, file=scene.source, key=key, value=error.value, choices=error.choices) from error
 
 
-def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool) -> None:
+def _add_body(
+    spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timestep: float, *, mirrored: bool, rigid_pads: bool
+) -> None:
     mjs_body = spec.worldbody.add_body(name=body.name, pos=body.position, quat=body.quaternion, mocap=mirrored)
     free = body.dynamics == "free" and not mirrored
     if free:
@@ -200,8 +180,12 @@ def _add_body(spec: mujoco.MjSpec, body: BodySpec, parts: Sequence[Part], timest
         geom.density = density
         geom.friction = (friction, 0.0, 0.0)
         geom.priority = 1
-        rate, impedance = _HARD[0] / timestep, _HARD[1]
-        geom.solref, geom.solimp = (-(rate**2), -2.0 * rate), (impedance, impedance, 1e-3, 0.5, 2.0)
+        if rigid_pads:
+            geom.solref, geom.solimp = (-_HARDER / timestep**2, -_HARDER / timestep), (_HARDER, _HARDER, 1e-3, 0.5, 2.0)
+            geom.margin = HARD_MARGIN
+        else:
+            rate, impedance = _HARD[0] / timestep, _HARD[1]
+            geom.solref, geom.solimp = (-(rate**2), -2.0 * rate), (impedance, impedance, 1e-3, 0.5, 2.0)
         geom.rgba = (*(_COLOUR if body.colour is None else body.colour), 1.0)
         if mirrored:
             geom.contype, geom.conaffinity = 0, 0
@@ -233,10 +217,11 @@ def _mass(parts: Sequence[Part]) -> float:
     return float(spec.compile().body("body").mass[0])
 
 
-def _composed(model: mujoco.MjModel, body: BodySpec, parts: tuple[Part, ...]) -> ComposedBody:
+def _touched(model: mujoco.MjModel, body: BodySpec, parts: tuple[Part, ...]) -> TouchedBody:
     index = int(model.body(body.name).id)
-    joint = int(model.body_jntadr[index])
-    return ComposedBody(body, parts, index, int(model.body_mocapid[index]), -1 if joint < 0 else int(model.jnt_qposadr[joint]))
+    first = int(model.body_geomadr[index])
+    geoms = range(first, first + int(model.body_geomnum[index]))
+    return TouchedBody.of(model, body.name, index, parts, body.friction_on_gel, geoms)
 
 
 def _start(
@@ -245,7 +230,7 @@ def _start(
     arm: Arm | None,
     opening: int | None,
     fingers: np.ndarray,
-    bodies: dict[str, ComposedBody],
+    bodies: Mapping[str, TouchedBody],
 ) -> tuple[np.ndarray, np.ndarray]:
     robot = scene.robot
     start, ctrl = model.qpos0.copy(), np.zeros(model.nu)
@@ -256,9 +241,10 @@ def _start(
             raise SpecError(rule, file=scene.source, key="robot.keyframe", value=robot.keyframe, choices=[n for n in names if n])
         key = names.index(robot.keyframe)
         start, ctrl = model.key_qpos[key].copy(), model.key_ctrl[key].copy()
-        for body in bodies.values():
-            if body.is_free:
-                start[body.qpos : body.qpos + 7] = *body.spec.position, *body.spec.quaternion
+        for body in scene.bodies:
+            if body.name in bodies and bodies[body.name].is_free:
+                first = bodies[body.name].qpos
+                start[first : first + 7] = *body.position, *body.quaternion
     elif robot.model not in ROBOTS:
         _balance_servos(model, start, ctrl)
     if arm is not None and robot.model in ("panda_one_sensor", "panda_two_fingers"):

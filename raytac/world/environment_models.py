@@ -15,7 +15,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.se3 import quaternion, rigid_poses, rotation_of
-from raytac.world.compose import ComposedScene
+from raytac.world.world_model import WorldModel
 
 __all__ = ["EnvironmentModels", "Variation"]
 
@@ -41,7 +41,7 @@ class EnvironmentModels:
 
     Attributes:
         inverse_weight: ``body_invweight0`` of translations [1/kg], (B, bodies of the model).
-        friction_on_gel: coefficients against gel (B, bodies of the scene); NaN is the gel's own.
+        friction_on_gel: coefficients against gel (B, touched bodies); NaN is the gel's own.
         gel_stiffness: factors of the gels' moduli (B, sensors).
         gel_friction: the gels' own coefficients (B, sensors).
     """
@@ -51,11 +51,11 @@ class EnvironmentModels:
     gel_stiffness: np.ndarray
     gel_friction: np.ndarray
 
-    def __init__(self, composed: ComposedScene, num_envs: int) -> None:
+    def __init__(self, composed: WorldModel, num_envs: int) -> None:
         self._composed = composed
         self._models = [composed.model] * num_envs
-        self._bodies = tuple(composed.bodies.values())
-        given = [np.nan if (own := body.spec.friction_on_gel) is None else own for body in self._bodies]
+        self._bodies = composed.touched
+        given = [np.nan if body.friction is None else body.friction for body in self._bodies]
         self._scene_friction = np.array(given, float)
         self.inverse_weight = np.repeat(composed.model.body_invweight0[None, :, 0], num_envs, axis=0)
         self.friction_on_gel = np.repeat(self._scene_friction[None], num_envs, axis=0)
@@ -95,7 +95,7 @@ class EnvironmentModels:
             InputError: a name that is not there, factors that are not positive and finite, poses that are not rigid, arrays of another
                 length, or bodies or gels that differ with soft pads.
         """
-        free = [body.spec.name for body in self._bodies if body.spec.dynamics == "free"]
+        free = [body.name for body in self._bodies if body.is_placed]
         sensors = [mounted.name for mounted in self._composed.sensors]
         names = {"mass": free, "friction": list(self._composed.bodies)}
         names |= dict.fromkeys(("gel_stiffness", "gel_friction", "mounting"), sensors)
@@ -121,12 +121,13 @@ class EnvironmentModels:
 
     def vary(self, envs: Sequence[int], variation: Variation) -> None:
         """Give environments models with a checked variation, in place of the one they had."""
+        scene = self._composed.scene
         for row, b in enumerate(envs):
             model = self._models[b] = copy(self._composed.model)
             self.friction_on_gel[b] = self._scene_friction
             self.gel_stiffness[b], self.gel_friction[b] = 1.0, self._scene_gel_friction
             for i, body in enumerate(self._bodies):
-                name, index = body.spec.name, body.index
+                name, index = body.name, body.index
                 if name in variation.mass:
                     factor = float(variation.mass[name][row])
                     model.body_mass[index] *= factor
@@ -134,9 +135,8 @@ class EnvironmentModels:
                 if name in variation.friction:
                     factor = float(variation.friction[name][row])
                     self.friction_on_gel[b, i] *= factor
-                    if body.spec.friction is not None:
-                        first = int(model.body_geomadr[index])
-                        model.geom_friction[first : first + int(model.body_geomnum[index]), 0] *= factor
+                    if scene is None or scene.body(name).friction is not None:
+                        model.geom_friction[list(body.geoms), 0] *= factor
             for i, mounted in enumerate(self._composed.sensors):
                 if mounted.name in variation.gel_stiffness:
                     self.gel_stiffness[b, i] = variation.gel_stiffness[mounted.name][row]

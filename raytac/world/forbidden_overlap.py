@@ -16,7 +16,7 @@ from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.primitives import UNDERSIDES, bounds
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.compose import ComposedScene
+from raytac.world.world_model import WorldModel
 
 __all__ = ["BondedFace", "Inside", "RobotOverlap"]
 
@@ -112,16 +112,12 @@ class RobotOverlap:
     half-spaces of the robot.
     """
 
-    def __init__(self, composed: ComposedScene) -> None:
+    def __init__(self, composed: WorldModel) -> None:
         self.model = model = composed.model
-        scene = {body.index for body in composed.bodies.values()}
+        scene = {body.index for body in composed.touched}
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self.robot = np.array([g for g in np.flatnonzero(solid) if int(model.geom_bodyid[g]) not in scene], int)
-        self.mirrors = {
-            body.spec.name: np.arange(model.body_geomnum[body.index]) + model.body_geomadr[body.index]
-            for body in composed.bodies.values()
-            if body.mocap >= 0
-        }
+        self.mirrors = {body.name: np.array(body.geoms) for body in composed.touched if body.mocap >= 0}
         known = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")) for kind in SOLIDS}
         self._parts = {int(g): geom_part(model, int(g)) for g in self.robot if int(model.geom_type[g]) in known}
 

@@ -13,7 +13,7 @@ from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PadOverlap", "Touches"]
+__all__ = ["PadOverlap", "Touches", "refined"]
 
 _PITCHES = 0.8e-3, 0.4e-3, 0.2e-3
 """Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, else on the last."""
@@ -21,6 +21,7 @@ _ENOUGH = 150
 """Nodes: 96 mm² of the first grid, 24 mm² of the second."""
 _NEAR = 0.75
 """Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
+
 
 _WINDOWS = np.array([8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256])
 """Nodes along a side of the windows that are looked at, beyond which it is the whole line: few sizes, so that environments share them, and
@@ -198,7 +199,7 @@ class _Nodes:
         normal = np.stack([-slope_x, -slope_y, np.ones(len(values))], axis=1)
         normal /= np.sqrt(np.vecdot(normal, normal))[:, None]
         cell, clear = np.full(len(values), self.cell), np.full(len(values), self.near)
-        return Touches(env, -_refined(values, self.pitch), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
+        return Touches(env, -refined(values, self.pitch), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
 
 
 def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
@@ -210,7 +211,7 @@ def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
     return np.minimum(np.maximum(first, 0), len(line) - nodes)[:, None] + np.arange(nodes)
 
 
-def _refined(gap: np.ndarray, pitch: float) -> np.ndarray:
+def refined(gap: np.ndarray, pitch: float) -> np.ndarray:
     """The least gaps (n,) of (n, Ny, Nx) between the nodes: parabolas through the least node and its neighbours along both axes, exact
     for a ball on a dome; none where a neighbour is higher by half the pitch, for it lies beyond an edge."""
     n, ny, nx = gap.shape
@@ -220,7 +221,8 @@ def _refined(gap: np.ndarray, pitch: float) -> np.ndarray:
     inside = np.stack([(i > 0) & (i < nx - 1), (j > 0) & (j < ny - 1)])
     step = np.where(inside, [[1], [nx]], 0)
     middle, before, after = (gap.take(lowest + offset * step) for offset in (0, -1, 1))
-    curve = before + after - 2.0 * middle
+    with np.errstate(invalid="ignore"):  # where no body is
+        curve = before + after - 2.0 * middle
     bent = inside & (curve > 0.0) & (np.maximum(before, after) < middle + 0.5 * pitch)
     rise = np.where(bent, after, 0.0) - np.where(bent, before, 0.0)
     return middle[0] - 0.125 * (rise * rise / np.where(bent, curve, 1.0)).sum(axis=0)

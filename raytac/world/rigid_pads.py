@@ -1,85 +1,93 @@
-"""Rigid pads in a MuJoCo world: contact by geometry and load law, as in a press, given to MuJoCo as one compliant contact a body.
+"""Rigid pads in a MuJoCo world: contact by geometry and load law, as in a press, given to MuJoCo as one contact a body.
 
 MuJoCo's own collision uses a convex hull of the body, and its number of contact points sets the stiffness. Here contact is computed as in
-``RigidPad``, from the overlap of the resting gel with the body's underside. That overlap, as an elastic foundation, gives one contact
-among MuJoCo's own:
+``RigidPad``, from the overlap of the resting gel with the body's underside (``PadSearch``):
 
-- depth δ: the greatest overlap;
-- position: the overlap's centroid, so that a tilted flat face is pushed back at the edge that is deepest;
-- normal: that of the gel at this position. Its line goes through the centre of a ball anywhere on the dome;
-- stiffness: F(δ) / δ of the load law of this body at this place, by ``solref`` in direct form;
-- friction: Coulomb's; torsional 3π/16 μ a with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling
-  3/16 α a (J. A. Greenwood, H. Minshall, D. Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259,
-  1961) with α the share of energy that the gel loses.
+- place and normal: the overlap's centroid, and the resting gel's normal there. Its line goes through the centre of a ball anywhere on
+  the dome;
+- normal force: the load law of this body at this place, as an implicit spring (``normal_spring``);
+- friction: the gel shears first and slips from the edge of the contact inwards (``ShearState``), within Coulomb's cone; torsional 3π/16 μ a
+  with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling 3/16 α a (J. A. Greenwood, H. Minshall, D.
+  Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
 
-MuJoCo's friction is a rate law: the gel's shear stiffness is not in it, a pad carries a tangential force without shearing first.
-
-All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other,
-since its share of the time is small (docs/rl.md, Speed).
+All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other.
+Where something moves fast near a pad, that environment takes shorter steps (``StepChoice``), each half as long as the scene's, a quarter …
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import mujoco
 import numpy as np
 
-from raytac.errors import OverlapError
-from raytac.gel.pierced import without_pierced
-from raytac.gel.pyramid import ElasticSurround
-from raytac.gel.surface import GelSurface, PadGrid
-from raytac.gel.traction import foundation_traction
+from raytac.errors import InputError, OverlapError
+from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
-from raytac.physics.rigid.load_law import LoadLaw
+from raytac.physics.rigid.contacts import LoadTables, PadContacts
+from raytac.physics.rigid.implicit_spring import NormalSpring, contact_rate, normal_spring
+from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
+from raytac.physics.rigid.shear import ShearState
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
-from raytac.shapes.underside import object_height, object_radius
+from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import SensorSpec
-from raytac.world.compose import ComposedScene
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
-from raytac.world.pad_overlap import PadOverlap, Touches
+from raytac.world.hard_contacts import is_hard, write_hard_reference
+from raytac.world.pad_overlap import PadOverlap
+from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
+from raytac.world.pad_search import PadSearch, half_spaces, near_pad
+from raytac.world.pad_steps import StepChoice
+from raytac.world.pad_surfaces import PadSurfaces
+from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
 
-_HYSTERESIS = 0.1
-"""α, share of the energy that the gel loses in a cycle: a guess; silicone elastomers lose some per cent to some tens of per cent."""
-_RATE = 0.2
-"""Greatest ω Δt of a contact: ω = √s with s the direct form's stiffness. A stiffer contact gets a smaller impedance d, which keeps the
-force at rest: K = s / ((1 − d) A)."""
-_SLIP_RATE = 0.5
-"""Rate at which friction takes away sliding, per step of MuJoCo."""
-
-_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""Axes of a cross product; NumPy's own takes ten times as long for one pair."""
-
 
 class _Pad:
-    """Pad of one sensor, with the geometry of its contact search."""
+    """Pad of one sensor."""
 
     def __init__(self, mounted: MountedSensor, spec: SensorSpec, model: mujoco.MjModel) -> None:
         self.mounted, self.spec = mounted, spec
         self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
         self.gel = int(model.geom(mounted.gel).id)
         self.overlap, self.face = PadOverlap(spec.gelpad), BondedFace(spec.gelpad)
-        self.highest = self.overlap.highest
-        self.reach = 0.5 * np.asarray(spec.gelpad.size)
 
 
-_PadPoses = tuple[str, _Pad, np.ndarray, np.ndarray]
-"""A pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4)."""
+_PadPoses = tuple[str, _Pad, np.ndarray]
+"""A pad with ``pad_from_body`` (n, bodies, 4, 4)."""
 
 
 @dataclass(frozen=True)
-class _Contact:
-    """Contact of a pad among MuJoCo's."""
+class _Motion:
+    """Poses and velocities of bodies in the frames of pads, of n environments."""
 
-    env: int
-    sensor: str
-    index: int
+    world_from_pad: np.ndarray
+    """(n, pads, 4, 4)."""
+    pad_from_body: np.ndarray
+    """(n, pads, bodies, 4, 4)."""
+    velocity: np.ndarray
+    """Of bodies' origins relative to the pad [m/s], pad frame, (n, pads, bodies, 3)."""
+    spin: np.ndarray
+    """Angular velocity relative to the pad [rad/s], (n, pads, bodies, 3)."""
+
+
+@dataclass(frozen=True)
+class _Put:
+    """Contacts of one step that are among MuJoCo's."""
+
+    contacts: PadContacts
+    radius: np.ndarray
+    """Of contact [m], (n,)."""
+    rows: PadRows
+    turn: np.ndarray
+    """Matrices (n, 2, 2) from the rows' tangents to the pad's."""
+    speed: np.ndarray
+    """At which they close [m/s], (n,)."""
 
 
 class RigidPads:
@@ -88,27 +96,48 @@ class RigidPads:
     soft = None
     meshes: tuple[str, ...] = ()
 
-    def __init__(self, composed: ComposedScene, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
-        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here."""
-        num_envs = len(datas)
+    def __init__(self, composed: WorldModel, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
+        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here.
+
+        Raises:
+            InputError: the model has pyramidal friction cones, or a noslip pass, which would undo the gel's shear.
+        """
+        num_envs, option = len(datas), composed.model.opt
+        if option.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+            raise InputError("option.cone", value="pyramidal", rule="must be elliptic with rigid pads", choices=("elliptic",))
+        if option.noslip_iterations:
+            rule = "must be 0 with rigid pads: the gel sticks by its shear, which a noslip pass would undo"
+            raise InputError("option.noslip_iterations", value=int(option.noslip_iterations), rule=rule)
         self.composed, self.model, self._models = composed, composed.model, models
         self.pads = {
             mounted.name: _Pad(mounted, spec, composed.model)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         }
-        self.bodies = tuple(composed.bodies.values())
+        self.bodies = composed.touched
         self._body_index = np.array([body.index for body in self.bodies], int)
         self._site_index = np.array([pad.site for pad in self.pads.values()], int)
-        self._planes = np.flatnonzero([body.spec.kind == "plane" for body in self.bodies])
+        self._pad_index = np.array([pad.body for pad in self.pads.values()], int)
+        self._gels = tuple(pad.spec.gelpad for pad in self.pads.values())
+        self._planes = half_spaces([body.parts for body in self.bodies])
+        self._frame = np.tile(np.eye(4), (len(self.bodies), 1, 1))
+        """Pose of a half-space in its body's frame; the identity of all else."""
+        self._frame[self._planes[0]] = self._planes[1]
         self._radius = np.array([object_radius(body.parts) for body in self.bodies])
-        self._geom = [int(composed.model.body_geomadr[body.index]) for body in self.bodies]
-        self._wrench = {name: np.zeros((num_envs, 6)) for name in self.pads}
-        self._laws: list[dict[tuple[str, int], tuple[LoadLaw, float]]] = [{} for _ in range(num_envs)]
-        """By sensor and body, and the depth [m] up to which each is known."""
-        self._pressed = {name: np.full(num_envs, -1) for name in self.pads}
-        """Body that each pad showed deepest last; −1: none."""
-        self._forms = {(name, i): self._form(name, i) for name in self.pads for i in range(len(self.bodies))}
-        self._shown: dict[str, tuple[PadGrid, ElasticSurround, float]] = {}
+        self._geom = np.array([body.geoms[0] for body in self.bodies], int)
+        self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
+        self._mass_centre = composed.model.body_ipos[self._body_index]
+        cases = [int(composed.model.geom(mounted.case).id) for mounted in composed.sensors]
+        self._case_centre, self._case_half = composed.model.geom_pos[cases], composed.model.geom_size[cases]
+        # A model of one's own keeps the contacts that it has.
+        self._hard = is_hard(composed.model) if composed.scene is not None else np.zeros(composed.model.ngeom, bool)
+        self._fall = float(np.linalg.norm(option.gravity))
+        self._search = PadSearch(self._gels, [body.parts for body in self.bodies], num_envs=num_envs)
+        self._wrench = np.zeros((num_envs, len(self.pads), 6))
+        self._shear = ShearState(num_envs, len(self.pads), len(self.bodies))
+        self._acceleration = np.zeros((num_envs, len(self.pads), len(self.bodies)))
+        """At which contacts closed faster in their last step [m/s²]."""
+        shapes = [body.parts for body in self.bodies]
+        self._surfaces = PadSurfaces({name: pad.spec.gelpad for name, pad in self.pads.items()}, shapes, num_envs)
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -117,127 +146,383 @@ class RigidPads:
         Raises:
             OverlapError: a body starts beyond a pad's bonded face.
         """
-        for sensor, pad, _, pad_from_body in self._poses([datas[b] for b in envs]):
+        for sensor, pad, pad_from_body in self._poses([datas[b] for b in envs]):
             for row, i in np.argwhere(self._pierced(pad, pad_from_body)).tolist():
-                rule = f"{self.bodies[i].spec.name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
+                rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
                 raise OverlapError(f"environment {envs[row]}: {rule}")
-        for b in envs:
-            self._laws[b] = {}
-            for wrench, pressed in zip(self._wrench.values(), self._pressed.values(), strict=True):
-                wrench[b], pressed[b] = 0.0, -1
+        self.clear(envs)
+
+    def clear(self, envs: Sequence[int]) -> None:
+        """Forget what environments went through."""
+        chosen = np.asarray(envs, int)
+        self._shear.clear(chosen)
+        self._wrench[chosen] = self._acceleration[chosen] = 0.0
+        self._surfaces.reset(chosen)
 
     def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still.
 
-        So are those in which a body goes through a pad: its contact, a spring, gives way to what is too fast or too heavy for it.
+        So are those in which a body goes through a pad all the same.
         """
-        scene, models = self.composed.scene, self._models
+        scene = self.composed
         before = {name: np.full((len(datas), len(self.bodies), 4, 4), np.nan) for name in self.pads}
-        sound, touching = np.flatnonzero(~failed), []
-        for b in sound.tolist():
-            self._laws[b] = {}  # they hold while bodies hardly roll or slide on the pad, so once a control step
         for _ in range(round(scene.control_timestep / scene.timestep)):
-            if not len(sound):
-                break
-            for b in sound.tolist():
-                mujoco.mj_step1(models[b], datas[b])
-            poses = list(self._poses([datas[b] for b in sound.tolist()]))
-            self._mark_pierced(poses, sound, before, failed)
-            touching = self._add_contacts(poses, datas, sound, failed)
-            sound = sound[~failed[sound]]
-            if not len(sound):
-                break
-            for b in sorted({contact.env for contact in touching if not failed[contact.env]}):
-                # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
-                mujoco.mj_makeConstraint(models[b], datas[b])
-                mujoco.mj_island(models[b], datas[b])
-                mujoco.mj_projectConstraint(models[b], datas[b])
-                mujoco.mj_referenceConstraint(models[b], datas[b])
-            drive(sound)
-            for b in sound.tolist():
-                mujoco.mj_step2(models[b], datas[b])
-            failed[sound] = lost([datas[b] for b in sound.tolist()])
-            sound = sound[~failed[sound]]
-        self._read_forces(datas, sound, [contact for contact in touching if not failed[contact.env]])
+            choice, done = StepChoice(scene.timestep), np.zeros(len(datas), int)
+            while len(envs := np.flatnonzero(~failed & (done < choice.ticks))):
+                done[envs] += self._step(datas, envs, drive, choice, done[envs], before, failed)
+        sound = np.flatnonzero(~failed)
         for b in sound.tolist():
-            mujoco.mj_kinematics(models[b], datas[b])  # so that poses are those of the end of the step
+            mujoco.mj_kinematics(self._models[b], datas[b])  # so that poses are those of the end of the step
         if len(sound):
             self._mark_pierced(list(self._poses([datas[b] for b in sound.tolist()])), sound, before, failed)
 
+    def _step(
+        self,
+        datas: Sequence[mujoco.MjData],
+        envs: np.ndarray,
+        drive: Drive,
+        choice: StepChoice,
+        done: np.ndarray,
+        before: dict[str, np.ndarray],
+        failed: np.ndarray,
+    ) -> np.ndarray:
+        """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
+        models, some = self._models, [datas[b] for b in envs.tolist()]
+        for b, data in zip(envs.tolist(), some, strict=True):
+            mujoco.mj_step1(models[b], data)
+        put, ticks, step = self._insert(datas, envs, choice, done, before, failed)
+        sound = envs[~failed[envs]]
+        if len(sound):
+            drive(sound)
+        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
+            if failed[b]:
+                continue
+            models[b].opt.timestep = length
+            mujoco.mj_step2(models[b], datas[b])
+            models[b].opt.timestep = choice.timestep
+        if len(sound):
+            failed[sound] = lost([datas[b] for b in sound.tolist()])
+        self._after(datas, envs, put, failed)
+        return ticks
+
+    def add(self, datas: Sequence[mujoco.MjData], before: dict[str, np.ndarray], failed: np.ndarray) -> _Put:
+        """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``.
+
+        ``before``: poses (B, bodies, 4, 4) of bodies by pad, as this method left them the last time; NaN of none. The result is for
+        ``finish``, after ``mj_step2``. A step is as long as the model's: it is not divided where something moves fast.
+        """
+        envs, choice = np.flatnonzero(~failed), StepChoice(self.composed.timestep)
+        put, _, _ = self._insert(datas, envs, choice, np.zeros(len(envs), int), before, failed, whole=True)
+        return put
+
+    def finish(self, datas: Sequence[mujoco.MjData], put: _Put, failed: np.ndarray) -> None:
+        """Read the forces of contacts that ``add`` has put in, and let the gels shear, after ``mj_step2``."""
+        sound = np.flatnonzero(~failed)
+        if len(sound):
+            failed[sound] = lost([datas[b] for b in sound.tolist()])
+        self._after(datas, sound, put, failed)
+
+    def _insert(
+        self,
+        datas: Sequence[mujoco.MjData],
+        envs: np.ndarray,
+        choice: StepChoice,
+        done: np.ndarray,
+        before: dict[str, np.ndarray],
+        failed: np.ndarray,
+        *,
+        whole: bool = False,
+    ) -> tuple[_Put, np.ndarray, np.ndarray]:
+        """Put the pads' contacts among MuJoCo's, after ``mj_step1``; returns also the ticks and the length [s] of each step, (n,)."""
+        models, some = self._models, [datas[b] for b in envs.tolist()]
+        motion = self._motion(some)
+        poses = [(name, pad, motion.pad_from_body[:, k]) for k, (name, pad) in enumerate(self.pads.items())]
+        self._mark_pierced(poses, envs, before, failed)
+        left = choice.timestep * (1.0 - done / choice.ticks)
+        contacts = self._search.contacts(motion.pad_from_body, envs, self._reach(motion, left))
+        row = np.searchsorted(envs, contacts.env)
+        compliance = models.inverse_weight[contacts.env]
+        at = np.arange(len(contacts))
+        compliance = compliance[at, self._pad_index[contacts.pad]] + compliance[at, self._body_index[contacts.body]]
+        movable = (compliance > 0.0) & ~failed[contacts.env]  # where the compliance is 0 neither moves
+        contacts, row, compliance = contacts.of(movable), row[movable], compliance[movable]
+        speed = self._closing(contacts, motion, row)
+        law = self._law(contacts)
+        longest = np.minimum(self._beside_cases(choice, motion), choice.timestep)
+        self._in_gels(choice, longest, contacts, row, compliance, speed, law, left)
+        ticks = np.full(len(envs), choice.ticks) if whole else choice.rounded(longest, done)
+        step = choice.timestep * ticks / choice.ticks
+        tau = np.array([gel.relaxation_time for gel in self._gels])[contacts.pad]
+        spring = normal_spring(law, contacts.depth, speed, compliance, step[row], tau, self._fall)
+        held = spring.damping > 0.0
+        contacts, row, speed = contacts.of(held), row[held], speed[held]
+        spring = NormalSpring(spring.force[held], spring.damping[held], spring.deepest[held])
+        law = self._law(contacts)
+        self._forget_apart(envs, contacts)
+        rows, turn = self._rows(contacts, law, spring, motion, row, step[row])
+        self._put(datas, contacts, rows, failed)
+        own = np.bincount(contacts.env, minlength=len(datas))
+        for b, length in zip(envs.tolist(), step.tolist(), strict=True):
+            count = datas[b].ncon - int(own[b])
+            if count and not failed[b]:
+                write_hard_reference(datas[b], self._hard, count, length)
+        return _Put(contacts, law.radius(np.maximum(spring.deepest, 0.0)), rows, turn, speed), ticks, step
+
+    def _motion(self, datas: Sequence[mujoco.MjData]) -> _Motion:
+        """Poses and velocities of the states given, after their velocities are known."""
+        world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
+        pad_from_body = _relative(world_from_pad[:, :, None], world_from_body[:, None])
+        indices = np.concatenate([self._pad_index, self._body_index])
+        twist = np.array([data.cvel[indices] for data in datas]).reshape(len(datas), len(indices), 6)
+        # MuJoCo's velocities are about the centre of mass of the kinematic tree.
+        about = np.array([data.subtree_com[self.model.body_rootid[indices]] for data in datas]).reshape(len(datas), -1, 3)
+        place = np.concatenate([world_from_pad[..., :3, 3], world_from_body[..., :3, 3]], axis=1)
+        linear = twist[..., 3:] + np.cross(twist[..., :3], place - about)
+        pads = len(self._pad_index)
+        spin = twist[:, None, pads:, :3] - twist[:, :pads, None, :3]
+        apart = place[:, None, pads:] - place[:, :pads, None]
+        velocity = linear[:, None, pads:] - linear[:, :pads, None] - np.cross(twist[:, :pads, None, :3], apart)
+        to_pad = world_from_pad[:, :, None, :3, :3]
+        return _Motion(world_from_pad, pad_from_body, _turned(velocity, to_pad), _turned(spin, to_pad))
+
+    def _reach(self, motion: _Motion, left: np.ndarray) -> np.ndarray:
+        """Distance (n, pads) [m] that the fastest body may come nearer to each pad in the time ``left`` (n,) [s]."""
+        if not len(self.bodies):
+            return np.zeros(motion.world_from_pad.shape[:2])
+        return self._speed(motion).max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
+
+    def _closing(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> np.ndarray:
+        """Speeds (n,) at which contacts close [m/s]."""
+        at = row, contacts.pad, contacts.body
+        arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
+        return -np.vecdot(motion.velocity[at] + np.cross(motion.spin[at], arm), contacts.normal)
+
+    def _law(self, contacts: PadContacts) -> LoadTables:
+        thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
+        return LoadTables(contacts, thickness, self._models.gel_stiffness[contacts.env, contacts.pad])
+
+    def _beside_cases(self, choice: StepChoice, motion: _Motion) -> np.ndarray:
+        """Longest steps (n,) [s] in which no body's bounding ball enters a case far."""
+        if not len(self.bodies):
+            return np.full(len(motion.velocity), np.inf)
+        apart = np.abs(motion.pad_from_body[..., :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
+        gap = np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - self._radius
+        longest = choice.beside_case(gap, self._speed(motion))
+        longest[..., self._planes[0]] = np.inf
+        return longest.min(axis=(1, 2))
+
+    def _speed(self, motion: _Motion) -> np.ndarray:
+        """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies relative to pads; of a half-space, within a metre."""
+        size = np.minimum(self._radius, 1.0)
+        return np.linalg.norm(motion.velocity, axis=-1) + np.linalg.norm(motion.spin, axis=-1) * size
+
+    def _in_gels(
+        self,
+        choice: StepChoice,
+        longest: np.ndarray,
+        contacts: PadContacts,
+        row: np.ndarray,
+        compliance: np.ndarray,
+        speed: np.ndarray,
+        law: LoadTables,
+        left: np.ndarray,
+    ) -> None:
+        """Shorten the ``longest`` steps (n,) [s] of environments to those that their contacts with gels allow."""
+        thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
+        deeper = contacts.depth + np.minimum(np.maximum(speed, 0.0) * left[row], 0.025 * thickness)
+        _, stiffness = law.force(deeper)
+        rate = contact_rate(stiffness, compliance)
+        acceleration = self._acceleration[contacts.env, contacts.pad, contacts.body]
+        np.minimum.at(longest, row, choice.longest(contacts.depth, speed, rate, acceleration, thickness))
+
+    def _forget_apart(self, envs: np.ndarray, contacts: PadContacts) -> None:
+        """Clear the shear of contacts that have ended."""
+        apart = np.zeros(self._acceleration.shape, bool)
+        apart[envs] = True
+        apart[contacts.env, contacts.pad, contacts.body] = False
+        apart &= self._shear.stiffness[..., 0] > 0.0
+        if apart.any():
+            self._shear.clear(*np.nonzero(apart))
+        self._acceleration[apart] = 0.0
+
+    def _rows(
+        self, contacts: PadContacts, law: LoadTables, spring: NormalSpring, motion: _Motion, row: np.ndarray, step: np.ndarray
+    ) -> tuple[PadRows, np.ndarray]:
+        """Rows of the contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``)."""
+        models, at = self._models, (contacts.env, contacts.pad, contacts.body)
+        deepest = np.maximum(spring.deepest, 0.0)
+        radius, load = law.radius(deepest), law.force(deepest)[0]
+        softer = models.gel_stiffness[contacts.env, contacts.pad]
+        stiffness = np.ones((len(contacts), 2))
+        hysteresis = np.zeros(len(contacts))
+        tau = np.zeros(len(contacts))
+        for k, gel in enumerate(self._gels):
+            some = contacts.pad == k
+            size = radius[some]
+            stiffness[some] = np.stack([shear_stiffness(size, gel), twist_stiffness(size, gel)], axis=1)
+            hysteresis[some], tau[some] = gel.hysteresis, gel.relaxation_time
+        stiffness = np.maximum(stiffness * softer[:, None], 1e-12)
+        friction = models.friction_on_gel[contacts.env, contacts.body]
+        friction = np.where(np.isnan(friction), models.gel_friction[contacts.env, contacts.pad], friction)
+        lever = 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
+        # As much at the end of a step as keeps both shear and spin stable, whatever its length.
+        time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
+        damping = stiffness[:, 0] * time
+        metacentric, turn = self._tilt(contacts, motion, row)
+        rolling = np.maximum(
+            3.0 / 16.0 * (hysteresis * radius)[:, None],
+            friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric),
+        )
+        pull = self._shear.begin(at, stiffness, contacts.centre)
+        force = np.zeros((len(contacts), ROWS))
+        force[:, 0] = spring.force - self._lift(contacts, spring, motion, row, friction, lever, damping, pull)
+        force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
+        force[:, 3] = -pull[:, 2]
+        rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
+        axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
+        return PadRows(
+            (rotation @ contacts.centre[..., None])[..., 0] + origin,
+            (axes @ np.swapaxes(rotation, 1, 2)).reshape(-1, 9),
+            np.stack([friction, friction, friction * lever, rolling[:, 0], rolling[:, 1]], axis=1),
+            force,
+            np.stack([spring.damping, damping], axis=1),
+            step,
+        ), turn
+
+    def _lift(
+        self,
+        contacts: PadContacts,
+        spring: NormalSpring,
+        motion: _Motion,
+        row: np.ndarray,
+        friction: np.ndarray,
+        lever: np.ndarray,
+        damping: np.ndarray,
+        pull: np.ndarray,
+    ) -> np.ndarray:
+        """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
+
+        Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+        """
+        at = row, contacts.pad, contacts.body
+        arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
+        velocity = motion.velocity[at] + np.cross(motion.spin[at], arm)
+        one, two = tangents(contacts.normal)
+        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
+        spin = np.vecdot(motion.spin[at], contacts.normal)
+        tangential = pull[:, :2] + damping[:, None] * slip
+        torque = pull[:, 2] / lever + damping * spin * lever
+        excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
+        return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
+
+    @staticmethod
+    def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first, second = tangents(normal)
+        one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
+        return one, np.cross(normal, one)
+
+    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, and these by the pad's tangents, (n, 2, 2).
+
+        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the height of
+        that centre over the gel: by nothing at all for a ball.
+        """
+        pose = motion.pad_from_body[row, contacts.pad, contacts.body]
+        middle = (pose[:, :3, :3] @ self._mass_centre[contacts.body][..., None])[..., 0] + pose[:, :3, 3]
+        height = np.vecdot(middle - contacts.centre, contacts.normal)
+        xx, xy, yy = contacts.spread.T
+        angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+        mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+        # A rotation about one tangent moves the centre along the other.
+        spread = np.stack([mean - half, mean + half], axis=1)
+        return np.maximum(spread - height[:, None], 0.0), turn
+
+    def _put(self, datas: Sequence[mujoco.MjData], contacts: PadContacts, rows: PadRows, failed: np.ndarray) -> None:
+        """Put contacts among MuJoCo's; marks environments whose memory for contacts is full."""
+        geoms = np.stack([self._gel_geom[contacts.pad], self._geom[contacts.body]], axis=1)
+        inverse = rows.regularisation()
+        for b, some in _runs(contacts.env):
+            model, data = self._models[b], datas[b]
+            if not write_contacts(model, data, rows, some, geoms[some]):
+                failed[b] = True
+                continue
+            # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
+            mujoco.mj_makeConstraint(model, data)
+            write_constraint(data, inverse[some], rows.friction[some])
+            mujoco.mj_island(model, data)
+            mujoco.mj_projectConstraint(model, data)
+            mujoco.mj_referenceConstraint(model, data)
+            write_reference(data, inverse[some], rows.force[some], float(rows.step[some.start]))
+
+    def _after(
+        self,
+        datas: Sequence[mujoco.MjData],
+        envs: np.ndarray,
+        put: _Put,
+        failed: np.ndarray,
+    ) -> None:
+        """Read forces and let the gels shear by what bodies moved in the step."""
+        contacts, rows, turn = put.contacts, put.rows, put.turn
+        self._wrench[envs] = 0.0
+        force, moved = np.zeros((2, len(contacts), ROWS))
+        for b, some in _runs(contacts.env):
+            if failed[b]:
+                continue
+            data = datas[b]
+            force[some] = data.efc_force[-ROWS * (some.stop - some.start) :].reshape(-1, ROWS)
+            velocity = np.empty(data.nefc)
+            mujoco.mj_mulJacVec(self._models[b], data, velocity, data.qvel)
+            moved[some] = velocity[-ROWS * (some.stop - some.start) :].reshape(-1, ROWS)
+        at = contacts.env, contacts.pad, contacts.body
+        displacement = np.empty((len(contacts), 3))
+        displacement[:, :2] = (turn @ moved[:, 1:3, None])[..., 0] * rows.step[:, None]
+        displacement[:, 2] = moved[:, 3] * rows.step
+        limit = force[:, :1] * rows.friction[:, [0, 2]]
+        self._shear.move(at, displacement, limit, contacts.centre, put.radius)
+        self._acceleration[at] = (-moved[:, 0] - put.speed) / rows.step
+        axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
+        # MuJoCo's force is on the second body; the pad gets the opposite.
+        push = -(force[:, None, :3] @ axes)[:, 0]
+        torque = -(force[:, None, 3:] @ axes)[:, 0] + np.cross(contacts.centre, push)
+        np.add.at(self._wrench, (contacts.env, contacts.pad), np.concatenate([push, torque], axis=1))
+
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
-        return self._wrench[name].copy()
+        return self._wrench[:, list(self.pads).index(name)].copy()
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
         overlaps = []
-        for name, pad, _, pad_from_body in self._poses([data]):
+        for name, pad, pad_from_body in self._poses([data]):
             near = self._near(pad, pad_from_body)
             for i in np.flatnonzero(near[0]).tolist():
                 if pad.face.pierced(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))[0]:
-                    overlaps.append((name, self.bodies[i].spec.name, np.inf))
+                    overlaps.append((name, self.bodies[i].name, np.inf))
                     continue
                 touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
-                overlaps += [(name, self.bodies[i].spec.name, float(depth)) for depth in touches.depth]
+                overlaps += [(name, self.bodies[i].name, float(depth)) for depth in touches.depth]
         return overlaps
 
     def reading(
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
     ) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
-        pad, rows = self.pads[name], np.arange(len(datas)) if envs is None else np.asarray(envs)
-        datas, failed = [datas[b] for b in rows.tolist()], failed[rows]
-        if name not in self._shown or self._shown[name][0] is not grid:
-            self._shown[name] = grid, ElasticSurround(grid), float(grid.rest.max())
-        height = np.full((len(datas), *grid.shape), np.inf)
-        poses = np.full((len(datas), 4, 4), np.nan)
-        deepest, pressed = np.zeros(len(datas)), np.full(len(datas), -1)
-        highest = self._shown[name][2]
-        pad_from_body = _relative(site_poses(datas, pad.site)[:, None], body_poses(datas, self._body_index))
-        near = self._near(pad, pad_from_body) & ~failed[:, None]
-        for i in np.flatnonzero(near.any(axis=0)).tolist():
-            rows_near = np.flatnonzero(near[:, i])
-            under = object_height(self.bodies[i].parts, pad_from_body[rows_near, i], grid.x, grid.y, below=highest)
-            behind = under < -pad.spec.gelpad.thickness
-            if behind.any():
-                deep = np.flatnonzero(behind.any(axis=(1, 2)))
-                deep = deep[pad.face.pierced(self.bodies[i].parts, pad_from_body[rows_near[deep], i], float(self._radius[i]))]
-                under[behind] = np.inf
-                under[deep] = np.nan
-            depth = (grid.rest - under).max(axis=(1, 2))
-            deeper = depth > deepest[rows_near]
-            at = rows_near[deeper]
-            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at, i]
-            if len(rows_near) == len(datas):
-                height = np.minimum(height, under, out=under)
-            else:
-                height[rows_near] = np.minimum(height[rows_near], under)
-        height[failed] = np.nan
-        # From one body to another is no motion of either.
-        before = self._pressed[name][rows]
-        poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
-        self._pressed[name][rows] = np.where(failed, before, pressed)
-        surface = without_pierced(self._shown[name][1].surface(height, poses), pad.spec.gelpad)
-        failed = np.isnan(surface.height[:, 0, 0])
-        wrench = np.where(failed[:, None], np.nan, self._wrench[name][rows])
-        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench))
+        rows = np.arange(len(datas)) if envs is None else np.asarray(envs)
+        some = [datas[b] for b in rows.tolist()]
+        poses = _relative(site_poses(some, self.pads[name].site)[:, None], body_poses(some, self._body_index))
+        return self._surfaces.reading(name, grid, poses, self.wrench(name)[rows], failed[rows], rows)
 
     def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
-        """Every pad with ``world_from_pad`` (n, 4, 4) and ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
+        """Every pad with ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
         world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
         for k, (name, pad) in enumerate(self.pads.items()):
-            yield name, pad, world_from_pad[:, k], _relative(world_from_pad[:, k, None], world_from_body)
+            yield name, pad, _relative(world_from_pad[:, k, None], world_from_body)
 
     def _near(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
         """True (n, bodies) where bodies at poses (n, bodies, 4, 4) may reach the pad's box."""
-        at, radius = pad_from_body[..., :3, 3], self._radius
-        near = (at[..., 2] - radius < pad.highest) & (np.abs(at[..., :2]) - radius[:, None] < pad.reach).all(axis=-1)
-        if len(self._planes):
-            # A plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
-            normal, at = pad_from_body[:, self._planes][..., :3, 2], at[:, self._planes]
-            lowest = normal[..., 2] * pad.highest - np.abs(normal[..., :2]) @ pad.reach
-            near[:, self._planes] = lowest < np.vecdot(normal, at)
-        return near
+        return near_pad(pad.spec.gelpad, self._radius, self._planes, pad_from_body)
 
     def _pierced(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
         """True (n, bodies) where bodies at poses (n, bodies, 4, 4) lie beyond the pad's bonded face."""
@@ -252,127 +537,35 @@ class RigidPads:
         self, poses: Sequence[_PadPoses], envs: np.ndarray, before: dict[str, np.ndarray], failed: np.ndarray
     ) -> None:
         """Mark environments in which a body is beyond a pad's bonded face, or was on the path from ``before``, which is renewed."""
-        for name, pad, _, pad_from_body in poses:
+        for name, pad, pad_from_body in poses:
             was, beyond = before[name][envs], self._pierced(pad, pad_from_body)
             before[name][envs] = pad_from_body
             for i, body in enumerate(self.bodies):
                 radius, now, pierced = float(self._radius[i]), pad_from_body[:, i], beyond[:, i]
-                pieces = pad.face.pieces(was[:, i], now, radius)
+                pieces = pad.face.pieces(was[:, i] @ self._frame[i], now @ self._frame[i], radius)
                 for row in np.flatnonzero(pieces > 1).tolist():
                     path = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
                     path = path[self._near(pad, np.repeat(path[:, None], len(self.bodies), axis=1))[:, i]]
                     pierced[row] |= pad.face.pierced(body.parts, path, radius).any()
                 failed[envs[pierced]] = True
 
-    def _add_contacts(
-        self, poses: Sequence[_PadPoses], datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray
-    ) -> list[_Contact]:
-        """Put the pads' contacts among MuJoCo's; marks environments whose memory for contacts is full."""
-        contacts, models = [], self._models
-        weight = models.inverse_weight[envs]
-        for sensor, (name, pad, world_from_pad, pad_from_body) in enumerate(poses):
-            compliance = weight[:, pad.body, None] + weight[:, self._body_index]
-            # Where the compliance is 0 neither moves.
-            near = self._near(pad, pad_from_body) & (compliance > 0.0) & ~failed[envs][:, None]
-            for i in np.flatnonzero(near.any(axis=0)).tolist():
-                rows = np.flatnonzero(near[:, i])
-                touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[rows, i], float(self._radius[i]))
-                if not len(touches.env):
-                    continue
-                rows = rows[touches.env]
-                rotation, origin = world_from_pad[rows, :3, :3], world_from_pad[rows, :3, 3]
-                frames = _frames((rotation @ touches.normal[..., None])[..., 0], rotation[..., 0])
-                places = (rotation @ touches.centre[..., None])[..., 0] + origin
-                contact = self._forms[name, i]
-                for k, (row, b) in enumerate(zip(rows.tolist(), envs[rows].tolist(), strict=True)):
-                    contact.frame[:], contact.pos[:] = frames[k], places[k]
-                    friction = float(models.friction_on_gel[b, i])
-                    if np.isnan(friction):
-                        friction = float(models.gel_friction[b, sensor])
-                    depth, softer = float(touches.depth[k]), float(models.gel_stiffness[b, sensor])
-                    law = self._law(b, name, i, touches, k)
-                    self._load(contact, depth, law, softer, float(compliance[row, i]), friction)
-                    if mujoco.mj_addContact(models[b], datas[b], contact) != 0:
-                        failed[b] = True
-                    else:
-                        contacts.append(_Contact(b, name, int(datas[b].ncon) - 1))
-        return contacts
-
-    def _law(self, env: int, name: str, i: int, touches: Touches, k: int) -> LoadLaw:
-        """Load law of a pad and a body, the k-th in contact; reused within a control step while it covers the depth."""
-        known = self._laws[env].get((name, i))
-        if known is None or touches.depth[k] > known[1]:
-            known = self._laws[env][name, i] = self.pads[name].overlap.law(touches, k), touches.known_depth(k)
-        return known[0]
-
-    def _form(self, name: str, i: int) -> mujoco.MjContact:
-        """Common part of all contacts between a pad and a body."""
-        contact, gel = mujoco.MjContact(), self.pads[name].gel
-        contact.includemargin, contact.dim, contact.exclude = 0.0, 6, 0
-        contact.solreffriction[:] = 0.0, -_SLIP_RATE / float(self.model.opt.timestep)
-        contact.geom1, contact.geom2 = gel, self._geom[i]
-        contact.geom[:] = gel, self._geom[i]
-        contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
-        return contact
-
-    def _load(
-        self, contact: mujoco.MjContact, depth: float, law: LoadLaw, factor: float, compliance: float, friction: float
-    ) -> None:
-        """Stiffness and friction of a contact, from gel to body; ``factor`` of the modulus, to which the law is proportional.
-
-        A contact of the direct form, stiffness s, impedance d, on a compliance A (MuJoCo's estimate of J M⁻¹ Jᵀ) is at rest a spring of
-        K = s / ((1 − d) A): see ``contact_solref``.
-        """
-        contact.dist = -depth
-        natural = factor * law.secant_stiffness(depth) * compliance
-        loss = min(max((_RATE / float(self.model.opt.timestep)) ** 2 / natural, 1e-3), 0.5)  # 1 − d
-        stiffness = natural * loss
-        contact.solimp[:] = 1.0 - loss, 1.0 - loss, 1e-3, 0.5, 2.0
-        contact.solref[:] = -stiffness, -2.0 * stiffness**0.5
-        radius = law.contact_radius(depth)
-        least = 1e-6  # MuJoCo wants them positive
-        rolling = max(3.0 / 16.0 * _HYSTERESIS * radius, least)
-        spin = max(3.0 * np.pi / 16.0 * friction * radius, least)
-        contact.friction[:] = max(friction, least), max(friction, least), spin, rolling, rolling
-
-    def _read_forces(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, touching: Sequence[_Contact]) -> None:
-        for wrench in self._wrench.values():
-            wrench[envs] = 0.0
-        local = np.empty(6)
-        for one in touching:
-            data = datas[one.env]
-            mujoco.mj_contactForce(self._models[one.env], data, one.index, local)
-            contact = data.contact[one.index]
-            to_world = contact.frame.reshape(3, 3).T
-            # MuJoCo's force is on the second body; the pad gets the opposite.
-            force, torque = -to_world @ local[:3], -to_world @ local[3:]
-            site = self.pads[one.sensor].site
-            # Place and force are of the start of this step, the site's too until the next step's kinematics.
-            rotation, origin = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
-            arm = contact.pos - origin
-            torque = torque + arm[_NEXT] * force[_AFTER] - arm[_AFTER] * force[_NEXT]
-            self._wrench[one.sensor][one.env] += np.concatenate([force @ rotation, torque @ rotation])
-
 
 def _relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
-    """``pad_from_body`` (…, 4, 4) of poses that broadcast to the latter's shape."""
-    away = world_from_body.copy()
+    """``pad_from_body`` (…, 4, 4) of poses that broadcast."""
+    away = np.broadcast_to(world_from_body, np.broadcast_shapes(world_from_pad.shape, world_from_body.shape)).copy()
     away[..., :3, 3] -= world_from_pad[..., :3, 3]
     back = np.swapaxes(world_from_pad[..., :3, :3], -1, -2)
     away[..., :3, :] = back @ away[..., :3, :]
     return away
 
 
-def _frames(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Rows of right-handed frames whose first is ``normal`` (n, 3) and whose second is near ``along``, (n, 9)."""
-    second = along - np.vecdot(along, normal)[:, None] * normal
-    second /= np.sqrt(np.vecdot(second, second))[:, None]
-    third = normal[:, _NEXT] * second[:, _AFTER] - normal[:, _AFTER] * second[:, _NEXT]
-    return np.concatenate([normal, second, third], axis=1)
+def _turned(vectors: np.ndarray, target_from_source: np.ndarray) -> np.ndarray:
+    """Vectors (…, 3) of the target frame in the source's, by rotations (…, 3, 3)."""
+    return (vectors[..., None, :] @ target_from_source)[..., 0, :]
 
 
-def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:
-    """Total forces of the pads distributed over their contacts (see ``foundation_traction``)."""
-    x, y = np.nan_to_num(surface.contact_centre).T
-    twist = wrench[:, 5] - (x * wrench[:, 1] - y * wrench[:, 0])
-    return foundation_traction(surface, wrench[:, :3], twist)
+def _runs(envs: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """Environments of sorted rows, and the rows of each."""
+    bounds = [*np.flatnonzero(np.diff(envs, prepend=-1)).tolist(), len(envs)]
+    for start, stop in pairwise(bounds):
+        yield int(envs[start]), slice(start, stop)

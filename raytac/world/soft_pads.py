@@ -32,10 +32,10 @@ from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.press import PADS
 from raytac.specs.task import PAIR_FRICTION, TaskScene
-from raytac.world.compose import ComposedScene
 from raytac.world.coupling import Coupling, coupling_inputs
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import Inside, RobotOverlap
+from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["SoftPads"]
@@ -57,7 +57,7 @@ class SoftPads:
 
     def __init__(
         self,
-        composed: ComposedScene,
+        composed: WorldModel,
         models: EnvironmentModels,
         datas: Sequence[mujoco.MjData],
         *,
@@ -73,16 +73,18 @@ class SoftPads:
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model, self._models = composed, composed.model, models
-        scene, level = composed.scene, physics.level or PADS[0]
+        assert composed.scene is not None, "a world of one's own has rigid pads"
+        self._scene, level = composed.scene, physics.level or PADS[0]
+        scene = self._scene
         pads = [
             ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), correction=physics.correction)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
         self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
         self._sites = [int(self.model.site(m.site).id) for m in composed.sensors]
-        self._own = [b for b in composed.bodies.values() if b.mocap >= 0]
+        self._own = [b for b in composed.touched if b.mocap >= 0]
         """Bodies that belong to the solver."""
-        self._driven = [b for b in composed.bodies.values() if b.is_free]
+        self._driven = [b for b in composed.touched if b.is_free]
         """Bodies that belong to MuJoCo."""
         bodies = [_solver_body(scene, i) for i in range(len(scene.bodies))]
         starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
@@ -104,11 +106,11 @@ class SoftPads:
         self._coupling = None
         if coupling == "two_way":
             felt = self._links + [b.index for b in self._driven]
-            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.spec.name for b in self._driven)], felt, strict=True))
+            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.name for b in self._driven)], felt, strict=True))
             self._coupling = Coupling(self.model, felt, len(datas))
             self._prepare_bonded()
         self._last_cases = self._pad_poses(datas)
-        self._last_driven = {b.spec.name: np.stack([starts[b.spec.name]] * len(datas)) for b in self._driven}
+        self._last_driven = {b.name: np.stack([starts[b.name]] * len(datas)) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
         self._unconverged = np.zeros(len(datas), int)
@@ -125,7 +127,7 @@ class SoftPads:
             OverlapError: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
         cases, chosen = self._pad_poses(datas), list(envs)
-        begin = {b.name: pose_of(b.position, b.quaternion) for b in self.composed.scene.bodies}
+        begin = {b.name: pose_of(b.position, b.quaternion) for b in self._scene.bodies}
         starts = {name: np.repeat(at[None], len(datas), axis=0) for name, at in begin.items()}
         for name, at in (bodies or {}).items():
             starts[name][chosen] = at
@@ -139,7 +141,7 @@ class SoftPads:
         for b in envs:
             self._last_cases[b] = cases[b]
             for body in self._driven:
-                self._last_driven[body.spec.name][b] = starts[body.spec.name][b]
+                self._last_driven[body.name][b] = starts[body.name][b]
             self._unconverged[b] = 0
             for wrench in self._wrench.values():
                 wrench[b] = 0.0
@@ -158,7 +160,7 @@ class SoftPads:
         Raises:
             InputError: the only environment moves too fast; it has failed then, until it is reset.
         """
-        scene = self.composed.scene
+        scene = self._scene
         interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
         steps = round(scene.control_timestep / scene.timestep)
         for step in range(1, steps + 1):
@@ -217,7 +219,7 @@ class SoftPads:
 
     def _prepare_bonded(self) -> None:
         """Invert the stiffness of bonded soft bodies here, not in the step that first touches them (see ``coupling_inputs``)."""
-        scene = self.composed.scene
+        scene = self._scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
                 continue
@@ -243,7 +245,7 @@ class SoftPads:
     def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """MuJoCo's poses of cases and of its own bodies; an environment that failed keeps its last ones."""
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        now = {body.spec.name: body_poses(datas, body.index) for body in self._driven}
+        now = {body.name: body_poses(datas, body.index) for body in self._driven}
         return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
 
     def _follow(
@@ -273,11 +275,11 @@ class SoftPads:
 
     def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
         """Set the mocap bodies to the poses of the solver's bodies."""
-        self._show(datas, envs, {body.spec.name: self.soft.pose(body.spec.name) for body in self._own})
+        self._show(datas, envs, {body.name: self.soft.pose(body.name) for body in self._own})
 
     def _show(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray, poses: Mapping[str, np.ndarray]) -> None:
         for body in self._own:
-            at = poses[body.spec.name]
+            at = poses[body.name]
             for b in envs:
                 datas[b].mocap_pos[body.mocap] = at[b, :3, 3]
                 datas[b].mocap_quat[body.mocap] = quaternion(at[b, :3, :3])

@@ -1,4 +1,4 @@
-"""``TactileWorld``: a task scene, stepped by MuJoCo with its pads, and read by tactile sensors."""
+"""``TactileWorld``: a task scene or a MuJoCo model of one's own, stepped with its pads, and read by tactile sensors."""
 
 from __future__ import annotations
 
@@ -27,12 +27,16 @@ from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
 from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.pads import WORLD_PADS, WorldPads
+from raytac.world.sensor_frames import SensorFrames
+from raytac.world.world_model import WorldModel, compiled_model, own_world_model
 from raytac.world.world_state import BatchController, Control, Drive, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
     from raytac.optics.base import OpticsConfig
     from raytac.physics.soft.scene import SoftScene
+    from raytac.robots.mount import SensorChoice
+    from raytac.world.touched import TouchChoice
 
 __all__ = ["TactileWorld"]
 
@@ -53,8 +57,14 @@ class TactileWorld:
             state = world.step(world.hold)
         frame = world.observe()["sensor"]  # only now are images and markers computed
 
+        mount(spec, "gelsight_mini", site="left_tip", name="left")  # on a MuJoCo model of your own
+        world = TactileWorld(spec, touches=["cube"], control_timestep=0.02, num_envs=8)
+
+    A model of one's own keeps its options, and moves to the bit as MuJoCo alone moves it while no pad is touched. Only MuJoCo's automatic
+    reset is disabled, since an environment that breaks down is marked in ``failed``. The model is copied.
+
     Attributes:
-        scene: the task scene.
+        scene: the task scene; None of a model of one's own.
         physics: configuration that is used.
         model, data: MuJoCo's model of the scene, and its state in every environment.
         models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
@@ -64,8 +74,13 @@ class TactileWorld:
 
     def __init__(
         self,
-        scene: str | Path | TaskScene,
+        scene: str | Path | TaskScene | mujoco.MjSpec | mujoco.MjModel,
         *,
+        sensors: SensorChoice | None = None,
+        touches: TouchChoice | None = None,
+        control_timestep: float | None = None,
+        keyframe: str | None = None,
+        allow_overlap: Sequence[str] = (),
         physics: str | PhysicsConfig | None = None,
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
@@ -80,7 +95,15 @@ class TactileWorld:
         """Compose the scene and put it at its start; sensors are made on first use.
 
         Args:
-            scene: name of a shipped task scene, path of a scene file, or a scene.
+            scene: name of a shipped task scene, path of a scene file, or a scene; or a ``MjSpec`` or ``MjModel`` with sensors that
+                ``raytac.mount`` put on it. The next five are of such a model.
+            sensors: names of sensors, results of ``mount``, or a mapping of names to sensors, which a model needs whose sensors were
+                mounted as specifications; None is every sensor that the model says it has.
+            touches: names of bodies that pads touch, or of single geoms; a mapping has their friction coefficients against gel. None is
+                every body with a free joint. Of a body the geoms that collide in MuJoCo are sensed; meshes as they are, not their hulls.
+            control_timestep: of one ``step`` [s], a whole multiple of the model's timestep; None is one timestep.
+            keyframe: name of the keyframe that is the start; None is ``qpos0``.
+            allow_overlap: names of geoms in which a gel may lie at the start.
             physics: name or configuration, as ``TactileSensor`` takes it; None is as the scene says, else ``rigid``.
             coupling: ``two_way`` or ``one_way``; None is as the scene says. The rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
@@ -89,7 +112,9 @@ class TactileWorld:
             pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
 
         Raises:
-            InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses.
+            InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses. Of a model of one's
+                own also: no sensor, nothing to touch, a mesh that is not closed, a gel inside the robot, a pyramidal friction cone or
+                the integrator ``RK4``, with which a pad's contact would not follow the gel's law (see ``own_world_model``).
             SpecError: the scene breaks a rule.
             BackendError: the solver or a renderer is not installed.
         """
@@ -97,25 +122,42 @@ class TactileWorld:
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         if coupling is not None:
             check_known("coupling", coupling, COUPLINGS)
-        self.scene = scene if isinstance(scene, TaskScene) else load_task(scene)
-        self.physics = scene_physics(asked, self.scene)
+        own = {"sensors": sensors, "touches": touches, "control_timestep": control_timestep, "keyframe": keyframe}
+        own["allow_overlap"] = allow_overlap or None
+        is_own = isinstance(scene, (mujoco.MjSpec, mujoco.MjModel))
+        for given, value in own.items():
+            if value is not None and not is_own:
+                raise InputError(given, value=value, rule="is for a MjSpec or MjModel: a task scene says this itself")
+        self.scene = None if is_own else scene if isinstance(scene, TaskScene) else load_task(scene)
+        self.physics = (asked or PHYSICS.config("rigid")) if self.scene is None else scene_physics(asked, self.scene)
         name = PHYSICS.name_of(self.physics)
         if name not in WORLD_PADS.names:
             raise InputError("physics", value=name, rule="has pads for presses only, none for worlds", choices=WORLD_PADS.names)
-        self.coupling = coupling or self.scene.coupling
+        if is_own and self.physics.is_simulated:
+            rule = "needs a task scene: bodies of a model of one's own meet rigid pads"
+            raise InputError("physics", value=name, rule=rule, choices=("rigid",))
+        self.coupling = coupling or (COUPLINGS[0] if self.scene is None else self.scene.coupling)
         self.num_envs, self.device, self.seed = num_envs, device, seed
-        self._sensor_settings: dict[str, Any] = {
-            "outputs": outputs,
-            "markers": markers,
-            "optics": optics,
-            "resolution": resolution,
-            "device": device,
-            "num_envs": num_envs,
-            "physics": self.physics,
-            "pitch": pitch,
-        }
-        self._sensors: dict[str, TactileSensor] = {}
-        self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
+        self.composed: WorldModel
+        if isinstance(scene, (mujoco.MjSpec, mujoco.MjModel)):
+            model = copy(compiled_model(scene))
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+            self.composed = own_world_model(model, **{**own, "allow_overlap": allow_overlap})
+        else:
+            assert self.scene is not None
+            self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
+        self._frames = SensorFrames(
+            self.composed.sensors,
+            num_envs=num_envs,
+            seed=seed,
+            outputs=outputs,
+            markers=markers,
+            optics=optics,
+            resolution=resolution,
+            device=device,
+            physics=self.physics,
+            pitch=pitch,
+        )
         self.model = self.composed.model
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.models = EnvironmentModels(self.composed, num_envs)
@@ -133,10 +175,7 @@ class TactileWorld:
     @property
     def sensors(self) -> dict[str, TactileSensor]:
         """Every sensor by its name, made on first use."""
-        for i, (mounted, spec) in enumerate(zip(self.composed.sensors, self.composed.sensor_specs, strict=True)):
-            if mounted.name not in self._sensors:
-                self._sensors[mounted.name] = TactileSensor(spec, seed=self.seed + i, **self._sensor_settings)
-        return self._sensors
+        return self._frames.sensors
 
     @property
     def soft(self) -> SoftScene | None:
@@ -146,7 +185,7 @@ class TactileWorld:
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the sensors, without making them."""
-        return tuple(mounted.name for mounted in self.composed.sensors)
+        return self._frames.names
 
     def reset(
         self,
@@ -161,7 +200,7 @@ class TactileWorld:
         Args:
             envs: n environments.
             joints: other starts of the arm's joints (n, joints) [rad or m].
-            bodies: other starts of free bodies: name to ``world_from_body`` (n, 4, 4).
+            bodies: other starts of free bodies and of mocap bodies: name to ``world_from_body`` (n, 4, 4).
             variation: differences of these environments from the scene from now on. None keeps the present ones, ``Variation()`` removes
                 them.
 
@@ -175,7 +214,7 @@ class TactileWorld:
         starts = {
             name: self._checked_start(f"bodies[{name!r}]", poses, (len(chosen), 4, 4)) for name, poses in (bodies or {}).items()
         }
-        free = [name for name, body in self.composed.bodies.items() if body.spec.dynamics == "free"]
+        free = [name for name, body in self.composed.bodies.items() if body.is_placed]
         for name in starts:
             if name not in free:
                 raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=free)
@@ -190,9 +229,7 @@ class TactileWorld:
             self._pads.reset(chosen, self.data)
         else:
             self._start_elsewhere(chosen, joints, starts, variation)
-        for sensor in self._sensors.values():
-            if sensor.markers is not None:
-                sensor.reset_markers(chosen)
+        self._frames.reset(chosen)
         return self.state()
 
     def _start_elsewhere(
@@ -236,20 +273,21 @@ class TactileWorld:
         """MuJoCo's part of a reset."""
         for row, b in enumerate(envs):
             data = self.data[b]
-            mujoco.mj_resetData(self.models[b], data)
-            data.qpos[:], data.ctrl[:] = self.composed.start, self.composed.ctrl
+            self.composed.reset(self.models[b], data)
             if joints is not None and self.arm is not None:
                 data.qpos[self.arm.qpos] = joints[row]
             for name, poses in (bodies or {}).items():
                 body = self.composed.bodies[name]
-                if body.is_free:  # a body of the solver is mirrored once the solver has reset it
+                if body.is_free:
                     data.qpos[body.qpos : body.qpos + 3] = poses[row, :3, 3]
                     data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(poses[row, :3, :3])
+                else:  # the solver's own bodies are mirrored here again once it has reset them
+                    data.mocap_pos[body.mocap], data.mocap_quat[body.mocap] = poses[row, :3, 3], quaternion(poses[row, :3, :3])
             mujoco.mj_forward(self.models[b], data)
             self._failed[b] = False
 
     def step(self, control: Control | None = None) -> WorldState:
-        """Advance every environment by ``scene.control_timestep``.
+        """Advance every environment by the control timestep of the scene or the model.
 
         Args:
             control: controllers of the actuators (see ``Control``); None is ``hold``.
@@ -268,7 +306,9 @@ class TactileWorld:
         return self._failed.copy()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
-        """Controller that keeps the robot at its start."""
+        """Controller that keeps the robot of a scene at its start; a model of one's own keeps its present controls."""
+        if self.scene is None:
+            return
         data.ctrl[:] = self.composed.ctrl
         if self._law is not None and self.arm is not None:
             self.arm.drive(data, self._law.torque(data, self.composed.start[self.arm.qpos]).torque)
@@ -299,20 +339,9 @@ class TactileWorld:
         Raises:
             InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
-        rows = None if envs is None else chosen_envs(envs, self.num_envs)
-        if rows is not None and not rows:
-            raise InputError("envs", value=envs, rule="must name one environment or more")
-        chosen = self.sensor_names if sensors is None else tuple(sensors)
-        for name in chosen:
-            if name not in self.sensor_names:
-                raise InputError("sensors", value=name, rule="must be a sensor of the scene", choices=self.sensor_names)
-        frames = {}
-        for name in chosen:
-            sensor = self.sensors[name]
-            reading = self._pads.reading(name, sensor.grid, self.data, self._failed, rows)
-            self._failed[slice(None) if rows is None else rows] |= reading.failed
-            frames[name] = sensor.update(reading, rows)
-        return frames
+        return self._frames.observe(
+            lambda name, grid, rows: self._pads.reading(name, grid, self.data, self._failed, rows), self._failed, sensors, envs
+        )
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or of a soft pad: vertices (B, n, 3) [m], world frame, and faces (F, 3).
@@ -322,8 +351,8 @@ class TactileWorld:
         if self._pads.soft is not None and name in self._pads.meshes:
             return self._pads.soft.mesh(name)
         body = self.composed.bodies.get(name)
-        if body is None or body.spec.kind == "plane":
-            there = [n for n, b in self.composed.bodies.items() if b.spec.kind != "plane"]
+        if body is None or body.is_plane:
+            there = [n for n, b in self.composed.bodies.items() if not b.is_plane]
             there += self._pads.meshes
             rule = "must be the name of a body or a soft pad, and no half-space"
             raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
@@ -366,14 +395,16 @@ class TactileWorld:
         return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
     def _check_start(self) -> None:
-        """Raise ``InputError`` for a start in which bodies overlap."""
+        """Raise ``InputError`` for a start in which bodies overlap; a model of one's own may start in contact, but not through a pad."""
         data, model = self.data[0], self.model
         for contact in data.contact[: data.ncon]:
-            if contact.dist < -_OVERLAP:
+            if contact.dist < -_OVERLAP and self.scene is not None:
                 names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
                 rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
                 raise InputError("bodies", value=tuple(names), rule=rule)
         for sensor, body, depth in self._pads.overlap(data):
-            if depth > _OVERLAP:
+            if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
+                if np.isinf(depth):
+                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to"
                 raise InputError("body", value=body, rule=rule)

@@ -11,7 +11,7 @@ import pytest
 from experiments import bench_rl as bench
 from experiments import soak
 from raytac.envs import batch as env_batch
-from raytac.errors import InputError
+from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import read_metrics
 from tests.clock import steady_clock
 
@@ -84,3 +84,44 @@ def test_a_soak_run_sees_what_is_not_finite_and_what_grows() -> None:
     assert found["env_steps_per_s"] == pytest.approx(20.0)
     made_once = [soak.Block(0, 10, 1, 0, 0, 0.5, m) for m in (100.0, *[150.0] * 18, 151.0)]
     assert soak.summary(made_once)["memory_growth_mb"] == 1.0
+
+
+def test_two_checkouts_take_turns_and_the_ratio_is_the_median_of_the_rounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Figures come from the scripts of both; the order changes from round to round, which a machine that slows down would show."""
+    other, ours = tmp_path / "other", Path(bench.__file__).resolve().parents[1]
+    (other / "experiments").mkdir(parents=True)
+    (other / "experiments" / "bench_rl.py").write_text("")
+    calls: list[Path] = []
+    speeds = {ours: iter([30.0, 20.0, 90.0]), other: iter([10.0, 10.0, 10.0])}
+
+    def figure_of(checkout: Path, mode: str, args: bench.Args) -> float:
+        calls.append(checkout)
+        return next(speeds[checkout])
+
+    monkeypatch.setattr(bench, "figure_of", figure_of)
+    found = bench.main(bench.Args(out=tmp_path / "out", device="cpu", modes="fots", against=other, rounds=3))
+    assert calls == [ours, other, other, ours, ours, other]
+    name = found["against"]
+    assert found[f"push.fots.speedup_vs_{name}"] == 3.0 and found["push.fots.speedup_most"] == 9.0
+    assert read_metrics(tmp_path / "out" / "metrics.json")["push.fots.env_steps_per_s"] == 30.0
+
+
+def test_a_checkout_runs_its_own_script_in_a_process_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "experiments").mkdir()
+    script = tmp_path / "experiments" / "bench_rl.py"
+    script.write_text(
+        "import json, os, pathlib, sys\n"
+        "assert os.environ['PYTHONPATH'] == os.getcwd()\n"
+        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir(parents=True)\n"
+        "values = {'experiment': 'x', 'device': 'cpu', 'seed': 0, 'wall_s': 1.0, 'versions.x': '1', 'push.fots.env_steps_per_s': 7.0}\n"
+        "(out / 'metrics.json').write_text(json.dumps(values))\n"
+    )
+    args = bench.Args(device="cpu", against=tmp_path)
+    assert bench.figure_of(tmp_path, "fots", args) == 7.0
+    script.write_text("raise SystemExit('broken on purpose')")
+    with pytest.raises(RaytacError, match="broken on purpose"):
+        bench.figure_of(tmp_path, "fots", args)
+    with pytest.raises(InputError, match="checkout"):
+        bench.main(bench.Args(device="cpu", out=tmp_path / "out", against=tmp_path / "nowhere"))

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from raytac.errors import InputError
-from raytac.robots.mount import case_depth, mount_sensor, standing_on
+from raytac.errors import InputError, SpecError
+from raytac.robots.mount import case_depth, mount, mounted_sensors, standing_on
 from raytac.se3 import pose, pose_error, quaternion, rotation_vector
 from raytac.specs.sensor_file import load_sensor
 
@@ -30,19 +30,21 @@ def world_from(data: mujoco.MjData, element) -> np.ndarray:
     return pose(element.xmat.reshape(3, 3), element.xpos)
 
 
-@pytest.mark.parametrize(("at", "kind"), [("base", None), ("tip", None), ("tool", "body"), ("tool", "site")])
+@pytest.mark.parametrize(("at", "kind"), [("base", "body"), ("tip", "site"), ("tool", "body"), ("tool", "site")])
 def test_the_pad_frame_lies_where_it_was_put(at, kind):
-    sensor, spec = load_sensor("gelsight_mini"), mujoco.MjSpec.from_string(ROBOT)
+    spec = mujoco.MjSpec.from_string(ROBOT)
     placed = pose(rotation(3), np.array([0.01, -0.02, 0.05]))
-    mounted = mount_sensor(spec, sensor, at, placed, kind=kind)
+    mounted = mount(spec, "gelsight_mini", pose=placed, **{kind: at})
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = 0.3, -0.7
     mujoco.mj_forward(model, data)
-    anchor = data.site(at) if kind == "site" or at == "tip" else data.body(at)
+    anchor = data.site(at) if kind == "site" else data.body(at)
     expected = world_from(data, anchor) @ placed
     np.testing.assert_allclose(mounted.world_from_pad(data), expected, atol=1e-9)
     np.testing.assert_allclose(world_from(data, data.body(mounted.body)), expected, atol=1e-9)
+    np.testing.assert_allclose(world_from(data, data.site(mounted.nominal)), expected, atol=1e-9)
+    assert model.site(mounted.nominal).bodyid != model.body(mounted.body).id
 
 
 def test_case_and_gel_have_the_sensors_size_and_weight():
@@ -50,7 +52,7 @@ def test_case_and_gel_have_the_sensors_size_and_weight():
     sensor, spec = load_sensor("gelsight_mini"), mujoco.MjSpec.from_string(ROBOT)
     before = spec.compile().body_mass.sum()
     spec = mujoco.MjSpec.from_string(ROBOT)
-    mounted = mount_sensor(spec, sensor, "base")
+    mounted = mount(spec, sensor, body="base")
     model = spec.compile()
     case, gel = model.geom(mounted.case), model.geom(mounted.gel)
     np.testing.assert_allclose(2 * case.size[:2], (0.032, 0.028), atol=1e-12)
@@ -62,13 +64,13 @@ def test_case_and_gel_have_the_sensors_size_and_weight():
     expected = 0.032 * 0.028 * (case_depth(sensor) - 0.004) * 1000 + 0.02525 * 0.02075 * 0.004 * 1000
     assert model.body_mass.sum() - before == pytest.approx(expected, rel=1e-9)
     spec = mujoco.MjSpec.from_string(ROBOT)
-    mount_sensor(spec, sensor, "base", mass=0.05)
+    mount(spec, sensor, body="base", mass=0.05)
     assert spec.compile().body_mass.sum() - before == pytest.approx(0.05, rel=1e-9)
 
 
 def test_a_sensor_stands_on_its_mount_by_default():
     sensor, spec = load_sensor("gelsight_mini"), mujoco.MjSpec.from_string(ROBOT)
-    mounted = mount_sensor(spec, sensor, "base")
+    mounted = mount(spec, sensor, body="base")
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -79,45 +81,91 @@ def test_a_sensor_stands_on_its_mount_by_default():
 
 def test_several_sensors_of_several_kinds_share_a_robot():
     spec = mujoco.MjSpec.from_string(ROBOT)
-    first = mount_sensor(spec, load_sensor("gelsight_mini"), "tip", name="left")
-    second = mount_sensor(spec, load_sensor("gelsight_dome"), "base", name="right")
+    first = mount(spec, "gelsight_mini", site="tip", name="left")
+    second = mount(spec, load_sensor("gelsight_dome"), body="base", name="right")
     model = spec.compile()
     names = [getattr(s, f) for s in (first, second) for f in ("body", "site", "case", "gel")]
     assert len(set(names)) == 8
     assert model.body(first.body).parentid != model.body(second.body).parentid
     with pytest.raises(InputError, match="name = 'left': must be new: the robot has a body 'left_body'"):
-        mount_sensor(spec, load_sensor("gelsight_mini"), "base", name="left")
+        mount(spec, "gelsight_mini", body="base", name="left")
 
 
 def test_what_cannot_be_mounted_is_refused():
-    sensor = load_sensor("gelsight_mini")
+    def put(**options):
+        mount(mujoco.MjSpec.from_string(ROBOT), "gelsight_mini", **({"body": "base"} | options))
 
-    def mount(at="base", *arguments, **options):
-        mount_sensor(mujoco.MjSpec.from_string(ROBOT), sensor, at, *arguments, **options)
-
-    with pytest.raises(InputError, match=r"at = 'tpi': must be the name of a body or site.*did you mean 'tip'\?.*base.*tool"):
-        mount("tpi")
-    with pytest.raises(InputError, match=r"must be the name of a body of the robot"):
-        mount("tip", kind="body")
-    with pytest.raises(InputError, match=r"at = 'tool': is the name of a body and of a site"):
-        mount("tool")
-    with pytest.raises(InputError, match=r"kind = 'geom'"):
-        mount(kind="geom")
-    with pytest.raises(InputError, match=r"mount_from_pad .*shape \(4, 4\)"):
-        mount("base", np.eye(3))
-    with pytest.raises(InputError, match=r"mount_from_pad .*determinant"):
-        mount("base", np.diag([1.0, 1.0, -1.0, 1.0]))
-    with pytest.raises(InputError, match=r"mount_from_pad .*finite"):
-        mount("base", np.full((4, 4), np.nan))
-    with pytest.raises(InputError, match=r"mount_from_pad .*last row"):
-        mount("base", np.ones((4, 4)))
+    with pytest.raises(InputError, match=r"site = 'tpi': must be the name of a site.*did you mean 'tip'\?.*tip, tool"):
+        put(site="tpi", body=None)
+    with pytest.raises(InputError, match=r"body = 'tip': must be the name of a body of the robot.*base, tool"):
+        put(body="tip")
+    for both in ({"site": "tip"}, {"body": None}):
+        with pytest.raises(InputError, match=r"one of the two"):
+            put(**both)
+    with pytest.raises(InputError, match=r"pose .*shape \(4, 4\)"):
+        put(pose=np.eye(3))
+    with pytest.raises(InputError, match=r"pose .*determinant"):
+        put(pose=np.diag([1.0, 1.0, -1.0, 1.0]))
+    with pytest.raises(InputError, match=r"pose .*finite"):
+        put(pose=np.full((4, 4), np.nan))
+    with pytest.raises(InputError, match=r"pose .*last row"):
+        put(pose=np.ones((4, 4)))
     with pytest.raises(InputError, match=r"name = ''"):
-        mount(name="")
+        put(name="")
+    with pytest.raises(InputError, match=r"collide = 1"):
+        put(collide=1)
     for mass in (0.0, -1.0, 1e-4, np.inf, np.nan):
         with pytest.raises(InputError, match=r"mass = "):
-            mount(mass=mass)
+            put(mass=mass)
+    with pytest.raises(SpecError, match=r"gelsight_mni.*did you mean 'gelsight_mini'"):
+        mount(mujoco.MjSpec.from_string(ROBOT), "gelsight_mni", body="base")
     with pytest.raises(InputError, match=r"must be a mujoco.MjSpec"):
-        mount_sensor(mujoco.MjModel.from_xml_string(ROBOT), sensor, "base")
+        mount(mujoco.MjModel.from_xml_string(ROBOT), "gelsight_mini", body="base")
+
+
+def test_a_compiled_model_knows_its_sensors_through_xml_and_prefixes():
+    hand, dome = mujoco.MjSpec.from_string(ROBOT), load_sensor("gelsight_dome")
+    left = mount(hand, "gelsight_mini_9x11", site="tip", name="left")
+    right = mount(hand, dome, body="base", name="right")
+    model = mujoco.MjModel.from_xml_string(hand.to_xml())
+    assert mounted_sensors(model, ["left"]) == (left,) and mounted_sensors(model, [right]) == (right,)
+    assert mounted_sensors(model, {"right": "gelsight_dome", "left": left.spec}) == (right, left)
+    arm = mujoco.MjSpec.from_string("<mujoco><worldbody><body name='flange'/></worldbody></mujoco>")
+    arm.attach(hand, prefix="hand/", frame=arm.body("flange").add_frame())
+    attached = arm.compile()
+    (found_left,) = mounted_sensors(attached, ["hand/left"])
+    assert found_left.gel == "hand/left_gel" and found_left.spec == left.spec
+    for given, text in (
+        (None, r"'right'.*was mounted as a specification.*say sensors=\{'right': specification\}"),
+        (["lift"], "must be a sensor of the model; did you mean 'left'"),
+        (["left", left], "must not name a sensor twice"),
+        ("left", "must be names"),
+        ([3], "must be a name or a result of mount"),
+        ([], "one sensor or more.*choose from: left, right"),
+        ({"middle": "gelsight_mini"}, "has no body 'middle_body'"),
+    ):
+        with pytest.raises(InputError, match=text):
+            mounted_sensors(model, given)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"put some on the MjSpec with raytac\.mount"):
+        mounted_sensors(mujoco.MjModel.from_xml_string(ROBOT))
+
+
+def test_a_gel_that_collides_carries_a_ball_about_as_deep_as_the_gel():
+    """A ball of 50 g, one contact point, in MuJoCo alone: m g / (2 E* a) to a factor of two, and the gel's friction."""
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body pos='0 0 0.005'><freejoint/><geom size='.005' mass='.05'/></body></worldbody></mujoco>"
+    )
+    sensor = load_sensor("gelsight_mini_9x11")
+    mounted = mount(spec, sensor, body="world", pose=np.eye(4), collide=True)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(1000):
+        mujoco.mj_step(model, data)
+    gelpad = sensor.gelpad
+    expected = 0.05 * 9.81 / (2.0 * gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2) * 3e-3)
+    assert 0.5 * expected < 0.005 - data.qpos[2] < 2.0 * expected
+    assert data.ncon == 1 and model.geom(mounted.gel).id in data.contact.geom
+    np.testing.assert_allclose(data.contact.friction[:, 0], gelpad.friction)
 
 
 def test_a_pose_error_leads_from_one_pose_to_the_other():

@@ -277,7 +277,7 @@ def test_wrong_arguments_are_refused() -> None:
         with pytest.raises(InputError, match=rule):
             TactileWorld(UP, **options)
     world = TactileWorld(UP, outputs=())
-    with pytest.raises(InputError, match="must be a sensor of the scene"):
+    with pytest.raises(InputError, match="must be a sensor of the world"):
         world.observe(["left"])
     with pytest.raises(InputError, match=r"envs.*one environment or more"):
         world.observe(envs=[False])

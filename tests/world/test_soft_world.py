@@ -306,7 +306,7 @@ def test_two_way_is_one_way_for_a_stiff_arm_and_a_spring_for_a_soft_one(tmp_path
 def test_what_mujoco_lost_is_not_shown_and_sensors_are_made_when_asked_for() -> None:
     slide = replace(UP, robot=RobotSpec("floating_gripper", opening=0.04, position=(0.0, 0.0, 0.1)))
     world = TactileWorld(slide, outputs=("wrench",), num_envs=2)
-    assert not world._sensors
+    assert not world._frames._made
     world.data[0].qvel[0] = 1e9
     assert world.step().failed.tolist() == [True, False]
     surface = world.observe()[world.sensor_names[0]].surface

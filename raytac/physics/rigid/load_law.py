@@ -13,7 +13,18 @@ from raytac.shapes.part import Part
 from raytac.shapes.underside import object_bounds, object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["FirstTouch", "LoadLaw", "first_touch", "first_touch_z", "gap_at_touch", "layer_stiffening", "reduced_modulus"]
+__all__ = [
+    "FirstTouch",
+    "LoadLaw",
+    "first_touch",
+    "first_touch_z",
+    "gap_at_touch",
+    "hard_back",
+    "layer_stiffening",
+    "reduced_modulus",
+    "twist_stiffness",
+    "shear_stiffness",
+]
 
 
 _TABLE = 512
@@ -52,6 +63,46 @@ def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
     return np.minimum(stiffening, 1.0 + 0.5 * np.pi * confined / reduced_modulus(gelpad) * ratio)
 
 
+_HARD_FROM, _HARD_RISE = 0.2, 20.0
+"""Share of the gel's thickness below which its back is felt, and how fast: a choice, no measurement. With 20 a press at a tenth of the
+thickness takes 21 times the force of the layer."""
+
+
+def hard_back(depth: np.ndarray, limit: np.ndarray | float, thickness: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Factor of the load law near the bonded face, and its derivative by depth [1/m].
+
+    φ = 1 + 20 (0.2 / x − 1)² with x the share of the thickness that is left under the object's lowest point: 1 down to x = 0.2, without
+    bound as x goes to 0, and once continuously differentiable. So is the work that it takes without bound, and nothing goes through.
+
+    Args:
+        depth: [m].
+        limit: depth [m] at which the object's lowest point would be at the bonded face.
+        thickness: of the gel [m].
+    """
+    left = np.maximum((np.asarray(limit) - depth) / thickness, 1e-6)
+    above = np.maximum(_HARD_FROM / left - 1.0, 0.0)
+    return 1.0 + _HARD_RISE * above**2, 2.0 * _HARD_RISE * above * _HARD_FROM / (left**2 * thickness)
+
+
+def shear_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
+    """Tangential force per displacement [N/m] of contacts of ``radius`` [m].
+
+    8Ga/(2 − ν) of a half-space (Mindlin) plus GA/h of a sheared layer.
+    """
+    shear = _shear_modulus(gelpad)
+    return 8.0 * shear * radius / (2.0 - gelpad.poisson_ratio) + shear * np.pi * radius**2 / gelpad.thickness
+
+
+def twist_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
+    """Torque per angle [N m/rad]: 16Ga³/3 of a half-space (Reissner and Sagoci) plus GJ/h of a twisted layer."""
+    shear = _shear_modulus(gelpad)
+    return 16.0 / 3.0 * shear * radius**3 + shear * 0.5 * np.pi * radius**4 / gelpad.thickness
+
+
+def _shear_modulus(gelpad: GelpadSpec) -> float:
+    return 0.5 * gelpad.youngs_modulus / (1.0 + gelpad.poisson_ratio)
+
+
 class LoadLaw:
     """Normal force, contact radius and tangential stiffness against depth, from the gap between object and resting gel.
 
@@ -59,7 +110,8 @@ class LoadLaw:
     (Pharr, Oliver & Brotzen, J. Mater. Res. 7, 1992, 613) and within a few percent for other compact ones; here it is multiplied
     by ``layer_stiffening``. The area at depth δ is taken as that where the gap is below δ/2. This is exact for a paraboloid
     (πRδ, so Hertz's law on a half-space) and for a flat punch; a cone comes out with π/4 of Sneddon's force. Separate contacts
-    count as one of the same area. F is strictly increasing in δ and 0 at δ <= 0.
+    count as one of the same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at
+    δ <= 0.
     """
 
     def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
@@ -78,23 +130,43 @@ class LoadLaw:
         stiffness = 2.0 * reduced_modulus(gelpad) * self.radius * layer_stiffening(self.radius, gelpad)
         steps = 0.5 * (stiffness[1:] + stiffness[:-1]) * np.diff(self.depth)
         self.table = np.concatenate([[0.0], np.cumsum(steps)])
-        """Normal force of the table [N]."""
+        """Normal force of the table, without the hard back [N]."""
 
     @property
     def greatest(self) -> float:
-        """Force at the greatest depth [N]."""
-        return self.force(self.deepest)
+        """Greatest force of a press [N]: with a hundredth of the thickness left, where the hard back takes 7,000 times the layer's force."""
+        return self.force(self.deepest - 0.01 * self.thickness)
 
     def force(self, depth: float) -> float:
         """Normal force [N] at ``depth`` [m]; 0 out of contact."""
-        return float(np.interp(depth, self.depth, self.table))
+        factor, _ = hard_back(np.asarray(depth), self.deepest, self.thickness)
+        return float(np.interp(depth, self.depth, self.table) * factor)
 
     def depth_at(self, force: float) -> float:
-        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is deeper than ``deepest``."""
+        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is more than ``greatest``."""
         if force > self.greatest:
             rule = f"would press deeper than the pad is there: at most {self.greatest:.4g} N, {self.deepest * 1e3:.4g} mm deep"
             raise InputError("force", value=force, rule=rule)
-        return float(np.interp(force, self.table, self.depth))
+        low, high = self.hard_from, self.deepest
+        if force <= self.force(low):
+            return float(np.interp(force, self.table, self.depth))
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.force(middle) > force else (middle, high)
+        return 0.5 * (low + high)
+
+    @property
+    def hard_from(self) -> float:
+        """Depth [m] from which the gel's hard back is felt; 0 where there is less gel than that."""
+        return max(self.deepest - _HARD_FROM * self.thickness, 0.0)
+
+    def stiffest(self, force: float) -> float:
+        """Greatest incremental stiffness [N/m] of the layer at any depth, and of the hard back up to ``force`` [N]."""
+        stiffest = float((np.diff(self.table) / np.diff(self.depth)).max())
+        depth = self.depth_at(min(force, self.greatest))
+        if depth <= self.hard_from:
+            return stiffest
+        return max(stiffest, (self.force(depth) - self.force(depth - 1e-7)) * 1e7)
 
     @property
     def thickness(self) -> float:
@@ -111,18 +183,12 @@ class LoadLaw:
         return float(np.interp(depth, self.depth, self.radius)) if depth > 0.0 else 0.0
 
     def shear_stiffness(self, depth: float) -> float:
-        """Tangential force per displacement [N/m]: 8Ga/(2 − ν) of a half-space (Mindlin) plus GA/h of a sheared layer."""
-        a, shear = self.contact_radius(depth), self._shear_modulus
-        return 8.0 * shear * a / (2.0 - self._gelpad.poisson_ratio) + shear * np.pi * a**2 / self.thickness
+        """Tangential force per displacement [N/m] at ``depth`` [m], see ``shear_stiffness``."""
+        return float(shear_stiffness(np.asarray(self.contact_radius(depth)), self._gelpad))
 
     def twist_stiffness(self, depth: float) -> float:
-        """Torque per angle [N m/rad]: 16Ga³/3 of a half-space (Reissner and Sagoci) plus GJ/h of a twisted layer."""
-        a, shear = self.contact_radius(depth), self._shear_modulus
-        return 16.0 / 3.0 * shear * a**3 + shear * 0.5 * np.pi * a**4 / self.thickness
-
-    @property
-    def _shear_modulus(self) -> float:
-        return 0.5 * self._gelpad.youngs_modulus / (1.0 + self._gelpad.poisson_ratio)
+        """Torque per angle [N m/rad] at ``depth`` [m], see ``twist_stiffness``."""
+        return float(twist_stiffness(np.asarray(self.contact_radius(depth)), self._gelpad))
 
 
 _ZOOMS, _FINE = 4, 17

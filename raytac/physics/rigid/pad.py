@@ -111,7 +111,7 @@ class RigidPad(PressPad):
             touch, law = self._touch(b, x, y, 0.0)
         except InputError as error:
             raise self.targets.start_error(b, error) from error
-        stiffest = float((np.diff(law.table) / np.diff(law.depth)).max())
+        stiffest = law.stiffest(max((stage.force or 0.0 for stage in self.scene.trajectory), default=0.0))
         e = _Environment(np.array([x, y, touch]), self._rig(stiffest), shear=np.zeros(2))
         e.rig.place(e.origin, touch)
         e.rig.hold(np.array([0.0, 0.0, CLEARANCE, 0.0]), law.secant_stiffness)

@@ -1,0 +1,93 @@
+"""Normal contact as an implicit spring: the force of one step, linear in the speed at its end, by which it stays stable at any step.
+
+A contact of depth δ that closes at the speed w at the end of a step Δt carries
+
+    f = F(δ) + C w,   C = c K
+
+with K the incremental stiffness of the load law at the deeper end of the step and c >= Δt/2. At rest that is F(δ) exactly. A step takes
+at least the work from the bodies that the gel stores (F is convex and K its greatest slope in the step), so that energy does not grow.
+c is the gel's relaxation time τ (Kelvin and Voigt) where the step resolves the motion, and goes to Δt where it does not: backward Euler.
+
+MuJoCo's constraint obeys R f = a* − a with a the acceleration that opens the contact, (v + Δt a) = −w: R = 1 / (C Δt),
+a* = F(δ) / (C Δt) − v / Δt (``TangentLaw.regularisation``, docs/worlds.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytac.physics.rigid.contacts import LoadTables
+
+__all__ = ["NormalSpring", "contact_rate", "normal_spring"]
+
+_HALVINGS = 30
+
+
+@dataclass(frozen=True)
+class NormalSpring:
+    """Normal forces f = force + damping · w of n contacts in one step, w the speed [m/s] at its end at which they close."""
+
+    force: np.ndarray
+    """[N], (n,); negative of a gap that closes within the step."""
+    damping: np.ndarray
+    """C [N s/m], (n,); 0 where no contact is possible in this step."""
+    deepest: np.ndarray
+    """Depth [m] to which a free pair of bodies would close in the step, (n,)."""
+
+
+def contact_rate(stiffness: np.ndarray, inverse_mass: np.ndarray) -> np.ndarray:
+    """Angular frequency [1/s] of two bodies on the spring between them; ``inverse_mass`` [1/kg] is the sum of both."""
+    return np.sqrt(stiffness * inverse_mass)
+
+
+def normal_spring(
+    law: LoadTables,
+    depth: np.ndarray,
+    speed: np.ndarray,
+    inverse_mass: np.ndarray,
+    step: np.ndarray,
+    relaxation: np.ndarray,
+    fall: float,
+) -> NormalSpring:
+    """Spring of one step of n contacts.
+
+    Args:
+        law: load laws.
+        depth: δ [m]; negative is a gap.
+        speed: speed [m/s] at which contacts close at the start of the step.
+        inverse_mass: 1/m of both bodies [1/kg].
+        step: Δt [s].
+        relaxation: τ [s] of the gel.
+        fall: acceleration [m/s²] that may close a gap on top of its speed.
+    """
+    gap = depth <= 0.0
+    start, slope = law.force(depth)
+    quickest = np.where(gap, speed + fall * step, speed)
+    reach = depth + step * np.maximum(quickest, 0.0)
+    # The speed at the end of the step at which free bodies would close, by bisection: m (v − w) / Δt = f(w), f rising in w.
+    low, high = np.zeros_like(depth), np.maximum(quickest, 0.0)
+    some = reach > np.maximum(depth, 0.0) + 1e-7
+    end = reach
+    if some.any():
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            end = depth + step * middle
+            force, stiffness = law.force(end)
+            force = np.where(gap, force, start + stiffness * _time(stiffness, inverse_mass, step, relaxation) * middle)
+            above = (quickest - middle) < step * inverse_mass * force
+            low, high = np.where(above, low, middle), np.where(above, middle, high)
+        end = np.where(some, depth + step * high, reach)
+    force, stiffness = law.force(np.maximum(end, 0.0))
+    secant = force / np.where(end > 0.0, end, 1.0)
+    stiffness = np.maximum(stiffness, slope)
+    touching = stiffness * _time(stiffness, inverse_mass, step, relaxation)
+    closing = np.where(end > 0.0, secant * step, 0.0)
+    return NormalSpring(np.where(gap, secant * depth, start), np.where(gap, closing, touching), end)
+
+
+def _time(stiffness: np.ndarray, inverse_mass: np.ndarray, step: np.ndarray, relaxation: np.ndarray) -> np.ndarray:
+    """c [s]: the relaxation time, at least between Δt/2 of slow contacts and Δt of those whose own motion a step does not resolve."""
+    squared = stiffness * inverse_mass * step * step
+    return np.maximum(relaxation, step * (0.5 + 0.5 * squared / (1.0 + squared)))

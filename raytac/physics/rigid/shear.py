@@ -1,0 +1,108 @@
+"""Shear of the gel under contacts: elastic stretch with partial slip, and its memory.
+
+A contact of normal load N carries a tangential force by shearing first. Cattaneo and Mindlin's contact of two spheres obeys
+
+    T = μN (1 − (1 − u/u₀)^(3/2)),   u₀ = 3 μN / (2 k)
+
+with u the tangential displacement and k the stiffness without slip; its outer annulus slips, the disc of radius c = a (1 − T/μN)^(1/3)
+sticks. Here elements in parallel give that curve (W. D. Iwan, A distributed-element model for hysteresis, J. Appl. Mech. 33, 1966): each
+has its share of the stiffness and slips at its own displacement. They remember: unloading and reversal follow Masing's rule, as Mindlin
+and Deresiewicz' contact does (J. Appl. Mech. 20, 1953). Spin about the normal takes part by one ellipsoid with both displacements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["ELEMENTS", "ContactShear", "ShearState", "element_limits"]
+
+ELEMENTS = 8
+"""Elements in parallel of every contact, all of one stiffness."""
+
+
+def element_limits(count: int = ELEMENTS) -> np.ndarray:
+    """Displacements over u₀ at which the elements slip, (count,).
+
+    The slope of the curve, √(1 − u/u₀), is the share of the stiffness that still sticks; the elements' strengths add up to μN.
+    """
+    stuck = 1.0 - (np.arange(count) + 0.5) / count
+    limits = 1.0 - stuck**2
+    return limits * (2.0 / 3.0) / limits.mean()
+
+
+_LIMITS = element_limits()
+
+
+@dataclass(frozen=True)
+class ContactShear:
+    """Shear of one contact of each of B pads with the body that is deepest in it, pad frame; zeros out of contact."""
+
+    stretch: np.ndarray
+    """Mean elastic displacement of the gel's skin along the pad's x and y [m], (B, 2)."""
+    spin: np.ndarray
+    """Mean elastic rotation about the normal [rad], (B,)."""
+    stuck: np.ndarray
+    """Radius of the disc that sticks over the contact's, (B,): 0 slips as a whole."""
+    centre: np.ndarray
+    """Centre of the contact [m], (B, 3)."""
+
+
+class ShearState:
+    """Stretch of all contacts: one row for each environment, pad and body."""
+
+    def __init__(self, num_envs: int, pads: int, bodies: int) -> None:
+        shape = num_envs, pads, bodies
+        self.stretch = np.zeros((*shape, ELEMENTS, 3))
+        """Displacement [m] along two tangents and rotation [rad] about the normal, of every element."""
+        self.stiffness = np.zeros((*shape, 2))
+        """Shear and twist stiffness at the last step [N/m, N m/rad]; 0 out of contact."""
+        self.load = np.zeros((*shape, 2))
+        """Tangential force and torque at which the contact slips [N, N m]."""
+        self.centre = np.zeros((*shape, 3))
+
+    def clear(self, *rows: np.ndarray) -> None:
+        """Forget the contacts named by indices of environments, pads and bodies, or all of some environments."""
+        for values in vars(self).values():
+            values[rows] = 0.0
+
+    def begin(self, rows: tuple[np.ndarray, ...], stiffness: np.ndarray, centre: np.ndarray) -> np.ndarray:
+        """Elastic force along two tangents and torque about the normal, (n, 3), of contacts of shear and twist stiffness (n, 2).
+
+        ``centre`` (n, 3) [m] is where new ones start.
+
+        A contact that has grown since keeps its force, since new area comes without stress; one that has shrunk keeps its stretch.
+        """
+        before = self.stiffness[rows]
+        self.centre[rows] = np.where(before[:, :1] > 0.0, self.centre[rows], centre)
+        kept = np.minimum(before / stiffness, 1.0)[:, [0, 0, 1]]
+        self.stretch[rows] *= kept[:, None]
+        self.stiffness[rows] = stiffness
+        return stiffness[:, [0, 0, 1]] * self.stretch[rows].mean(axis=1)
+
+    def move(
+        self, rows: tuple[np.ndarray, ...], displacement: np.ndarray, limit: np.ndarray, centre: np.ndarray, radius: np.ndarray
+    ) -> None:
+        """Add a step's displacement (n, 3) and let elements slip.
+
+        ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact and its ``radius`` (n,)
+        [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
+        """
+        stretch = self.stretch[rows] + displacement[:, None]
+        largest = 1.5 * limit / np.maximum(self.stiffness[rows], 1e-30)
+        part = stretch / np.maximum(largest[:, None, [0, 0, 1]] * _LIMITS[None, :, None], 1e-30)
+        stretch /= np.maximum(np.sqrt(np.vecdot(part, part)), 1.0)[..., None]
+        travel = np.linalg.norm(centre - self.centre[rows], axis=1) - np.linalg.norm(displacement[:, :2], axis=1)
+        stretch *= np.exp(-np.maximum(travel, 0.0) / np.maximum(2.0 * radius, 1e-9))[:, None, None]
+        self.stretch[rows], self.load[rows], self.centre[rows] = stretch, limit, centre
+
+    def of(self, envs: np.ndarray, pad: int, body: np.ndarray) -> ContactShear:
+        """Shear of one contact of each environment; body −1 is none."""
+        rows = envs, np.full(len(envs), pad), np.maximum(body, 0)
+        touched = (body >= 0) & (self.load[rows][:, 0] > 0.0)
+        mean = np.where(touched[:, None], self.stretch[rows].mean(axis=1), 0.0)
+        force = np.linalg.norm(mean[:, :2], axis=1) * self.stiffness[rows][:, 0]
+        share = np.minimum(force / np.where(touched, self.load[rows][:, 0], 1.0), 1.0)
+        stuck = np.where(touched, np.cbrt(1.0 - share), 0.0)
+        return ContactShear(mean[:, :2], mean[:, 2], stuck, np.where(touched[:, None], self.centre[rows], 0.0))

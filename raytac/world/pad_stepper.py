@@ -1,0 +1,161 @@
+"""``PadStepper``: the contact of rigid pads in a loop that somebody else writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from raytac.checks import MOST_ENVIRONMENTS, check_whole
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
+from raytac.gel.surface import chosen_envs
+from raytac.world.environment_models import EnvironmentModels
+from raytac.world.rigid_pads import RigidPads
+from raytac.world.sensor_frames import SensorFrames
+from raytac.world.world_model import checked_states, own_world_model
+
+if TYPE_CHECKING:
+    from raytac.robots.mount import SensorChoice
+    from raytac.world.touched import TouchChoice
+
+__all__ = ["PadStepper"]
+
+
+class PadStepper:
+    """Rigid pads that act on the states of a model that somebody else steps.
+
+    .. code-block:: python
+
+        pads = PadStepper(model, touches=["cube"], outputs=("rgb", "wrench"))
+        for _ in range(100):
+            data.ctrl[:] = policy(data)
+            pads.step(model, data)  # in place of mujoco.mj_step
+        frame = pads.observe(data)["left"]
+
+        mujoco.mj_step1(model, data)  # or around a step of one's own
+        pads.add(model, data)
+        mujoco.mj_step2(model, data)
+        pads.finish(model, data)
+
+    ``step`` divides a step where something moves fast near a pad, as ``TactileWorld`` does, and leaves the poses of its end. With ``add`` a
+    step is as long as the model's, so that what is fast may go through a gel; that is marked in ``failed`` in both. A failed state is not
+    stepped until ``reset``. A state whose time has gone back counts as reset.
+
+    Attributes:
+        model: the model, which is not changed.
+        failed: states whose physics broke down, (B,), bool.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        sensors: SensorChoice | None = None,
+        touches: TouchChoice | None = None,
+        num_envs: int = 1,
+        allow_overlap: Sequence[str] = (),
+        keyframe: str | None = None,
+        **settings: Any,
+    ) -> None:
+        """Find sensors and bodies in the model.
+
+        Args:
+            model: model with sensors that ``raytac.mount`` put on it.
+            sensors, touches, allow_overlap, keyframe: as of ``TactileWorld``.
+            num_envs: number of states B that are stepped together.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``seed`` of every sensor.
+
+        Raises:
+            InputError: what ``TactileWorld`` refuses of a model of one's own.
+        """
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
+        self.model = model
+        self.composed = own_world_model(
+            model, sensors=sensors, touches=touches, keyframe=keyframe, allow_overlap=allow_overlap, own_contact=True
+        )
+        self.failed = np.zeros(num_envs, bool)
+        self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
+        self._pads = RigidPads(self.composed, EnvironmentModels(self.composed, num_envs), [mujoco.MjData(model)] * num_envs)
+        bodies = len(self.composed.touched)
+        self._before = {name: np.full((num_envs, bodies, 4, 4), np.nan) for name in self._frames.names}
+        self._time = np.full(num_envs, -np.inf)
+        self._put: Any = None
+
+    def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
+        """Forget what the pads of states (a mask (B,), a list, or None for all) went through.
+
+        Raises ``InputError`` for a state that does not exist.
+        """
+        chosen = chosen_envs(envs, len(self.failed))
+        self.failed[chosen], self._time[chosen], self._put = False, -np.inf, None
+        self._pads.clear(chosen)
+        self._frames.reset(chosen)
+        for poses in self._before.values():
+            poses[chosen] = np.nan
+
+    def step(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
+        """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.
+
+        Raises:
+            InputError: another model, or another number of states.
+        """
+        datas = self._states(model, data)
+        self._pads.advance(datas, lambda _: None, self.failed)
+        self._time[:] = [one.time for one in datas]
+
+    def add(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
+        """Put the pads' contacts into states, between ``mj_step1`` and ``mj_step2``.
+
+        Raises:
+            InputError: another model, another number of states, or no ``finish`` since the last ``add``.
+        """
+        datas = self._states(model, data)
+        if self._put is not None:
+            raise InputError("add", value="again", rule="must be followed by mj_step2 and finish before it is called again")
+        self._put = self._pads.add(datas, self._before, self.failed)
+
+    def finish(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
+        """Read the pads' forces and let the gels shear, after ``mj_step2``.
+
+        Raises:
+            InputError: another model, another number of states, or no ``add`` before.
+        """
+        datas = checked_states(self.model, model, data, len(self.failed))
+        if self._put is None:
+            raise InputError("finish", value="without add", rule="must follow add and mj_step2")
+        self._pads.finish(datas, self._put, self.failed)
+        self._put = None
+        self._time[:] = [one.time for one in datas]
+
+    def wrench(self, name: str) -> np.ndarray:
+        """Wrench (B, 6) on a pad about its origin in the last step, pad frame; NaN of a failed state.
+
+        Raises ``InputError`` for an unknown sensor.
+        """
+        if name not in self._frames.names:
+            raise InputError("name", value=name, rule="must be a sensor of the model", choices=self._frames.names)
+        return np.where(self.failed[:, None], np.nan, self._pads.wrench(name))
+
+    def observe(
+        self, data: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | None = None
+    ) -> dict[str, TactileFrame]:
+        """Frames of the sensors named (all if None) at the present poses.
+
+        Raises:
+            InputError: another number of states or an unknown sensor; as ``TactileSensor.update``.
+        """
+        datas = checked_states(self.model, self.model, data, len(self.failed))
+        return self._frames.observe(
+            lambda name, grid, rows: self._pads.reading(name, grid, datas, self.failed, rows), self.failed, sensors, None
+        )
+
+    def _states(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> list[mujoco.MjData]:
+        """The states; those whose time has gone back are reset."""
+        datas = checked_states(self.model, model, data, len(self.failed))
+        back = [b for b, one in enumerate(datas) if one.time < self._time[b]]
+        if back:
+            self.reset(back)
+        return datas

@@ -1,0 +1,75 @@
+"""Frames of the sensors of a model: one tactile sensor for each, made when it is first used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
+from raytac.gel.surface import PadGrid, chosen_envs
+from raytac.physics.base import PadReading
+from raytac.robots.mount import MountedSensor
+from raytac.sensor import TactileSensor
+
+__all__ = ["SensorFrames"]
+
+Read = Callable[[str, PadGrid, list[int] | None], PadReading]
+"""Reading of a sensor on a grid, for the environments named; None is all."""
+
+
+class SensorFrames:
+    """Sensors of one model in B environments, and what they see."""
+
+    def __init__(self, mounted: Sequence[MountedSensor], *, num_envs: int, seed: int, **settings: Any) -> None:
+        """``settings``: those of every ``TactileSensor``, which are checked when the first one is made."""
+        self._mounted, self._num_envs, self._seed = tuple(mounted), num_envs, seed
+        self._settings = settings
+        self._made: dict[str, TactileSensor] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sensors, without making them."""
+        return tuple(mounted.name for mounted in self._mounted)
+
+    @property
+    def sensors(self) -> dict[str, TactileSensor]:
+        """Every sensor by its name."""
+        for i, mounted in enumerate(self._mounted):
+            if mounted.name not in self._made:
+                own = {"seed": self._seed + i, "num_envs": self._num_envs, **self._settings}
+                self._made[mounted.name] = TactileSensor(mounted.spec, **own)
+        return self._made
+
+    def reset(self, envs: list[int]) -> None:
+        """Forget the markers' history in environments."""
+        for sensor in self._made.values():
+            if sensor.markers is not None:
+                sensor.reset_markers(envs)
+
+    def observe(
+        self, read: Read, failed: np.ndarray, sensors: Sequence[str] | None, envs: np.ndarray | list[int] | None
+    ) -> dict[str, TactileFrame]:
+        """Frames of the sensors named (None: all) in environments (a mask (B,), a list, or None for all).
+
+        Environments whose surface cannot be are marked in ``failed`` (B,).
+
+        Raises:
+            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
+        """
+        rows = None if envs is None else chosen_envs(envs, self._num_envs)
+        if rows is not None and not rows:
+            raise InputError("envs", value=envs, rule="must name one environment or more")
+        frames = {}
+        chosen = self.names if sensors is None else tuple(sensors)
+        for name in chosen:
+            if name not in self.names:
+                raise InputError("sensors", value=name, rule="must be a sensor of the world", choices=self.names)
+        for name in chosen:
+            sensor = self.sensors[name]
+            reading = read(name, sensor.grid, rows)
+            failed[slice(None) if rows is None else rows] |= reading.failed
+            frames[name] = sensor.update(reading, rows)
+        return frames

@@ -1,0 +1,183 @@
+"""``TactileReader``: frames of sensors from states of MuJoCo that somebody else steps, with MuJoCo's own contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from raytac.checks import MOST_ENVIRONMENTS, check_known, check_whole
+from raytac.frame import TactileFrame
+from raytac.gel.surface import chosen_envs
+from raytac.physics.base import PadReading
+from raytac.physics.rigid.contacts import LoadTables
+from raytac.robots.frames import body_poses, site_poses
+from raytac.robots.mount import MountedSensor
+from raytac.se3 import inverse
+from raytac.world.pad_search import PadSearch
+from raytac.world.pad_surfaces import PadSurfaces
+from raytac.world.sensor_frames import SensorFrames
+from raytac.world.world_model import checked_states, own_world_model
+
+if TYPE_CHECKING:
+    from raytac.gel.surface import PadGrid
+    from raytac.robots.mount import SensorChoice
+    from raytac.world.touched import TouchChoice
+
+__all__ = ["DEPTHS", "TactileReader"]
+
+DEPTHS = ("force", "geometry")
+"""Depths of an imprint: that at which the gel's load law gives MuJoCo's normal force, or the overlap that MuJoCo's state has."""
+_HALVINGS = 50
+
+
+class TactileReader:
+    """Frames of B states that are only looked at.
+
+    .. code-block:: python
+
+        raytac.mount(spec, "gelsight_mini", site="left_tip", name="left", collide=True)
+        model = spec.compile()
+        reader = TactileReader(model, touches=["cube"], outputs=("rgb", "wrench"))
+        mujoco.mj_step(model, data)  # by anybody
+        frame = reader.read(data)["left"]
+
+    Forces are those of MuJoCo's contacts of the gel's geom, with whatever touches it. MuJoCo's contacts are harder or softer than the gel,
+    as masses and contact points have it, so their penetration says little about the imprint. With ``depth="force"`` each body that touches
+    the gel is moved along the pad's z for the picture, until the load law of its shape at this place and angle gives MuJoCo's normal force.
+    A body without a force is moved out of the gel. With ``depth="geometry"`` bodies are shown where they are.
+
+    After ``mj_step`` MuJoCo's forces and poses are those of the beginning of that step; after ``mj_forward`` those of the present state.
+
+    Attributes:
+        model: the model, which is not changed.
+        failed: states in which a number is not finite or a body is beyond a gel's bonded face, at the last ``read``, (B,), bool.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        sensors: SensorChoice | None = None,
+        touches: TouchChoice | None = None,
+        depth: str = "force",
+        num_envs: int = 1,
+        allow_overlap: Sequence[str] = (),
+        keyframe: str | None = None,
+        **settings: Any,
+    ) -> None:
+        """Find sensors and bodies in the model.
+
+        Args:
+            model: model with sensors that ``raytac.mount`` put on it with ``collide=True``. Any integrator and friction cone will do.
+            sensors, touches: as of ``TactileWorld``; only bodies of ``touches`` leave an imprint.
+            depth: one of ``DEPTHS``.
+            num_envs: number of states B that are read together.
+            allow_overlap, keyframe: as of ``TactileWorld``: at this start, or ``qpos0``, no gel may lie in a geom that is not touched.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``seed`` of every sensor.
+
+        Raises:
+            InputError: no sensor, a gel that does not collide, and what ``TactileWorld`` refuses of bodies.
+        """
+        check_known("depth", depth, DEPTHS)
+        check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
+        self.model, self.depth = model, depth
+        self.composed = own_world_model(
+            model, sensors=sensors, touches=touches, keyframe=keyframe, allow_overlap=allow_overlap, own_contact=False
+        )
+        self.failed = np.zeros(num_envs, bool)
+        sensors_, bodies = self.composed.sensors, self.composed.touched
+        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
+        shapes = [body.parts for body in bodies]
+        self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
+        self._body_index = np.array([body.index for body in bodies], int)
+        # Entries of one body move together: MuJoCo's force is on the body.
+        self._groups = {int(index): np.flatnonzero(self._body_index == index) for index in np.unique(self._body_index)}
+        self._search = {
+            mounted.name: PadSearch(
+                [mounted.spec.gelpad],
+                [tuple(part for i in group for part in shapes[i]) for group in self._groups.values()],
+                num_envs=num_envs,
+            )
+            for mounted in sensors_
+        }
+
+    def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
+        """Forget the history of markers in states (a mask (B,), a list, or None for all), at the beginning of an episode.
+
+        Raises ``InputError`` for a state that does not exist.
+        """
+        chosen = chosen_envs(envs, len(self.failed))
+        self._surfaces.reset(chosen)
+        self._frames.reset(chosen)
+
+    def read(
+        self, datas: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | None = None
+    ) -> dict[str, TactileFrame]:
+        """Frames of the sensors named (all if None), a row for each state.
+
+        Raises:
+            InputError: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
+        """
+        states = checked_states(self.model, self.model, datas, len(self.failed))
+        self.failed[:] = [not np.isfinite(data.qpos.sum() + data.qvel.sum()) for data in states]
+        mounted = {one.name: one for one in self.composed.sensors}
+        return self._frames.observe(
+            lambda name, grid, _: self._reading(mounted[name], grid, states, self.failed), self.failed, sensors, None
+        )
+
+    def _reading(self, mounted: MountedSensor, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
+        world_from_pad = site_poses(datas, int(self.model.site(mounted.site).id))
+        pad_from_body = inverse(world_from_pad)[:, None] @ body_poses(datas, self._body_index)
+        wrench, load = self._forces(mounted, datas, world_from_pad)
+        if self.depth == "force":
+            self._settle(mounted, pad_from_body, load, failed)
+        return self._surfaces.reading(mounted.name, grid, pad_from_body, wrench, failed, np.arange(len(datas)))
+
+    def _forces(
+        self, mounted: MountedSensor, datas: Sequence[mujoco.MjData], world_from_pad: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Wrench (B, 6) of all contacts on the gel, pad frame, and the normal loads (B, groups) [N]."""
+        gel, groups = int(self.model.geom(mounted.gel).id), list(self._groups)
+        wrench, load, local = np.zeros((len(datas), 6)), np.zeros((len(datas), len(groups))), np.zeros(6)
+        for b, data in enumerate(datas):
+            if not data.ncon:
+                continue
+            geoms = data.contact.geom[: data.ncon]
+            rotation, origin = world_from_pad[b, :3, :3], world_from_pad[b, :3, 3]
+            for k in np.flatnonzero((geoms == gel).any(axis=1)).tolist():
+                mujoco.mj_contactForce(self.model, data, k, local)
+                contact = data.contact[k]
+                first = int(geoms[k, 0]) == gel
+                # MuJoCo's force is on the second geom.
+                axes = contact.frame.reshape(3, 3) * (-1.0 if first else 1.0)
+                force, torque = local[:3] @ axes, local[3:] @ axes
+                torque = torque + np.cross(contact.pos - origin, force)
+                on_pad = np.concatenate([force @ rotation, torque @ rotation])
+                wrench[b] += on_pad
+                body = int(self.model.geom_bodyid[geoms[k, 1 if first else 0]])
+                if body in self._groups:
+                    load[b, groups.index(body)] -= on_pad[2]
+        return wrench, load
+
+    def _settle(self, mounted: MountedSensor, pad_from_body: np.ndarray, load: np.ndarray, failed: np.ndarray) -> None:
+        """Move bodies along the pad's z, in place, until the load law gives their loads (B, groups) [N]."""
+        sound, gelpad = np.flatnonzero(~failed), mounted.spec.gelpad
+        firsts = [int(group[0]) for group in self._groups.values()]
+        poses = pad_from_body[sound][:, None, firsts]
+        near = self._search[mounted.name].contacts(poses, sound, gelpad.thickness)
+        wanted = np.maximum(load[near.env, near.body], 0.0)
+        law = LoadTables(near, np.full(len(near), gelpad.thickness))
+        low, high = np.zeros(len(near)), np.maximum(near.depth + near.clearance, 0.0)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            above = law.force(middle)[0] > wanted
+            low, high = np.where(above, low, middle), np.where(above, middle, high)
+        loaded = wanted > 0.0
+        shift = np.where(loaded, near.depth - low, np.maximum(near.depth, 0.0))
+        for group, entries in enumerate(self._groups.values()):
+            some = near.body == group
+            for i in entries:
+                pad_from_body[near.env[some], i, 2, 3] += shift[some]

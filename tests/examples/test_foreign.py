@@ -1,0 +1,50 @@
+"""Examples with robots that others modelled, and that their sensors carry what they lift; skipped without those packages."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def last_line(name: str, folder: Path) -> str:
+    """What an example prints last."""
+    command = [sys.executable, str(EXAMPLES / f"{name}.py")]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip().splitlines()[-1]
+
+
+def test_examples_say_which_package_they_need(tmp_path: Path) -> None:
+    """Without the packages that are not this project's own, in isolation from where they may be installed."""
+    code = (
+        "import importlib.util, runpy, sys; known = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name, *rest: None if name == 'gymnasium_robotics' else known(name, *rest)\n"
+        "runpy.run_path(sys.argv[1])"
+    )
+    for name in ("fetch_pick_place", "shadow_hand"):
+        command = [sys.executable, "-c", code, str(EXAMPLES / f"{name}.py")]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 1 and "pip install gymnasium-robotics" in done.stderr
+
+
+@pytest.mark.slow
+def test_fetch_lifts_its_cube_and_feels_it(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    lifted, left, right = (
+        float(number) for number in re.findall(r"(-?[\d.]+) (?:mm|and|N)", last_line("fetch_pick_place", tmp_path))
+    )
+    assert 60.0 < lifted < 75.0
+    assert left == pytest.approx(40.0, rel=0.01) and right == pytest.approx(40.0, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_shadow_hand_feels_its_block(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    loads = [float(number) for number in re.findall(r": ([\d.]+)", last_line("shadow_hand", tmp_path).partition("{")[2])]
+    assert len(loads) == 5 and sum(load > 0.1 for load in loads) >= 2

@@ -1,0 +1,74 @@
+"""The script of the hard cases of rigid pads: the form of its report, and measures that do not trust the pad."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import rigid_hard_cases as hard
+from experiments.rigid_hard_bench import GEL, Bench, Outcome, on_pad
+from raytac.errors import InputError
+from raytac.io.metrics import read_metrics
+from raytac.specs import BodySpec
+
+
+def test_a_run_reports_every_check_and_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"out": tmp_path, "device": "cpu", "seconds": 0.02, "grasps": 8}
+    ran: list[str] = []
+    measured = hard.measured
+    monkeypatch.setattr(hard, "measured", lambda name, case: (ran.append(name), measured(name, case))[1])
+    found = hard.main(hard.Args(**options, cases="drop_5g_1ms-1_[12]ms"))
+    assert ran == ["drop_5g_1ms-1_1ms", "drop_5g_1ms-1_2ms", "drop_5g_1ms-1_steps"]
+    assert found["rigid_hard.total"] == 3 and found["rigid_hard.passed"] == sum(
+        int(found[f"rigid_hard.{name}.passed"]) for name in ran
+    )
+    assert -0.004 <= float(found["rigid_hard.max_penetration_of_bond_m"]) < 1.0
+    assert abs(float(found["rigid_hard.drop_5g_1ms-1_1ms.friction_beyond_its_cone"])) < 0.01
+    assert read_metrics(tmp_path / "metrics.json")["rigid_hard.total"] == 3
+    text = (tmp_path / "table.txt").read_text()
+    assert "steps of 2 and 1 ms: greatest depth" in text and (tmp_path / "rigid_hard.png").stat().st_size > 10_000
+    ran.clear()
+    hard.main(hard.Args(**options, cases="drop_5g_1ms-1_1ms,grasps_sphere"))
+    assert ran == ["grasps_sphere"]
+    with pytest.raises(InputError, match="other settings"):
+        hard.main(hard.Args(**{**options, "seconds": 0.03}, cases="pin*"))
+
+
+def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for options, text in (({"cases": "spike"}, "drop_5g"), ({"seconds": 0.0}, "greater than 0"), ({"grasps": -1}, "0 or more")):
+        with pytest.raises(InputError, match=text):
+            hard.main(hard.Args(out=out, device="cpu", **options))  # type: ignore[arg-type]
+    assert not out.exists()
+
+
+def test_a_case_that_breaks_off_has_failed_and_says_why() -> None:
+    def case() -> Outcome:
+        raise ValueError("no such thing")
+
+    row = hard.measured("broken", case)
+    assert not row["passed"] and "ValueError: no such thing" in hard.line(row)
+
+
+def test_penetration_is_seen_at_sub_steps_whatever_the_pad_says() -> None:
+    """A ball that is put through the pad without a step of the pad: the record alone finds it."""
+    ball = BodySpec("ball", "sphere", {"radius": 5e-3}, position=(0.0, 0.0, 0.006), mass=0.01)
+    with Bench(on_pad([ball], 1e-3)) as bench:
+        bench.run(2e-3)
+        assert bench.penetration() == pytest.approx(-GEL.thickness - 0.001, abs=5e-5)
+        bench._poses[0][0, 2, 3] = -1e-3
+        assert bench.penetration() == pytest.approx(0.006 - GEL.thickness, abs=1e-5)
+        outcome = bench.common(Outcome())
+    assert not outcome.passed and [c.name for c in outcome.checks if not c.passed] == ["beyond the bonded face"]
+
+
+def test_full_runs_have_every_combination() -> None:
+    quick, full = hard.all_cases(hard.Args()), hard.all_cases(hard.Args(full=True))
+    drops = [name for name in full if name.startswith("drop")]
+    assert len(drops) == 3 * 6 * 5 and set(quick) <= set(full)
+    assert {f"lift_mu{mu:g}_2ms" for mu in (0.1, 0.3, 1.0, 1.5)} <= set(full)
+    counts = [case.args[1] for name, case in full.items() if name.startswith("grasps")]  # type: ignore[attr-defined]
+    assert sum(counts) == 10_000 and np.ptp(counts) <= 1
