@@ -50,6 +50,10 @@ from raytac.world.world_state import Drive, lost
 __all__ = ["RigidPads"]
 
 
+_EDGE = 0.7
+"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
+
+
 class _Pad:
     """Pad of one sensor."""
 
@@ -317,11 +321,11 @@ class RigidPads:
         # As much at the end of a step as keeps both shear and spin stable, whatever its length.
         time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
         damping = stiffness[:, 0] * time
-        metacentric, turn = self._tilt(contacts, motion, row)
-        rolling = np.maximum(
-            3.0 / 16.0 * (hysteresis * radius)[:, None],
-            friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric),
-        )
+        metacentric, height, turn = self._tilt(contacts, motion, row)
+        rolling = friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric)
+        # The cone must not cut this row before the centre of pressure is near the edge.
+        rolling = np.maximum(rolling, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
+        rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
         pull = self._shear.begin(at, stiffness, contacts.centre)
         force = np.zeros((len(contacts), ROWS))
         force[:, 0] = spring.force - self._lift(contacts, spring, motion, row, friction, lever, damping, pull)
@@ -370,8 +374,9 @@ class RigidPads:
         one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
         return one, np.cross(normal, one)
 
-    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, and these by the pad's tangents, (n, 2, 2).
+    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
+        tangents by the pad's, (n, 2, 2).
 
         The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the height of
         that centre over the gel: by nothing at all for a ball.
@@ -386,7 +391,7 @@ class RigidPads:
         turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
         # A rotation about one tangent moves the centre along the other.
         spread = np.stack([mean - half, mean + half], axis=1)
-        return np.maximum(spread - height[:, None], 0.0), turn
+        return np.maximum(spread - height[:, None], 0.0), height, turn
 
     def _put(self, datas: Sequence[mujoco.MjData], contacts: PadContacts, rows: PadRows, failed: np.ndarray) -> None:
         """Put contacts among MuJoCo's; marks environments whose memory for contacts is full."""
