@@ -22,7 +22,9 @@ _SHALLOW = 0.1e-3
 """Overlap [m] that a body across a gap is given to find the place of the least gap."""
 
 
-def near_pad(gelpad: GelpadSpec, radius: np.ndarray, planes: np.ndarray, poses: np.ndarray, reach: np.ndarray | float = 0.0) -> np.ndarray:
+def near_pad(
+    gelpad: GelpadSpec, radius: np.ndarray, planes: np.ndarray, poses: np.ndarray, reach: np.ndarray | float = 0.0
+) -> np.ndarray:
     """True (n, bodies) where bodies at poses (n, bodies, 4, 4) may come within ``reach`` [m], a number or (n,), of the pad's box.
 
     ``radius`` (bodies,) [m] of balls about the bodies' origins; ``planes``: indices of half-spaces.
@@ -33,14 +35,18 @@ def near_pad(gelpad: GelpadSpec, radius: np.ndarray, planes: np.ndarray, poses: 
     if len(planes):
         # A plane reaches the pad's box where its lowest corner along the plane's normal lies below it.
         normal, at = poses[:, planes][..., :3, 2], at[:, planes]
-        near[:, planes] = -np.abs(normal[..., :2]) @ half - np.maximum(-normal[..., 2], 0.0) * gelpad.thickness < np.vecdot(normal, at) + reach
+        near[:, planes] = (
+            -np.abs(normal[..., :2]) @ half - np.maximum(-normal[..., 2], 0.0) * gelpad.thickness < np.vecdot(normal, at) + reach
+        )
     return near
 
 
 class PadSearch:
     """Contacts of all bodies with all pads of a world."""
 
-    def __init__(self, gelpads: Sequence[GelpadSpec], bodies: Sequence[Sequence[Part]], *, num_envs: int, device: str = "cpu") -> None:
+    def __init__(
+        self, gelpads: Sequence[GelpadSpec], bodies: Sequence[Sequence[Part]], *, num_envs: int, device: str = "cpu"
+    ) -> None:
         """``gelpads`` of the pads, parts of the bodies in their frames; ``num_envs`` and ``device`` do not matter here."""
         self._gelpads, self._bodies = tuple(gelpads), tuple(bodies)
         self._overlaps = [PadOverlap(gelpad) for gelpad in gelpads]
@@ -81,12 +87,16 @@ class PadSearch:
         apart = apart[reach[apart] > 0.0]
         if len(apart):
             grid = self._grid(p, _GAP_PITCH)
-            gap = refined(object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest, _GAP_PITCH)
+            gap = refined(
+                object_height(parts, poses[apart], grid.x, grid.y, below=float(reach[apart].max())) - grid.rest, _GAP_PITCH
+            )
             some = (gap < reach[apart]) & np.isfinite(gap)
             apart, shift = apart[some], np.maximum(gap[some], 0.0) + _SHALLOW
             if len(apart):
                 beside = overlap.touches(parts, _lowered(poses[apart], shift), radius)
-                found += [self._row(p, i, int(apart[row]), poses, beside, k, float(shift[row])) for k, row in enumerate(beside.env)]
+                found += [
+                    self._row(p, i, int(apart[row]), poses, beside, k, float(shift[row])) for k, row in enumerate(beside.env)
+                ]
         return found
 
     def _grid(self, p: int, pitch: float) -> PadGrid:

@@ -49,9 +49,12 @@ class Drop:
 
 
 @pytest.mark.parametrize(
-    ("mass", "speed", "timestep"), [(0.005, 5.0, 0.01), (0.05, 1.0, 0.01), (0.5, 1.0, 0.0005), (0.5, 5.0, 0.01), (0.05, 0.1, 0.005)]
+    ("mass", "speed", "timestep"),
+    [(0.005, 5.0, 0.01), (0.05, 1.0, 0.01), (0.5, 1.0, 0.0005), (0.5, 5.0, 0.01), (0.05, 0.1, 0.005)],
 )
-def test_a_ball_that_hits_the_gel_stays_above_its_bonded_face_and_gains_no_energy(mass: float, speed: float, timestep: float) -> None:
+def test_a_ball_that_hits_the_gel_stays_above_its_bonded_face_and_gains_no_energy(
+    mass: float, speed: float, timestep: float
+) -> None:
     drop = Drop(mass, speed, timestep)
     assert not drop.state.failed.any()
     assert 0.0 < max(drop.depth) < THICK
@@ -102,7 +105,9 @@ def test_a_ball_thrown_between_closing_pads_touches_both_and_goes_through_neithe
 def test_a_heavy_block_lies_still_at_the_depth_of_the_press() -> None:
     """1 kg on a face of 12 mm at the scene's longest step: it carries its weight to 1e-4 and does not creep."""
     size = {"length": 0.012, "width": 0.012, "height": 0.02}
-    world = TactileWorld(scene_of(BodySpec("block", "box", size, position=(0.0, 0.0, 0.0101), mass=1.0), timestep=0.01), outputs=())
+    world = TactileWorld(
+        scene_of(BodySpec("block", "box", size, position=(0.0, 0.0, 0.0101), mass=1.0), timestep=0.01), outputs=()
+    )
     for _ in range(100):
         world.step()
     before = world.state()

@@ -60,7 +60,7 @@ def test_unloading_follows_masing_s_rule_and_a_loop_closes() -> None:
     np.testing.assert_allclose(back, mindlin(np.array([top]))[0] - 2.0 * mindlin(0.5 * (top - down)), atol=0.02 * LIMIT)
     assert force[-1] == pytest.approx(force[len(up) - 1], rel=0.01)
     # The loop takes energy: a tangential force without history would take none.
-    assert np.trapezoid(np.r_[force[len(up) - 1], back], np.r_[top, down]) < 0.0 < force[len(up) - 1]
+    assert np.trapezoid(np.r_[force[len(up) - 1], back], np.r_[top, down]) > 0.05 * LIMIT * top
 
 
 def cube_on(share: float, mu: float = 0.6, timestep: float = 0.01, num_envs: int = 1) -> TactileWorld:
