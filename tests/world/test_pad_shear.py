@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytac.gel.surface import make_grid
 from raytac.physics.rigid.shear import ShearState
 from raytac.specs import BodySpec, RobotSpec, TaskScene
 from raytac.world.rigid_pads import RigidPads
@@ -151,6 +152,10 @@ def test_reset_forgets_the_shear_and_a_batch_shears_as_its_environments_alone() 
         both.step()
     pads = both._pads
     assert isinstance(pads, RigidPads) and pads._shear.stretch[:, 0, 0, :, 0].min() > 1e-6
+    grid = make_grid(both.composed.sensor_specs[0].gelpad, 0.4e-3)
+    shear = pads.reading("sensor", grid, both.data, np.array([False, True])).shear
+    assert shear is not None and shear.stretch[0, 0] == pytest.approx(pads._shear.stretch[0, 0, 0, :, 0].mean())
+    assert 0.0 < shear.stuck[0] < 1.0 and np.isnan(shear.stretch[1]).all() and np.isnan(shear.spin[1])
     both.reset([0])
     alone = cube_on(0.8)
     assert not pads._shear.stretch[0].any() and pads._shear.stretch[1].any()
