@@ -9,3 +9,5 @@ from .settings import ObservationSettings as ObservationSettings
 from .spaces import ArraySpec as ArraySpec
 from .spaces import as_tensors as as_tensors
 from .spaces import gymnasium_space as gymnasium_space
+from .wrapper import AddTactile as AddTactile
+from .wrapper import AddTactileVector as AddTactileVector

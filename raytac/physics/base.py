@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.physics.rigid.shear import ContactShear
 from raytac.shapes.part import Part
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -35,6 +36,7 @@ class PadReading:
         depth: travel below first touch at zero shear and twist [m], (B,); negative when lifted.
         force_law_area: area of contact by the law that ties force to depth [m²], (B,); None without such a law.
         solved: what the physics itself knows beyond this, of a type of its own: ``SoftReading`` of a soft pad's press; else None.
+        shear: elastic shear of the contact with the body that is deepest; None where the physics has no such state.
     """
 
     stage: int = -1
@@ -59,12 +61,13 @@ class PadReading:
         depth: np.ndarray | None = None,
         force_law_area: np.ndarray | None = None,
         solved: Any = None,
+        shear: ContactShear | None = None,
     ) -> None:
         """Keep what is given (see the class), and call a function when its result is first asked for; None is not known."""
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
-        self.solved, batch = solved, len(self.failed)
+        self.solved, self.shear, batch = solved, shear, len(self.failed)
         self.pad_from_object = np.full((batch, 4, 4), np.nan) if pad_from_object is None else pad_from_object
         self.world_from_pad = np.full((batch, 4, 4), np.nan) if world_from_pad is None else world_from_pad
         self.depth = np.full(batch, np.nan) if depth is None else depth
@@ -118,6 +121,7 @@ class PadReading:
         for name in ("failed", "unconverged", "pad_from_object", "world_from_pad", "depth", "force_law_area"):
             values = getattr(self, name)
             setattr(part, name, None if values is None else values[rows])
+        part.shear = None if self.shear is None else self.shear.of(rows)
         return part
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-__all__ = ["ROWS", "PadRows", "tangents", "write_contacts", "write_constraint", "write_reference"]
+__all__ = ["ROWS", "PadRows", "tangents", "write_constraint", "write_contacts", "write_reference"]
 
 ROWS = 6
 """Rows of a contact: normal, two tangents, spin, two of rolling."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
+from raytac.physics.rigid.shear import ContactShear
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import GelpadSpec
@@ -39,7 +40,16 @@ class PadSurfaces:
             pressed[np.asarray(envs, int)] = -1
 
     def reading(
-        self, name: str, grid: PadGrid, pad_from_body: np.ndarray, wrench: np.ndarray, failed: np.ndarray, rows: np.ndarray
+        self,
+        name: str,
+        grid: PadGrid,
+        pad_from_body: np.ndarray,
+        wrench: np.ndarray,
+        failed: np.ndarray,
+        rows: np.ndarray,
+        *,
+        press: Callable[[np.ndarray], object] | None = None,
+        shear: Callable[[np.ndarray], ContactShear] | None = None,
     ) -> PadReading:
         """Reading of one pad in n environments on the nodes of ``grid``.
 
@@ -50,6 +60,8 @@ class PadSurfaces:
             wrench: forces of all that touches (n, 6), as in a ``PadReading``.
             failed: environments that have failed already, (n,).
             rows: what the environments are called, (n,).
+            press: lowers heights (n, Ny, Nx) to what else presses, in place; None is nothing.
+            shear: shear of the gel under the bodies (n,) that it shows deepest; None is not known.
         """
         if name not in self._shown or self._shown[name][0] is not grid:
             self._shown[name] = grid, ElasticSurround(grid), float(grid.rest.max())
@@ -76,6 +88,8 @@ class PadSurfaces:
                 height = np.minimum(height, under, out=under)
             else:
                 height[rows_near] = np.minimum(height[rows_near], under)
+        if press is not None:
+            press(height)
         height[failed] = np.nan
         # From one body to another is no motion of either.
         before = self._pressed[name][rows]
@@ -84,7 +98,8 @@ class PadSurfaces:
         surface = without_pierced(self._shown[name][1].surface(height, poses), gelpad)
         failed = np.isnan(surface.height[:, 0, 0])
         wrench = np.where(failed[:, None], np.nan, wrench)
-        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench))
+        sheared = None if shear is None else ContactShear.where(failed, shear(pressed))
+        return PadReading(surface, wrench, failed, lambda surface: _traction(surface, wrench), shear=sheared)
 
 
 def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:

@@ -36,6 +36,7 @@ from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import SensorSpec
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
+from raytac.world.gel_pairs import GelPairs
 from raytac.world.hard_contacts import is_hard, write_hard_reference
 from raytac.world.pad_overlap import PadOverlap
 from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
@@ -46,6 +47,10 @@ from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
+
+
+_EDGE = 0.7
+"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
 
 
 class _Pad:
@@ -88,6 +93,8 @@ class _Put:
     """Matrices (n, 2, 2) from the rows' tangents to the pad's."""
     speed: np.ndarray
     """At which they close [m/s], (n,)."""
+    pose: np.ndarray
+    """``pad_from_body`` (n, 4, 4) at the beginning of the step."""
 
 
 class RigidPads:
@@ -114,6 +121,7 @@ class RigidPads:
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         }
         self.bodies = composed.touched
+        self._count = len(self.bodies)
         self._body_index = np.array([body.index for body in self.bodies], int)
         self._site_index = np.array([pad.site for pad in self.pads.values()], int)
         self._pad_index = np.array([pad.body for pad in self.pads.values()], int)
@@ -123,9 +131,13 @@ class RigidPads:
         """Pose of a half-space in its body's frame; the identity of all else."""
         self._frame[self._planes[0]] = self._planes[1]
         self._radius = np.array([object_radius(body.parts) for body in self.bodies])
-        self._geom = np.array([body.geoms[0] for body in self.bodies], int)
         self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
-        self._mass_centre = composed.model.body_ipos[self._body_index]
+        # What pads may touch: the bodies, then the gels of the pads.
+        self._touched = np.concatenate([self._body_index, self._pad_index])
+        geoms = [body.geoms[0] for body in self.bodies]
+        self._geom = np.concatenate([np.array(geoms, int), self._gel_geom])
+        self._mass_centre = composed.model.body_ipos[self._touched]
+        self._gel_pairs = GelPairs(self._gels, self._pad_index, num_envs)
         cases = [int(composed.model.geom(mounted.case).id) for mounted in composed.sensors]
         self._case_centre, self._case_half = composed.model.geom_pos[cases], composed.model.geom_size[cases]
         # A model of one's own keeps the contacts that it has.
@@ -133,8 +145,8 @@ class RigidPads:
         self._fall = float(np.linalg.norm(option.gravity))
         self._search = PadSearch(self._gels, [body.parts for body in self.bodies], num_envs=num_envs)
         self._wrench = np.zeros((num_envs, len(self.pads), 6))
-        self._shear = ShearState(num_envs, len(self.pads), len(self.bodies))
-        self._acceleration = np.zeros((num_envs, len(self.pads), len(self.bodies)))
+        self._shear = ShearState(num_envs, len(self.pads), len(self._touched))
+        self._acceleration = np.zeros((num_envs, len(self.pads), len(self._touched)))
         """At which contacts closed faster in their last step [m/s²]."""
         shapes = [body.parts for body in self.bodies]
         self._surfaces = PadSurfaces({name: pad.spec.gelpad for name, pad in self.pads.items()}, shapes, num_envs)
@@ -236,14 +248,14 @@ class RigidPads:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1``; returns also the ticks and the length [s] of each step, (n,)."""
         models, some = self._models, [datas[b] for b in envs.tolist()]
         motion = self._motion(some)
-        poses = [(name, pad, motion.pad_from_body[:, k]) for k, (name, pad) in enumerate(self.pads.items())]
+        poses = [(name, pad, motion.pad_from_body[:, k, : self._count]) for k, (name, pad) in enumerate(self.pads.items())]
         self._mark_pierced(poses, envs, before, failed)
         left = choice.timestep * (1.0 - done / choice.ticks)
-        contacts = self._search.contacts(motion.pad_from_body, envs, self._reach(motion, left))
+        contacts = self._contacts(motion, envs, left)
         row = np.searchsorted(envs, contacts.env)
         compliance = models.inverse_weight[contacts.env]
         at = np.arange(len(contacts))
-        compliance = compliance[at, self._pad_index[contacts.pad]] + compliance[at, self._body_index[contacts.body]]
+        compliance = compliance[at, self._pad_index[contacts.pad]] + compliance[at, self._touched[contacts.body]]
         movable = (compliance > 0.0) & ~failed[contacts.env]  # where the compliance is 0 neither moves
         contacts, row, compliance = contacts.of(movable), row[movable], compliance[movable]
         speed = self._closing(contacts, motion, row)
@@ -266,13 +278,15 @@ class RigidPads:
             count = datas[b].ncon - int(own[b])
             if count and not failed[b]:
                 write_hard_reference(datas[b], self._hard, count, length)
-        return _Put(contacts, law.radius(np.maximum(spring.deepest, 0.0)), rows, turn, speed), ticks, step
+        pose = motion.pad_from_body[row, contacts.pad, contacts.body]
+        return _Put(contacts, law.radius(np.maximum(spring.deepest, 0.0)), rows, turn, speed, pose), ticks, step
 
     def _motion(self, datas: Sequence[mujoco.MjData]) -> _Motion:
         """Poses and velocities of the states given, after their velocities are known."""
-        world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
+        world_from_pad = site_poses(datas, self._site_index)
+        world_from_body = np.concatenate([body_poses(datas, self._body_index), world_from_pad], axis=1)
         pad_from_body = _relative(world_from_pad[:, :, None], world_from_body[:, None])
-        indices = np.concatenate([self._pad_index, self._body_index])
+        indices = np.concatenate([self._pad_index, self._touched])
         twist = np.array([data.cvel[indices] for data in datas]).reshape(len(datas), len(indices), 6)
         # MuJoCo's velocities are about the centre of mass of the kinematic tree.
         about = np.array([data.subtree_com[self.model.body_rootid[indices]] for data in datas]).reshape(len(datas), -1, 3)
@@ -284,6 +298,13 @@ class RigidPads:
         velocity = linear[:, None, pads:] - linear[:, :pads, None] - np.cross(twist[:, :pads, None, :3], apart)
         to_pad = world_from_pad[:, :, None, :3, :3]
         return _Motion(world_from_pad, pad_from_body, _turned(velocity, to_pad), _turned(spin, to_pad))
+
+    def _contacts(self, motion: _Motion, envs: np.ndarray, left: np.ndarray) -> PadContacts:
+        """Contacts of bodies and gels with pads, or what may come near them in the time ``left`` (n,) [s]."""
+        bodies = self._search.contacts(motion.pad_from_body[:, :, : self._count], envs, self._reach(motion, left))
+        reach = np.linalg.norm(motion.velocity[:, :, self._count :], axis=-1) * left[:, None, None]
+        gels = self._gel_pairs.contacts(motion.pad_from_body[:, :, self._count :], envs, reach, self._count)
+        return PadContacts.joined([bodies, *gels]) if gels else bodies
 
     def _reach(self, motion: _Motion, left: np.ndarray) -> np.ndarray:
         """Distance (n, pads) [m] that the fastest body may come nearer to each pad in the time ``left`` (n,) [s]."""
@@ -298,14 +319,21 @@ class RigidPads:
         return -np.vecdot(motion.velocity[at] + np.cross(motion.spin[at], arm), contacts.normal)
 
     def _law(self, contacts: PadContacts) -> LoadTables:
-        thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
-        return LoadTables(contacts, thickness, self._models.gel_stiffness[contacts.env, contacts.pad])
+        return LoadTables(contacts, self._thickness(contacts), self._softer(contacts))
+
+    def _thickness(self, contacts: PadContacts) -> np.ndarray:
+        """Thickness (n,) [m] of the gel, or of both gels."""
+        return self._gel_pairs.thickness(contacts, self._count)
+
+    def _softer(self, contacts: PadContacts) -> np.ndarray:
+        """Factors (n,) of the modulus of the pad's gel; with that of the other gel in series."""
+        return self._gel_pairs.factor(contacts, self._count, self._models.gel_stiffness)
 
     def _beside_cases(self, choice: StepChoice, motion: _Motion) -> np.ndarray:
         """Longest steps (n,) [s] in which no body's bounding ball enters a case far."""
-        if not len(self.bodies):
+        if not self._count:
             return np.full(len(motion.velocity), np.inf)
-        apart = np.abs(motion.pad_from_body[..., :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
+        apart = np.abs(motion.pad_from_body[:, :, : self._count, :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
         gap = np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - self._radius
         longest = choice.beside_case(gap, self._speed(motion))
         longest[..., self._planes[0]] = np.inf
@@ -314,7 +342,8 @@ class RigidPads:
     def _speed(self, motion: _Motion) -> np.ndarray:
         """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies relative to pads; of a half-space, within a metre."""
         size = np.minimum(self._radius, 1.0)
-        return np.linalg.norm(motion.velocity, axis=-1) + np.linalg.norm(motion.spin, axis=-1) * size
+        velocity, spin = motion.velocity[:, :, : self._count], motion.spin[:, :, : self._count]
+        return np.linalg.norm(velocity, axis=-1) + np.linalg.norm(spin, axis=-1) * size
 
     def _in_gels(
         self,
@@ -328,7 +357,7 @@ class RigidPads:
         left: np.ndarray,
     ) -> None:
         """Shorten the ``longest`` steps (n,) [s] of environments to those that their contacts with gels allow."""
-        thickness = np.array([gel.thickness for gel in self._gels])[contacts.pad]
+        thickness = self._thickness(contacts)
         deeper = contacts.depth + np.minimum(np.maximum(speed, 0.0) * left[row], 0.025 * thickness)
         _, stiffness = law.force(deeper)
         rate = contact_rate(stiffness, compliance)
@@ -352,7 +381,7 @@ class RigidPads:
         models, at = self._models, (contacts.env, contacts.pad, contacts.body)
         deepest = np.maximum(spring.deepest, 0.0)
         radius, load = law.radius(deepest), law.force(deepest)[0]
-        softer = models.gel_stiffness[contacts.env, contacts.pad]
+        softer = self._softer(contacts)
         stiffness = np.ones((len(contacts), 2))
         hysteresis = np.zeros(len(contacts))
         tau = np.zeros(len(contacts))
@@ -362,17 +391,18 @@ class RigidPads:
             stiffness[some] = np.stack([shear_stiffness(size, gel), twist_stiffness(size, gel)], axis=1)
             hysteresis[some], tau[some] = gel.hysteresis, gel.relaxation_time
         stiffness = np.maximum(stiffness * softer[:, None], 1e-12)
-        friction = models.friction_on_gel[contacts.env, contacts.body]
+        own = np.append(models.friction_on_gel, np.full_like(models.gel_friction, np.nan), axis=1)
+        friction = own[contacts.env, contacts.body]
         friction = np.where(np.isnan(friction), models.gel_friction[contacts.env, contacts.pad], friction)
         lever = 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
         # As much at the end of a step as keeps both shear and spin stable, whatever its length.
         time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
         damping = stiffness[:, 0] * time
-        metacentric, turn = self._tilt(contacts, motion, row)
-        rolling = np.maximum(
-            3.0 / 16.0 * (hysteresis * radius)[:, None],
-            friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric),
-        )
+        metacentric, height, turn = self._tilt(contacts, motion, row)
+        rolling = friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric)
+        # The cone must not cut this row before the centre of pressure is near the edge.
+        rolling = np.maximum(rolling, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
+        rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
         pull = self._shear.begin(at, stiffness, contacts.centre)
         force = np.zeros((len(contacts), ROWS))
         force[:, 0] = spring.force - self._lift(contacts, spring, motion, row, friction, lever, damping, pull)
@@ -421,8 +451,9 @@ class RigidPads:
         one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
         return one, np.cross(normal, one)
 
-    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, and these by the pad's tangents, (n, 2, 2).
+    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
+        tangents by the pad's, (n, 2, 2).
 
         The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the height of
         that centre over the gel: by nothing at all for a ball.
@@ -437,7 +468,7 @@ class RigidPads:
         turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
         # A rotation about one tangent moves the centre along the other.
         spread = np.stack([mean - half, mean + half], axis=1)
-        return np.maximum(spread - height[:, None], 0.0), turn
+        return np.maximum(spread - height[:, None], 0.0), height, turn
 
     def _put(self, datas: Sequence[mujoco.MjData], contacts: PadContacts, rows: PadRows, failed: np.ndarray) -> None:
         """Put contacts among MuJoCo's; marks environments whose memory for contacts is full."""
@@ -487,6 +518,13 @@ class RigidPads:
         push = -(force[:, None, :3] @ axes)[:, 0]
         torque = -(force[:, None, 3:] @ axes)[:, 0] + np.cross(contacts.centre, push)
         np.add.at(self._wrench, (contacts.env, contacts.pad), np.concatenate([push, torque], axis=1))
+        gel = np.flatnonzero(contacts.body >= self._count)
+        if len(gel):
+            # The other gel feels the opposite, about its own origin.
+            pose = put.pose[gel]
+            torque = -torque[gel] + np.cross(pose[:, :3, 3], push[gel])
+            opposite = np.concatenate([_turned(-push[gel], pose[:, :3, :3]), _turned(torque, pose[:, :3, :3])], axis=1)
+            np.add.at(self._wrench, (contacts.env[gel], contacts.body[gel] - self._count), opposite)
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
@@ -509,10 +547,19 @@ class RigidPads:
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
     ) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
-        rows = np.arange(len(datas)) if envs is None else np.asarray(envs)
-        some = [datas[b] for b in rows.tolist()]
-        poses = _relative(site_poses(some, self.pads[name].site)[:, None], body_poses(some, self._body_index))
-        return self._surfaces.reading(name, grid, poses, self.wrench(name)[rows], failed[rows], rows)
+        rows, index = np.arange(len(datas)) if envs is None else np.asarray(envs), list(self.pads).index(name)
+        some, failed = [datas[b] for b in rows.tolist()], failed[rows]
+        world_from_pad = site_poses(some, self._site_index)
+        return self._surfaces.reading(
+            name,
+            grid,
+            _relative(world_from_pad[:, index, None], body_poses(some, self._body_index)),
+            self.wrench(name)[rows],
+            failed,
+            rows,
+            press=lambda height: self._gel_pairs.press(index, height, grid, world_from_pad, failed),
+            shear=lambda pressed: self._shear.of(rows, index, pressed),
+        )
 
     def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
         """Every pad with ``pad_from_body`` (n, bodies, 4, 4) of the states given."""

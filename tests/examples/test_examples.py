@@ -13,7 +13,9 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "batch": "load",
+    "foreign_loop": "the ball weighs 0.98",
     "gym_env": "return after five random actions",
+    "own_mujoco_model": "right: normal force",
     "press": "force",
     "relight": "without blue",
 }

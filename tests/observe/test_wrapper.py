@@ -9,10 +9,11 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from raytac.errors import InputError
 from raytac.observe import ObservationSettings, Randomization, TactileObserver
-from raytac.observe.wrapper import AddTactile
+from raytac.observe.wrapper import AddTactile, AddTactileVector
 from raytac.sensor import TactileSensor
 
 
@@ -68,3 +69,64 @@ def test_names_and_settings_that_cannot_be_are_told(wrapped: AddTactile) -> None
         AddTactile(wrapped, {"sensor": observer}, wrapped._frames)
     with pytest.raises(InputError, match="one environment"):
         AddTactile(Pressing(), {"sensor": TactileObserver("gelsight_mini_9x11", num_envs=2)}, wrapped._frames)
+
+
+class Counting(gymnasium.vector.VectorEnv):
+    """Two environments of episodes of two and three steps; a frame shows which step it is of."""
+
+    def __init__(self, mode: AutoresetMode, sensor: TactileSensor) -> None:
+        self.num_envs, self.metadata = 2, {"autoreset_mode": mode}
+        self.single_observation_space = gymnasium.spaces.Box(-1.0, 9.0, (1,), np.float32)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, 2)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, 2)
+        self.count, self._frames = np.zeros(2, int), {k: sensor.rest(range(k)) for k in (1, 2)}
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.count[(options or {}).get("reset_mask", [True, True])] = 0
+        return self._seen(), {}
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        mode, before = self.metadata["autoreset_mode"], self.count >= [2, 3]
+        self.count = np.where(before & (mode == AutoresetMode.NEXT_STEP), 0, self.count + 1)
+        ended = self.count >= [2, 3]
+        if mode == AutoresetMode.SAME_STEP:
+            self.count = np.where(ended, 0, self.count)
+        return self._seen(), np.zeros(2), ended, np.zeros(2, bool), {}
+
+    def _seen(self) -> np.ndarray:
+        return self.count[:, None].astype(np.float32)
+
+    def frames(self, envs: list[int] | None = None) -> dict[str, Any]:
+        count = self.count if envs is None else self.count[envs]
+        return {"sensor": self._frames[len(count)].with_values(wrench=np.repeat(count[:, None].astype(float), 6, axis=1))}
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_vector_begins_each_environments_stack_with_its_episode(mode: AutoresetMode) -> None:
+    settings = ObservationSettings(("wrench",), stack=2, normalise=False)
+    observer = TactileObserver("gelsight_mini", settings, num_envs=2)
+    sensor = observer.make_sensor(device="cpu", pitch=0.4e-3)
+    inner = Counting(mode, sensor)
+    envs = AddTactileVector(inner, {"sensor": observer}, inner.frames)
+    first, _ = envs.reset(seed=3)
+    assert envs.observation_space.contains(first) and first["sensor_wrench"].shape == (2, 2, 6)
+    actions = np.zeros((2, 1), np.float32)
+    seen = []
+    for _ in range(4):
+        observed, _, ended, _, _ = envs.step(actions)
+        if mode == AutoresetMode.DISABLED and ended.any():
+            observed, _ = envs.reset(options={"reset_mask": ended})
+        seen.append(observed["sensor_wrench"][:, :, 0].astype(int).tolist())
+        np.testing.assert_array_equal(observed["sensor_wrench"][:, -1, 0], observed["observation"][:, 0])
+    # Last frame and present one, of both environments: an episode begins with its first frame twice.
+    next_step = [[[0, 1], [0, 1]], [[1, 2], [1, 2]], [[0, 0], [2, 3]], [[0, 1], [0, 0]]]
+    same_step = [[[0, 1], [0, 1]], [[0, 0], [1, 2]], [[0, 1], [0, 0]], [[0, 0], [0, 1]]]
+    assert seen == (next_step if mode == AutoresetMode.NEXT_STEP else same_step)
+
+
+def test_a_vector_takes_observers_of_its_size_only() -> None:
+    observer = TactileObserver("gelsight_mini", ObservationSettings(("wrench",)), num_envs=3)
+    inner = Counting(AutoresetMode.NEXT_STEP, observer.make_sensor(device="cpu", pitch=0.4e-3))
+    with pytest.raises(InputError, match=r"observers\['sensor'\] = 3: must be of 2 environments"):
+        AddTactileVector(inner, {"sensor": observer}, inner.frames)

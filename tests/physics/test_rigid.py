@@ -70,6 +70,13 @@ def scene_of(
     return PressScene("test", ObjectSpec(kind, OBJECTS.get(kind, {}), position, quaternion, 0.05), stages)
 
 
+def grain(*stages: StageSpec) -> PressScene:
+    """A ball so small that 200 N would take it through the pad."""
+    return dataclasses.replace(
+        scene_of("sphere", *stages), object=ObjectSpec("sphere", {"radius": 1.2e-4}, (0.0, 0.0, 0.0), IDENTITY, 0.05)
+    )
+
+
 def indent(depth: float) -> StageSpec:
     return StageSpec("indent", depth=depth)
 
@@ -335,8 +342,8 @@ FORCE = StageSpec("indent", force=1.0)
 @pytest.mark.parametrize(
     ("scene", "key", "value", "rule"),
     [
-        (scene_of("sphere", StageSpec("indent", force=200.0)), "trajectory[0].force_n", 200.0, "deeper than the pad"),
-        (scene_of("sphere", FORCE, StageSpec("indent", force=200.0)), "trajectory[1].force_n", 200.0, "deeper than the pad"),
+        (grain(StageSpec("indent", force=200.0)), "trajectory[0].force_n", 200.0, "deeper than the pad"),
+        (grain(FORCE, StageSpec("indent", force=200.0)), "trajectory[1].force_n", 200.0, "deeper than the pad"),
         (scene_of("sphere", indent(1e-3), position=(50e-3, 0, 0)), "object.position_mm", [50.0, 0.0], "above a node"),
         (scene_of("sphere", FORCE, StageSpec("shear", shear=(0, 40e-3))), "trajectory[1].shear_mm", [0.0, 40.0], "above a node"),
         (scene_of("sphere", indent(4.1e-3)), "trajectory[0].depth_mm", 4.1, "thickness, 4 mm"),
@@ -351,10 +358,14 @@ def test_a_press_that_cannot_be_done_names_file_and_key(scene: PressScene, key: 
 
 
 def test_a_kept_force_that_would_go_through_the_pad_is_blamed_on_the_stage_that_moves() -> None:
-    """Off the pad's edge less of the ball is above gel, so the pad cannot carry what it carried in the middle."""
-    law_force = StageSpec("indent", force=16.0)
-    with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = .*the force kept here, 16 N, would press deeper"):
-        press(scene_of("sphere", law_force, StageSpec("shear", shear=(11.9e-3, 0.0))))
+    """Near the pad's edge there is less gel under a grain, so the pad cannot carry what it carried in the middle."""
+    scene = grain(FORCE)
+    grid, pose = make_grid(PAD, PITCH), np.eye(4)
+    touch = first_touch(object_parts(scene.object), pose, PAD, grid)
+    force = 0.99 * LoadLaw(touch.gap, float(np.prod(grid.pitch)), PAD, touch.deepest).greatest
+    stages = StageSpec("indent", force=force), StageSpec("shear", shear=(9e-3, 0.0))
+    with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = .*the force kept here, .* N, would press deeper"):
+        press(grain(*stages))
 
 
 @pytest.mark.parametrize(

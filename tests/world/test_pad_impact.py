@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytac.gel.surface import make_grid
+from raytac.physics.rigid.load_law import LoadLaw
 from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor
 from raytac.world.rigid_pads import RigidPads
@@ -143,3 +145,34 @@ def test_a_press_into_the_hard_back_is_as_deep_as_a_body_of_that_weight() -> Non
     )
     pad = RigidPad(load_sensor("gelsight_mini"), press, pitch=0.1e-3)
     assert float(pad.peak(pad.run()).depth[0]) == pytest.approx(sunk, rel=0.01)
+
+
+def test_two_gels_that_meet_carry_the_same_load_at_half_of_the_overlap_each() -> None:
+    """A gripper that closes on nothing."""
+    gripper = RobotSpec("floating_gripper", opening=0.004, position=(0.0, 0.0, 0.0))
+    scene = TaskScene("meet", gripper, (), gravity=(0.0, 0.0, 0.0), timestep=2e-3, control_timestep=1e-2)
+    world = TactileWorld(scene, outputs=("wrench",))
+    opening = world.composed.opening
+    assert opening is not None
+
+    def close(data, time: float) -> None:
+        data.ctrl[opening] = max(0.0, 0.004 - 0.1 * time)
+
+    for k in range(20):
+        if k == 8:  # the servo cannot ask for less than no gap
+            for name in ("left", "right"):
+                joint = world.model.joint(f"{name}_slide").id
+                world.data[0].qfrc_applied[world.model.jnt_dofadr[joint]] = -5.0
+        state = world.step(close)
+    left, right = (state.world_from_pad[name][0] for name in ("left", "right"))
+    overlap = -float((np.linalg.inv(left) @ right)[2, 3])
+    assert not state.failed.any() and overlap > 1e-4
+    pressed = [-state.wrench[name][0, 2] for name in ("left", "right")]
+    assert pressed[0] > 1.0 and pressed[1] == pytest.approx(pressed[0], rel=1e-9)
+    for frame in world.observe().values():
+        assert float(frame.surface.indentation.max()) == pytest.approx(0.5 * overlap, rel=0.01)
+    # Half of what one gel carries against a rigid copy of the other at the same overlap.
+    gel = load_sensor("gelsight_mini").gelpad
+    grid = make_grid(gel, 0.2e-3)
+    law = LoadLaw(-2.0 * grid.rest, float(np.prod(grid.pitch)), gel)
+    assert pressed[0] == pytest.approx(0.5 * law.force(overlap), rel=0.02)

@@ -33,7 +33,8 @@ def settled(scene: TaskScene, steps: int = 60, **options) -> TactileWorld:
 @pytest.mark.parametrize("mass", [0.004, 0.05, 0.5])
 @pytest.mark.parametrize("timestep", [0.0005, 0.002])
 def test_a_resting_ball_weighs_what_it_weighs_and_sinks_in_as_the_press_says(mass: float, timestep: float) -> None:
-    world = settled(replace(UP, timestep=timestep, bodies=(replace(BALL, mass=mass),)))
+    # The gel damps a heavy ball, which swings slowly, for longer.
+    world = settled(replace(UP, timestep=timestep, bodies=(replace(BALL, mass=mass),)), 60 if mass < 0.1 else 180)
     state = world.state()
     np.testing.assert_allclose(state.wrench["sensor"][0], [0, 0, -mass * G, 0, 0, 0], atol=1e-6 * mass * G)
     assert np.abs(world.data[0].qvel).max() < 1e-6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,12 @@ class PadContacts:
 
     def __len__(self) -> int:
         return len(self.env)
+
+    @staticmethod
+    def joined(some: Sequence[PadContacts]) -> PadContacts:
+        """All rows, sorted."""
+        rows = {name: np.concatenate([getattr(one, name) for one in some]) for name in PadContacts.__dataclass_fields__}
+        return PadContacts(**rows).of(np.lexsort((rows["body"], rows["pad"], rows["env"])))
 
     def of(self, rows: np.ndarray) -> PadContacts:
         """The rows chosen by a mask or by indices."""

@@ -48,6 +48,17 @@ class ContactShear:
     centre: np.ndarray
     """Centre of the contact [m], (B, 3)."""
 
+    def of(self, rows: np.ndarray) -> ContactShear:
+        """The same of the environments named."""
+        return ContactShear(**{name: values[rows] for name, values in vars(self).items()})
+
+    @staticmethod
+    def where(failed: np.ndarray, shear: ContactShear) -> ContactShear:
+        """``shear`` with NaN for environments that ``failed`` (B,)."""
+        return ContactShear(
+            **{name: np.where(np.reshape(failed, (-1,) + (1,) * (v.ndim - 1)), np.nan, v) for name, v in vars(shear).items()}
+        )
+
 
 class ShearState:
     """Stretch of all contacts: one row for each environment, pad and body."""
