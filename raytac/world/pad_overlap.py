@@ -214,8 +214,10 @@ def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
 
 
 def refined(gap: np.ndarray, pitch: float) -> np.ndarray:
-    """The least gaps (n,) of (n, Ny, Nx) between the nodes: parabolas through the least node and its neighbours along both axes, exact
-    for a ball on a dome. Not across an edge, where the slope changes by more than a half from one node, ``pitch`` [m] apart, to the next."""
+    """The least gaps (n,) of (n, Ny, Nx) between nodes that are ``pitch`` [m] apart.
+
+    By parabolas through the least node and its neighbours along both axes, exact for a ball on a dome; not across an edge.
+    """
     n, ny, nx = gap.shape
     lowest = gap.reshape(n, -1).argmin(axis=1)
     j, i = np.divmod(lowest, nx)

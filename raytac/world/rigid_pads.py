@@ -43,7 +43,7 @@ from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.hard_contacts import is_hard, write_hard_reference
 from raytac.world.pad_overlap import PadOverlap
-from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
+from raytac.world.pad_rows import ROWS, PadRows, cross, tangents, write_constraint, write_contacts, write_reference
 from raytac.world.pad_search import PadSearch, near_pad
 from raytac.world.pad_steps import StepChoice
 from raytac.world.world_state import Drive, lost
@@ -237,11 +237,11 @@ class RigidPads:
         # MuJoCo's velocities are about the centre of mass of the kinematic tree.
         about = np.array([data.subtree_com[self.model.body_rootid[indices]] for data in datas]).reshape(len(datas), -1, 3)
         place = np.concatenate([world_from_pad[..., :3, 3], world_from_body[..., :3, 3]], axis=1)
-        linear = twist[..., 3:] + np.cross(twist[..., :3], place - about)
+        linear = twist[..., 3:] + cross(twist[..., :3], place - about)
         pads = len(self._pad_index)
         spin = twist[:, None, pads:, :3] - twist[:, :pads, None, :3]
         apart = place[:, None, pads:] - place[:, :pads, None]
-        velocity = linear[:, None, pads:] - linear[:, :pads, None] - np.cross(twist[:, :pads, None, :3], apart)
+        velocity = linear[:, None, pads:] - linear[:, :pads, None] - cross(twist[:, :pads, None, :3], apart)
         to_pad = world_from_pad[:, :, None, :3, :3]
         return _Motion(world_from_pad, pad_from_body, _turned(velocity, to_pad), _turned(spin, to_pad))
 
@@ -262,7 +262,7 @@ class RigidPads:
         """Speeds (n,) at which contacts close [m/s]."""
         at = row, contacts.pad, contacts.body
         arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        return -np.vecdot(motion.velocity[at] + np.cross(motion.spin[at], arm), contacts.normal)
+        return -np.vecdot(motion.velocity[at] + cross(motion.spin[at], arm), contacts.normal)
 
     def _law(self, contacts: PadContacts) -> LoadTables:
         return LoadTables(contacts, self._thickness(contacts), self._softer(contacts))
@@ -382,7 +382,7 @@ class RigidPads:
         """
         at = row, contacts.pad, contacts.body
         arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        velocity = motion.velocity[at] + np.cross(motion.spin[at], arm)
+        velocity = motion.velocity[at] + cross(motion.spin[at], arm)
         one, two = tangents(contacts.normal)
         slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
         spin = np.vecdot(motion.spin[at], contacts.normal)
@@ -395,14 +395,14 @@ class RigidPads:
     def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         first, second = tangents(normal)
         one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
-        return one, np.cross(normal, one)
+        return one, cross(normal, one)
 
     def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
         tangents by the pad's, (n, 2, 2).
 
-        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the height of
-        that centre over the gel: by nothing at all for a ball.
+        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the
+        height of that centre over the gel: by nothing at all for a ball.
         """
         pose = motion.pad_from_body[row, contacts.pad, contacts.body]
         middle = (pose[:, :3, :3] @ self._mass_centre[contacts.body][..., None])[..., 0] + pose[:, :3, 3]
@@ -469,13 +469,13 @@ class RigidPads:
         axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
         # MuJoCo's force is on the second body; the pad gets the opposite.
         push = -(force[:, None, :3] @ axes)[:, 0]
-        torque = -(force[:, None, 3:] @ axes)[:, 0] + np.cross(contacts.centre, push)
+        torque = -(force[:, None, 3:] @ axes)[:, 0] + cross(contacts.centre, push)
         np.add.at(self._wrench, (contacts.env, contacts.pad), np.concatenate([push, torque], axis=1))
         gel = np.flatnonzero(contacts.body >= self._count)
         if len(gel):
             # The other gel feels the opposite, about its own origin.
             pose = motion.pad_from_body[row[gel], contacts.pad[gel], contacts.body[gel]]
-            torque = -torque[gel] + np.cross(pose[:, :3, 3], push[gel])
+            torque = -torque[gel] + cross(pose[:, :3, 3], push[gel])
             opposite = np.concatenate([_turned(-push[gel], pose[:, :3, :3]), _turned(torque, pose[:, :3, :3])], axis=1)
             np.add.at(self._wrench, (contacts.env[gel], contacts.body[gel] - self._count), opposite)
 
