@@ -50,11 +50,11 @@ class GelPairs:
         """
         result = []
         for i, j, search in self._pairs:
-            found = search.contacts(pad_from_pad[:, i : i + 1, j : j + 1], envs, reach[:, i, j : j + 1])
-            if len(found):
-                pad, body = np.full(len(found), i), np.full(len(found), first + j)
+            near = search.contacts(pad_from_pad[:, i : i + 1, j : j + 1], envs, reach[:, i, j : j + 1])
+            if len(near):
+                pad, body = np.full(len(near), i), np.full(len(near), first + j)
                 # Both layers may be squeezed.
-                result.append(replace(found, pad=pad, body=body, clearance=found.clearance + self._size[j]))
+                result.append(replace(near, pad=pad, body=body, clearance=near.clearance + self._size[j]))
         return result
 
     def thickness(self, contacts: PadContacts, first: int) -> np.ndarray:
