@@ -44,14 +44,17 @@ class GelPairs:
         self._modulus = np.array([gel.youngs_modulus for gel in gels])
 
     def contacts(self, pad_from_pad: np.ndarray, envs: np.ndarray, reach: np.ndarray, first: int) -> list[PadContacts]:
-        """Contacts of pairs at poses (n, pads, pads, 4, 4), or nearer than ``reach`` (n, pads, pads) [m]; gel j is the body ``first`` + j."""
+        """Contacts of pairs at poses (n, pads, pads, 4, 4), or nearer than ``reach`` (n, pads, pads) [m].
+
+        Gel j is the body ``first`` + j.
+        """
         result = []
         for i, j, search in self._pairs:
-            found = search.contacts(pad_from_pad[:, i : i + 1, j : j + 1], envs, reach[:, i, j : j + 1])
-            if len(found):
-                pad, body = np.full(len(found), i), np.full(len(found), first + j)
+            near = search.contacts(pad_from_pad[:, i : i + 1, j : j + 1], envs, reach[:, i, j : j + 1])
+            if len(near):
+                pad, body = np.full(len(near), i), np.full(len(near), first + j)
                 # Both layers may be squeezed.
-                result.append(replace(found, pad=pad, body=body, clearance=found.clearance + self._size[j]))
+                result.append(replace(near, pad=pad, body=body, clearance=near.clearance + self._size[j]))
         return result
 
     def thickness(self, contacts: PadContacts, first: int) -> np.ndarray:
@@ -96,5 +99,7 @@ def _gel_part(gelpad: GelpadSpec) -> Part:
     up = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
     rim = np.concatenate([node[0, :-1], node[:-1, -1], node[-1, :0:-1], node[:0:-1, 0]])
     following, deep = np.roll(rim, -1), ny * nx
-    wall = np.concatenate([np.stack([rim, rim + deep, following + deep], axis=1), np.stack([rim, following + deep, following], axis=1)])
+    wall = np.concatenate(
+        [np.stack([rim, rim + deep, following + deep], axis=1), np.stack([rim, following + deep, following], axis=1)]
+    )
     return mesh_part(np.concatenate([top, back]), np.concatenate([up, up[:, ::-1] + deep, wall]))

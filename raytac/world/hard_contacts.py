@@ -5,8 +5,7 @@ contact for a step and falls again, and what rests chatters. Here contacts are k
 asks for the speed at the end of a step by which a gap is just closed, v = −gap / Δt. A penetration is taken back by a tenth in a step, so
 that bodies do not bounce off it. Both hold for steps of any length.
 
-MuJoCo's convex cone lifts what slides, v_n = μ |v_t| (M. Anitescu, Math. Program. 105, 2006), by 0.2 mm at 0.1 m/s, μ = 0.2 and 10 ms. The
-speed at the start of the step is taken off that (G. De Saxcé, Z.-Q. Feng, Math. Comput. Model. 28, 1998).
+MuJoCo's convex cone lifts what slides by μ |v_t| Δt (M. Anitescu, Math. Program. 105, 2006): by 0.2 mm at 0.1 m/s, μ = 0.2 and 10 ms.
 """
 
 from __future__ import annotations
@@ -20,8 +19,6 @@ HARD_MARGIN = 3e-3
 """Margin of such geoms [m]: by how much bodies may near each other in a step and not overlap at its end."""
 _BACK = 0.1
 """Share of a penetration that a step takes back."""
-_LIFT = 0.1e-3
-"""Greatest lift of what slides that is taken off in a step [m]: a body that stops within it penetrates by as much."""
 
 
 def is_hard(model: mujoco.MjModel) -> np.ndarray:
@@ -34,11 +31,10 @@ def write_hard_reference(data: mujoco.MjData, hard: np.ndarray, count: int, step
     contact = data.contact
     rows = contact.efc_address[:count]
     some = hard[contact.geom[:count]].any(axis=1) & (rows >= 0) & (contact.dim[:count] >= 3)
-    rows, gap, friction = rows[some], contact.dist[:count][some], contact.friction[:count][some]
+    rows, gap = rows[some], contact.dist[:count][some]
     if not len(rows):
         return
     velocity = data.efc_vel[rows[:, None] + [0, 1, 2]]
-    lift = friction[:, 0] * np.hypot(velocity[:, 1], velocity[:, 2])
-    wanted = np.where(gap > 0.0, gap, _BACK * gap) / step + np.minimum(lift, _LIFT / step)
+    wanted = np.where(gap > 0.0, gap, _BACK * gap) / step
     data.efc_aref[rows] = -(velocity[:, 0] + wanted) / step
     data.efc_aref[rows[:, None] + [1, 2]] = -velocity[:, 1:] / step

@@ -23,10 +23,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-__all__ = ["ROWS", "PadRows", "tangents", "write_constraint", "write_contacts", "write_reference"]
+__all__ = ["ROWS", "PadRows", "cross", "tangents", "write_constraint", "write_contacts", "write_reference"]
 
 ROWS = 6
 """Rows of a contact: normal, two tangents, spin, two of rolling."""
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 _LEAST = 1e-6
 """Least coefficient of friction, which MuJoCo wants positive."""
 
@@ -57,12 +58,17 @@ class PadRows:
         return result
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products (…, 3); NumPy's own takes several times as long for a few."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]
+
+
 def tangents(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit tangents (n, 3) of a gel: along the pad's x as nearly as can be, and that turned by 90° about the normal (n, 3)."""
     first = -normal[:, :1] * normal
     first[:, 0] += 1.0
     first /= np.sqrt(np.vecdot(first, first))[:, None]
-    return first, np.cross(normal, first)
+    return first, cross(normal, first)
 
 
 def write_contacts(model: mujoco.MjModel, data: mujoco.MjData, rows: PadRows, chosen: slice, geoms: np.ndarray) -> bool:

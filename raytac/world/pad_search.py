@@ -92,7 +92,7 @@ class PadSearch:
         """Contacts of one pad and one body at poses (n, 4, 4)."""
         parts, radius, overlap = self._bodies[i], float(self._radius[i]), self._overlaps[p]
         touches = overlap.touches(parts, poses, radius)
-        found = [self._row(p, i, int(row), poses, touches, k, 0.0) for k, row in enumerate(touches.env)]
+        result = [self._row(p, i, int(row), poses, touches, k, 0.0) for k, row in enumerate(touches.env)]
         apart = np.setdiff1d(np.arange(len(poses)), touches.env)
         apart = apart[reach[apart] > 0.0]
         if len(apart):
@@ -104,10 +104,10 @@ class PadSearch:
             apart, shift = apart[some], np.maximum(gap[some], 0.0) + _SHALLOW
             if len(apart):
                 beside = overlap.touches(parts, _lowered(poses[apart], shift), radius)
-                found += [
+                result += [
                     self._row(p, i, int(apart[row]), poses, beside, k, float(shift[row])) for k, row in enumerate(beside.env)
                 ]
-        return found
+        return result
 
     def _grid(self, p: int, pitch: float) -> PadGrid:
         key = p, round(pitch, 7)

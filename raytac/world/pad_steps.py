@@ -53,7 +53,7 @@ class StepChoice:
         return np.maximum(gap, _CASE_TRAVEL) / np.maximum(speed, 1e-12)
 
     def rounded(self, longest: np.ndarray, done: np.ndarray) -> np.ndarray:
-        """Ticks (n,) of the next step, which is not longer than ``longest`` (n,) [s], of environments that have done ``done`` (n,) ticks."""
+        """Ticks (n,) of the next step, not longer than ``longest`` (n,) [s], of environments that have done ``done`` (n,) ticks."""
         wanted = np.clip(longest / self.timestep * self.ticks * (1.0 + 1e-9), 1.0, self.ticks)
         power = 2 ** np.floor(np.log2(wanted)).astype(int)
         aligned = np.where(done == 0, self.ticks, done & -done)

@@ -38,8 +38,9 @@ from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.hard_contacts import is_hard, write_hard_reference
+from raytac.world.pad_motion import PadMotion, motion_of, relative, turned
 from raytac.world.pad_overlap import PadOverlap
-from raytac.world.pad_rows import ROWS, PadRows, tangents, write_constraint, write_contacts, write_reference
+from raytac.world.pad_rows import ROWS, PadRows, cross, tangents, write_constraint, write_contacts, write_reference
 from raytac.world.pad_search import PadSearch, half_spaces, near_pad
 from raytac.world.pad_steps import StepChoice
 from raytac.world.pad_surfaces import PadSurfaces
@@ -65,20 +66,6 @@ class _Pad:
 
 _PadPoses = tuple[str, _Pad, np.ndarray]
 """A pad with ``pad_from_body`` (n, bodies, 4, 4)."""
-
-
-@dataclass(frozen=True)
-class _Motion:
-    """Poses and velocities of bodies in the frames of pads, of n environments."""
-
-    world_from_pad: np.ndarray
-    """(n, pads, 4, 4)."""
-    pad_from_body: np.ndarray
-    """(n, pads, bodies, 4, 4)."""
-    velocity: np.ndarray
-    """Of bodies' origins relative to the pad [m/s], pad frame, (n, pads, bodies, 3)."""
-    spin: np.ndarray
-    """Angular velocity relative to the pad [rad/s], (n, pads, bodies, 3)."""
 
 
 @dataclass(frozen=True)
@@ -247,7 +234,7 @@ class RigidPads:
     ) -> tuple[_Put, np.ndarray, np.ndarray]:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1``; returns also the ticks and the length [s] of each step, (n,)."""
         models, some = self._models, [datas[b] for b in envs.tolist()]
-        motion = self._motion(some)
+        motion = motion_of(self.model, some, self._site_index, self._pad_index, self._body_index)
         poses = [(name, pad, motion.pad_from_body[:, k, : self._count]) for k, (name, pad) in enumerate(self.pads.items())]
         self._mark_pierced(poses, envs, before, failed)
         left = choice.timestep * (1.0 - done / choice.ticks)
@@ -281,42 +268,24 @@ class RigidPads:
         pose = motion.pad_from_body[row, contacts.pad, contacts.body]
         return _Put(contacts, law.radius(np.maximum(spring.deepest, 0.0)), rows, turn, speed, pose), ticks, step
 
-    def _motion(self, datas: Sequence[mujoco.MjData]) -> _Motion:
-        """Poses and velocities of the states given, after their velocities are known."""
-        world_from_pad = site_poses(datas, self._site_index)
-        world_from_body = np.concatenate([body_poses(datas, self._body_index), world_from_pad], axis=1)
-        pad_from_body = _relative(world_from_pad[:, :, None], world_from_body[:, None])
-        indices = np.concatenate([self._pad_index, self._touched])
-        twist = np.array([data.cvel[indices] for data in datas]).reshape(len(datas), len(indices), 6)
-        # MuJoCo's velocities are about the centre of mass of the kinematic tree.
-        about = np.array([data.subtree_com[self.model.body_rootid[indices]] for data in datas]).reshape(len(datas), -1, 3)
-        place = np.concatenate([world_from_pad[..., :3, 3], world_from_body[..., :3, 3]], axis=1)
-        linear = twist[..., 3:] + np.cross(twist[..., :3], place - about)
-        pads = len(self._pad_index)
-        spin = twist[:, None, pads:, :3] - twist[:, :pads, None, :3]
-        apart = place[:, None, pads:] - place[:, :pads, None]
-        velocity = linear[:, None, pads:] - linear[:, :pads, None] - np.cross(twist[:, :pads, None, :3], apart)
-        to_pad = world_from_pad[:, :, None, :3, :3]
-        return _Motion(world_from_pad, pad_from_body, _turned(velocity, to_pad), _turned(spin, to_pad))
-
-    def _contacts(self, motion: _Motion, envs: np.ndarray, left: np.ndarray) -> PadContacts:
+    def _contacts(self, motion: PadMotion, envs: np.ndarray, left: np.ndarray) -> PadContacts:
         """Contacts of bodies and gels with pads, or what may come near them in the time ``left`` (n,) [s]."""
         bodies = self._search.contacts(motion.pad_from_body[:, :, : self._count], envs, self._reach(motion, left))
         reach = np.linalg.norm(motion.velocity[:, :, self._count :], axis=-1) * left[:, None, None]
         gels = self._gel_pairs.contacts(motion.pad_from_body[:, :, self._count :], envs, reach, self._count)
         return PadContacts.joined([bodies, *gels]) if gels else bodies
 
-    def _reach(self, motion: _Motion, left: np.ndarray) -> np.ndarray:
+    def _reach(self, motion: PadMotion, left: np.ndarray) -> np.ndarray:
         """Distance (n, pads) [m] that the fastest body may come nearer to each pad in the time ``left`` (n,) [s]."""
         if not len(self.bodies):
             return np.zeros(motion.world_from_pad.shape[:2])
         return self._speed(motion).max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
 
-    def _closing(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> np.ndarray:
+    def _closing(self, contacts: PadContacts, motion: PadMotion, row: np.ndarray) -> np.ndarray:
         """Speeds (n,) at which contacts close [m/s]."""
         at = row, contacts.pad, contacts.body
         arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        return -np.vecdot(motion.velocity[at] + np.cross(motion.spin[at], arm), contacts.normal)
+        return -np.vecdot(motion.velocity[at] + cross(motion.spin[at], arm), contacts.normal)
 
     def _law(self, contacts: PadContacts) -> LoadTables:
         return LoadTables(contacts, self._thickness(contacts), self._softer(contacts))
@@ -329,7 +298,7 @@ class RigidPads:
         """Factors (n,) of the modulus of the pad's gel; with that of the other gel in series."""
         return self._gel_pairs.factor(contacts, self._count, self._models.gel_stiffness)
 
-    def _beside_cases(self, choice: StepChoice, motion: _Motion) -> np.ndarray:
+    def _beside_cases(self, choice: StepChoice, motion: PadMotion) -> np.ndarray:
         """Longest steps (n,) [s] in which no body's bounding ball enters a case far."""
         if not self._count:
             return np.full(len(motion.velocity), np.inf)
@@ -339,7 +308,7 @@ class RigidPads:
         longest[..., self._planes[0]] = np.inf
         return longest.min(axis=(1, 2))
 
-    def _speed(self, motion: _Motion) -> np.ndarray:
+    def _speed(self, motion: PadMotion) -> np.ndarray:
         """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies relative to pads; of a half-space, within a metre."""
         size = np.minimum(self._radius, 1.0)
         velocity, spin = motion.velocity[:, :, : self._count], motion.spin[:, :, : self._count]
@@ -375,7 +344,7 @@ class RigidPads:
         self._acceleration[apart] = 0.0
 
     def _rows(
-        self, contacts: PadContacts, law: LoadTables, spring: NormalSpring, motion: _Motion, row: np.ndarray, step: np.ndarray
+        self, contacts: PadContacts, law: LoadTables, spring: NormalSpring, motion: PadMotion, row: np.ndarray, step: np.ndarray
     ) -> tuple[PadRows, np.ndarray]:
         """Rows of the contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``)."""
         models, at = self._models, (contacts.env, contacts.pad, contacts.body)
@@ -423,7 +392,7 @@ class RigidPads:
         self,
         contacts: PadContacts,
         spring: NormalSpring,
-        motion: _Motion,
+        motion: PadMotion,
         row: np.ndarray,
         friction: np.ndarray,
         lever: np.ndarray,
@@ -436,7 +405,7 @@ class RigidPads:
         """
         at = row, contacts.pad, contacts.body
         arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        velocity = motion.velocity[at] + np.cross(motion.spin[at], arm)
+        velocity = motion.velocity[at] + cross(motion.spin[at], arm)
         one, two = tangents(contacts.normal)
         slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
         spin = np.vecdot(motion.spin[at], contacts.normal)
@@ -449,14 +418,14 @@ class RigidPads:
     def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         first, second = tangents(normal)
         one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
-        return one, np.cross(normal, one)
+        return one, cross(normal, one)
 
-    def _tilt(self, contacts: PadContacts, motion: _Motion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _tilt(self, contacts: PadContacts, motion: PadMotion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
         tangents by the pad's, (n, 2, 2).
 
-        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the height of
-        that centre over the gel: by nothing at all for a ball.
+        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the
+        height of that centre over the gel: by nothing at all for a ball.
         """
         pose = motion.pad_from_body[row, contacts.pad, contacts.body]
         middle = (pose[:, :3, :3] @ self._mass_centre[contacts.body][..., None])[..., 0] + pose[:, :3, 3]
@@ -516,14 +485,14 @@ class RigidPads:
         axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
         # MuJoCo's force is on the second body; the pad gets the opposite.
         push = -(force[:, None, :3] @ axes)[:, 0]
-        torque = -(force[:, None, 3:] @ axes)[:, 0] + np.cross(contacts.centre, push)
+        torque = -(force[:, None, 3:] @ axes)[:, 0] + cross(contacts.centre, push)
         np.add.at(self._wrench, (contacts.env, contacts.pad), np.concatenate([push, torque], axis=1))
         gel = np.flatnonzero(contacts.body >= self._count)
         if len(gel):
             # The other gel feels the opposite, about its own origin.
             pose = put.pose[gel]
-            torque = -torque[gel] + np.cross(pose[:, :3, 3], push[gel])
-            opposite = np.concatenate([_turned(-push[gel], pose[:, :3, :3]), _turned(torque, pose[:, :3, :3])], axis=1)
+            torque = -torque[gel] + cross(pose[:, :3, 3], push[gel])
+            opposite = np.concatenate([turned(-push[gel], pose[:, :3, :3]), turned(torque, pose[:, :3, :3])], axis=1)
             np.add.at(self._wrench, (contacts.env[gel], contacts.body[gel] - self._count), opposite)
 
     def wrench(self, name: str) -> np.ndarray:
@@ -553,7 +522,7 @@ class RigidPads:
         return self._surfaces.reading(
             name,
             grid,
-            _relative(world_from_pad[:, index, None], body_poses(some, self._body_index)),
+            relative(world_from_pad[:, index, None], body_poses(some, self._body_index)),
             self.wrench(name)[rows],
             failed,
             rows,
@@ -565,7 +534,7 @@ class RigidPads:
         """Every pad with ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
         world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
         for k, (name, pad) in enumerate(self.pads.items()):
-            yield name, pad, _relative(world_from_pad[:, k, None], world_from_body)
+            yield name, pad, relative(world_from_pad[:, k, None], world_from_body)
 
     def _near(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
         """True (n, bodies) where bodies at poses (n, bodies, 4, 4) may reach the pad's box."""
@@ -595,20 +564,6 @@ class RigidPads:
                     path = path[self._near(pad, np.repeat(path[:, None], len(self.bodies), axis=1))[:, i]]
                     pierced[row] |= pad.face.pierced(body.parts, path, radius).any()
                 failed[envs[pierced]] = True
-
-
-def _relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
-    """``pad_from_body`` (…, 4, 4) of poses that broadcast."""
-    away = np.broadcast_to(world_from_body, np.broadcast_shapes(world_from_pad.shape, world_from_body.shape)).copy()
-    away[..., :3, 3] -= world_from_pad[..., :3, 3]
-    back = np.swapaxes(world_from_pad[..., :3, :3], -1, -2)
-    away[..., :3, :] = back @ away[..., :3, :]
-    return away
-
-
-def _turned(vectors: np.ndarray, target_from_source: np.ndarray) -> np.ndarray:
-    """Vectors (…, 3) of the target frame in the source's, by rotations (…, 3, 3)."""
-    return (vectors[..., None, :] @ target_from_source)[..., 0, :]
 
 
 def _runs(envs: np.ndarray) -> Iterator[tuple[int, slice]]:

@@ -97,8 +97,8 @@ class ShearState:
     ) -> None:
         """Add a step's displacement (n, 3) and let elements slip.
 
-        ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact and its ``radius`` (n,)
-        [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
+        ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact and its ``radius``
+        (n,) [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
         """
         stretch = self.stretch[rows] + displacement[:, None]
         largest = 1.5 * limit / np.maximum(self.stiffness[rows], 1e-30)

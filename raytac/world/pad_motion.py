@@ -1,0 +1,71 @@
+"""Poses and velocities of bodies, and of other gels, in the frames of pads; all environments at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from raytac.robots.frames import body_poses, site_poses
+from raytac.world.pad_rows import cross
+
+__all__ = ["PadMotion", "motion_of", "relative", "turned"]
+
+
+@dataclass(frozen=True)
+class PadMotion:
+    """Poses and velocities of bodies in the frames of pads, of n environments."""
+
+    world_from_pad: np.ndarray
+    """(n, pads, 4, 4)."""
+    pad_from_body: np.ndarray
+    """(n, pads, bodies, 4, 4)."""
+    velocity: np.ndarray
+    """Of bodies' origins relative to the pad [m/s], pad frame, (n, pads, bodies, 3)."""
+    spin: np.ndarray
+    """Angular velocity relative to the pad [rad/s], (n, pads, bodies, 3)."""
+
+
+def motion_of(
+    model: mujoco.MjModel, datas: Sequence[mujoco.MjData], sites: np.ndarray, pads: np.ndarray, bodies: np.ndarray
+) -> PadMotion:
+    """Motion in the states given, after their velocities are known.
+
+    Args:
+        model: any of the states' models.
+        datas: n states.
+        sites: sites at the pads' frames.
+        pads: bodies that carry them.
+        bodies: indices of bodies; the pads follow them as what is touched.
+    """
+    world_from_pad = site_poses(datas, sites)
+    world_from_body = np.concatenate([body_poses(datas, bodies), world_from_pad], axis=1)
+    pad_from_body = relative(world_from_pad[:, :, None], world_from_body[:, None])
+    indices = np.concatenate([pads, bodies, pads])
+    twist = np.array([data.cvel[indices] for data in datas]).reshape(len(datas), len(indices), 6)
+    # MuJoCo's velocities are about the centre of mass of the kinematic tree.
+    about = np.array([data.subtree_com[model.body_rootid[indices]] for data in datas]).reshape(len(datas), -1, 3)
+    place = np.concatenate([world_from_pad[..., :3, 3], world_from_body[..., :3, 3]], axis=1)
+    linear = twist[..., 3:] + cross(twist[..., :3], place - about)
+    count = len(pads)
+    spin = twist[:, None, count:, :3] - twist[:, :count, None, :3]
+    apart = place[:, None, count:] - place[:, :count, None]
+    velocity = linear[:, None, count:] - linear[:, :count, None] - cross(twist[:, :count, None, :3], apart)
+    to_pad = world_from_pad[:, :, None, :3, :3]
+    return PadMotion(world_from_pad, pad_from_body, turned(velocity, to_pad), turned(spin, to_pad))
+
+
+def relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndarray:
+    """``pad_from_body`` (…, 4, 4) of poses that broadcast."""
+    away = np.broadcast_to(world_from_body, np.broadcast_shapes(world_from_pad.shape, world_from_body.shape)).copy()
+    away[..., :3, 3] -= world_from_pad[..., :3, 3]
+    back = np.swapaxes(world_from_pad[..., :3, :3], -1, -2)
+    away[..., :3, :] = back @ away[..., :3, :]
+    return away
+
+
+def turned(vectors: np.ndarray, target_from_source: np.ndarray) -> np.ndarray:
+    """Vectors (…, 3) of the target frame in the source's, by rotations (…, 3, 3)."""
+    return (vectors[..., None, :] @ target_from_source)[..., 0, :]
