@@ -14,11 +14,11 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid, make_grid
 from raytac.physics.rigid.contacts import PadContacts
+from raytac.physics.rigid.search import PadSearch
 from raytac.se3 import inverse
 from raytac.shapes.part import Part, mesh_part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.pad_search import PadSearch
 
 __all__ = ["GelPairs"]
 

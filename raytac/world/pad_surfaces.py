@@ -16,7 +16,7 @@ from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import GelpadSpec
 from raytac.world.forbidden_overlap import BondedFace
-from raytac.world.pad_search import half_spaces, near_pad
+from raytac.world.near_pads import half_spaces, near_pad
 
 __all__ = ["PadSurfaces"]
 

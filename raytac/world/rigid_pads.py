@@ -29,6 +29,7 @@ from raytac.physics.base import PadReading
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.implicit_spring import NormalSpring, contact_rate, normal_spring
 from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
+from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear import ShearState
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
@@ -38,10 +39,9 @@ from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.hard_contacts import is_hard, write_hard_reference
+from raytac.world.near_pads import half_spaces, near_pad
 from raytac.world.pad_motion import PadMotion, motion_of, relative, turned
-from raytac.world.pad_overlap import PadOverlap
 from raytac.world.pad_rows import ROWS, PadRows, cross, tangents, write_constraint, write_contacts, write_reference
-from raytac.world.pad_search import PadSearch, half_spaces, near_pad
 from raytac.world.pad_steps import StepChoice
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.world_model import WorldModel
@@ -61,7 +61,7 @@ class _Pad:
         self.mounted, self.spec = mounted, spec
         self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
         self.gel = int(model.geom(mounted.gel).id)
-        self.overlap, self.face = PadOverlap(spec.gelpad), BondedFace(spec.gelpad)
+        self.face = BondedFace(spec.gelpad)
 
 
 _PadPoses = tuple[str, _Pad, np.ndarray]
@@ -503,13 +503,15 @@ class RigidPads:
         """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
         overlaps = []
         for name, pad, pad_from_body in self._poses([data]):
-            near = self._near(pad, pad_from_body)
-            for i in np.flatnonzero(near[0]).tolist():
-                if pad.face.pierced(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))[0]:
-                    overlaps.append((name, self.bodies[i].name, np.inf))
-                    continue
-                touches = pad.overlap.touches(self.bodies[i].parts, pad_from_body[:, i], float(self._radius[i]))
-                overlaps += [(name, self.bodies[i].name, float(depth)) for depth in touches.depth]
+            overlaps += [
+                (name, self.bodies[i].name, np.inf) for i in np.flatnonzero(self._pierced(pad, pad_from_body)[0]).tolist()
+            ]
+        poses = np.stack([pad_from_body for _, _, pad_from_body in self._poses([data])], axis=1)
+        contacts = self._search.contacts(poses, np.zeros(1, int), 0.0)
+        names = list(self.pads)
+        for pad, body, depth in zip(contacts.pad.tolist(), contacts.body.tolist(), contacts.depth.tolist(), strict=True):
+            if (names[pad], self.bodies[body].name, np.inf) not in overlaps:
+                overlaps.append((names[pad], self.bodies[body].name, depth))
         return overlaps
 
     def reading(

@@ -13,10 +13,10 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.contacts import LoadTables
+from raytac.physics.rigid.search import PadSearch
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
 from raytac.se3 import inverse
-from raytac.world.pad_search import PadSearch
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import checked_states, own_world_model

@@ -72,6 +72,18 @@ def incremental_stiffness(radius: wp.float64, law: wp.array2d(dtype=wp.float64),
 
 
 @wp.func
+def radius_of(nodes: wp.float64, cell: wp.float64) -> wp.float64:
+    """Radius [m] of a disc with the area of so many nodes, each of ``cell`` [m²]."""
+    return wp.sqrt(nodes * cell / _PI)
+
+
+@wp.func
+def stiffness_of(nodes: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
+    """dF/dδ [N/m] of a contact that covers so many nodes."""
+    return incremental_stiffness(radius_of(nodes, cell), law, pad)
+
+
+@wp.func
 def tabulate(
     bins: Bins,
     block: wp.int32,
@@ -93,13 +105,21 @@ def tabulate(
         bins.low[block, k] = later
     nodes = wp.int32(0)
     before = -infinity()
-    depth_before, stiffness_before, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    depth_before, total = wp.float64(0.0), wp.float64(0.0)
+    stiffness_before = stiffness_of(_HALF, cell, law, pad)
     for k in range(_BINS + 1):
         share = wp.float64(k) / _SCALE
         depth = deepest * share * share
-        if k > 0:
+        if k > 0 and bins.count[block, k - 1] > 0:
+            # The stiffness is integrated from kink to kink, so that the force does not jump as nodes pass from bin to bin.
+            first = wp.clamp(wp.float64(2.0) * bins.low[block, k - 1], depth_before, depth)
+            stiffness = stiffness_of(wp.float64(nodes) + _HALF, cell, law, pad)
+            total += _HALF * (stiffness + stiffness_before) * (first - depth_before)
             nodes += bins.count[block, k - 1]
             before = wp.max(before, bins.high[block, k - 1])
+            depth_before = wp.clamp(wp.float64(2.0) * before, first, depth)
+            stiffness_before = stiffness_of(wp.float64(nodes) - _HALF, cell, law, pad)
+            total += _HALF * (stiffness + stiffness_before) * (depth_before - first)
         counted = wp.float64(0.5)
         if nodes > 0:
             # Half a node at its own gap, so that the area grows continuously from node to node.
@@ -109,11 +129,9 @@ def tabulate(
                 after = bins.low[block, k]
             if after < _INF and after > before:
                 counted += wp.clamp((_HALF * depth - before) / (after - before), _0, wp.float64(1.0))
-        a = wp.sqrt(wp.max(counted, _HALF) * cell / _PI)
-        stiffness = incremental_stiffness(a, law, pad)
-        if k > 0:
-            total += _HALF * (stiffness + stiffness_before) * (depth - depth_before)
+        stiffness = stiffness_of(counted, cell, law, pad)
+        total += _HALF * (stiffness + stiffness_before) * (depth - depth_before)
         depth_before, stiffness_before = depth, stiffness
         if k % _STEP == 0:
             force[row, k // _STEP] = total
-            radius[row, k // _STEP] = a
+            radius[row, k // _STEP] = radius_of(counted, cell)

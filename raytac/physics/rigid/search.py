@@ -204,6 +204,7 @@ _ROWS = {
     "centre": wp.vec3d,
     "normal": wp.vec3d,
     "clearance": wp.float64,
+    "spread": wp.vec3d,
     "deepest": wp.float64,
     "force": wp.float64,
     "radius": wp.float64,

@@ -73,6 +73,7 @@ class Rows:
     centre: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3d)
     clearance: wp.array(dtype=wp.float64)
+    spread: wp.array(dtype=wp.vec3d)
     deepest: wp.array(dtype=wp.float64)
     force: wp.array2d(dtype=wp.float64)
     radius: wp.array2d(dtype=wp.float64)
@@ -391,6 +392,10 @@ def measure_pair(
     s, sx, sy, sz, szz, slope_x, slope_y = (
         wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
     )  # fmt: skip
+    # Of the overlap's area: number of nodes, first and second moments.
+    n1, nx1, ny1, nxx, nxy, nyy = (
+        wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
+    )  # fmt: skip
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
     beyond_law = infinity()
@@ -409,6 +414,12 @@ def measure_pair(
                 szz += overlap * overlap
                 slope_x += overlap * u[2]
                 slope_y += overlap * v[2]
+                n1 += wp.float64(1.0)
+                nx1 += u[0]
+                ny1 += v[0]
+                nxx += u[0] * u[0]
+                nxy += u[0] * v[0]
+                nyy += v[0] * v[0]
             if _2 * (gap + depth) < deepest:
                 add_node(work.bins, block, wp.max(gap + depth, _0), deepest)
             else:
@@ -417,11 +428,20 @@ def measure_pair(
     beyond_law = least_of(beyond_law)
     s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
     slope_x, slope_y = total_of(slope_x), total_of(slope_y)
+    n1, nx1, ny1, nxx, nxy, nyy = total_of(n1), total_of(nx1), total_of(ny1), total_of(nxx), total_of(nxy), total_of(nyy)
     if lane == 0:
         rows.valid[row] = 1
         rows.depth[row] = depth
         rows.deepest[row] = deepest
         rows.clearance[row] = lowest - bond
+        rows.spread[row] = wp.vec3d(_0, _0, _0)
+        if touching == 1 and s > _0:
+            x, y = sx / s, sy / s
+            rows.spread[row] = wp.vec3d(
+                (nxx - _2 * x * nx1 + n1 * x * x) / s,
+                (nxy - x * ny1 - y * nx1 + n1 * x * y) / s,
+                (nyy - _2 * y * ny1 + n1 * y * y) / s,
+            )
         if s > _0:
             rows.centre[row] = wp.vec3d(sx / s, sy / s, sz / s - szz / s + shift)
             rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
@@ -449,6 +469,7 @@ def missing_row(rows: Rows, row: wp.int32, depth: wp.float64, clearance: wp.floa
     rows.valid[row] = 1
     rows.depth[row] = depth
     rows.clearance[row] = clearance
+    rows.spread[row] = wp.vec3d(_NAN, _NAN, _NAN)
     rows.deepest[row] = _NAN
     rows.centre[row] = wp.vec3d(_NAN, _NAN, _NAN)
     rows.normal[row] = wp.vec3d(_NAN, _NAN, _NAN)

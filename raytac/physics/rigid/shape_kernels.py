@@ -350,9 +350,7 @@ def under_primitive(
 
 
 @wp.func
-def under_surface(
-    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
-) -> wp.float64:
+def under_surface(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
     """Lowest z [m] of a mesh or relief on the vertical line at x, y."""
     if shapes.kind[part] == RELIEF:
         o, d = line_through(rotation, at, x, y), direction_of(rotation)
@@ -363,9 +361,7 @@ def under_surface(
 
 
 @wp.func
-def first_hit(
-    shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64
-) -> wp.float64:
+def first_hit(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
     """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
     if shapes.kind[part] < MESH:
         return under_primitive(shapes.kind[part], shapes.size[part], rotation, at, x, y)

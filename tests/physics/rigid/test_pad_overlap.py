@@ -10,7 +10,7 @@ from raytac.physics.rigid.load_law import LoadLaw
 from raytac.shapes.part import Part, mesh_part, primitive
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
-from raytac.world.pad_overlap import PadOverlap
+from tests.physics.rigid.pad_overlap import PadOverlap
 
 PAD = load_sensor("gelsight_mini").gelpad
 OVERLAP = PadOverlap(PAD)
