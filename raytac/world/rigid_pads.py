@@ -239,6 +239,8 @@ class RigidPads:
         self._mark_pierced(poses, envs, before, failed)
         left = choice.timestep * (1.0 - done / choice.ticks)
         contacts = self._contacts(motion, envs, left)
+        # What has no law has gone through the gel, as two gels that overlap by more than one of them.
+        failed[contacts.env[np.isnan(contacts.deepest)]] = True
         row = np.searchsorted(envs, contacts.env)
         compliance = models.inverse_weight[contacts.env]
         at = np.arange(len(contacts))
