@@ -210,10 +210,7 @@ PROBES = (
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),
     Probe("assets", _ASSETS, True, "reinstall raytac, or run it from a complete checkout"),
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
-    Probe(
-        "warp", _WARP, False, "pip install 'raytac[ipc]'",
-        _absent("physics ipc (the soft pad), raytac calibrate, and raytac compare with --level or --markers need it", "warp"),
-    ),
+    Probe("warp", _WARP, True, "pip install 'warp-lang>=1.19,<2'"),
     Probe(
         "pytetwild", _TETWILD, False, "pip install 'raytac[ipc]'",
         _absent("soft objects on the soft pad need it", "pytetwild", "pyvista"),
