@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -14,11 +15,12 @@ from raytac.se3 import rotation_vector, rotations, turn_angle
 from raytac.shapes.part import Part
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.primitives import UNDERSIDES, bounds
-from raytac.shapes.underside import object_height
+from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import GelpadSpec
+from raytac.world.near_pads import half_spaces, near_pad
 from raytac.world.world_model import WorldModel
 
-__all__ = ["BondedFace", "Inside", "RobotOverlap"]
+__all__ = ["BondedFace", "BondedFaces", "Inside", "RobotOverlap"]
 
 _PITCH = 0.2e-3
 """Spacing of the vertical lines along which a bonded face is checked [m]."""
@@ -80,6 +82,48 @@ class BondedFace:
         result[:, :3, :3] = before[:3, :3] @ rotations(share * rotation_vector(before[:3, :3].T @ after[:3, :3]))
         result[:, :3, 3] = before[:3, 3] + share * (after[:3, 3] - before[:3, 3])
         return result
+
+
+class BondedFaces:
+    """Bonded faces of all pads of a world."""
+
+    def __init__(self, gelpads: Sequence[GelpadSpec], bodies: Sequence[Sequence[Part]]) -> None:
+        """``bodies``: parts of each in its frame."""
+        self._gelpads, self._bodies = tuple(gelpads), tuple(bodies)
+        self._faces = [BondedFace(gelpad) for gelpad in gelpads]
+        self._radius = np.array([object_radius(parts) for parts in bodies])
+        self._planes = half_spaces(bodies)
+        self._frame = np.tile(np.eye(4), (len(bodies), 1, 1))
+        """Pose of a half-space in its body's frame; the identity of all else."""
+        self._frame[self._planes[0]] = self._planes[1]
+
+    def pierced(self, pad_from_body: np.ndarray) -> np.ndarray:
+        """True (n, pads, bodies) where bodies at poses (n, pads, bodies, 4, 4) lie beyond a pad's bonded face."""
+        near = [self._near(k, pad_from_body[:, k]) for k in range(len(self._faces))]
+        result = np.stack(near, axis=1) if near else np.zeros(pad_from_body.shape[:3], bool)
+        for k, i in np.argwhere(result.any(axis=0)).tolist():
+            rows = np.flatnonzero(result[:, k, i])
+            result[rows, k, i] = self._faces[k].pierced(self._bodies[i], pad_from_body[rows, k, i], float(self._radius[i]))
+        return result
+
+    def mark(self, pad_from_body: np.ndarray, envs: np.ndarray, before: np.ndarray, failed: np.ndarray) -> None:
+        """Mark environments ``envs`` (n,) in ``failed`` (B,) in which a body is beyond a face, or was on the path from ``before``.
+
+        ``before`` (B, pads, bodies, 4, 4), NaN where unknown, becomes ``pad_from_body`` (n, pads, bodies, 4, 4).
+        """
+        pierced, was = self.pierced(pad_from_body), before[envs]
+        before[envs] = pad_from_body
+        for (k, face), (i, parts) in product(enumerate(self._faces), enumerate(self._bodies)):
+            radius, start, end = float(self._radius[i]), was[:, k, i], pad_from_body[:, k, i]
+            pieces = face.pieces(start @ self._frame[i], end @ self._frame[i], radius)
+            for row in np.flatnonzero(pieces > 1).tolist():
+                path = face.poses_between(start[row], end[row], int(pieces[row]))
+                path = path[self._near(k, np.repeat(path[:, None], len(self._bodies), axis=1))[:, i]]
+                pierced[row, k, i] |= face.pierced(parts, path, radius).any()
+        failed[envs[pierced.any(axis=(1, 2))]] = True
+
+    def _near(self, pad: int, poses: np.ndarray) -> np.ndarray:
+        return near_pad(self._gelpads[pad], self._radius, self._planes, poses)
 
 
 def _lowest(parts: Sequence[Part], poses: np.ndarray, radius: float) -> np.ndarray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from raytac.physics.rigid.contacts import PadContacts
 from raytac.robots.frames import body_poses, site_poses
 from raytac.world.pad_rows import cross
 
@@ -26,6 +27,20 @@ class PadMotion:
     """Of bodies' origins relative to the pad [m/s], pad frame, (n, pads, bodies, 3)."""
     spin: np.ndarray
     """Angular velocity relative to the pad [rad/s], (n, pads, bodies, 3)."""
+
+    def closing(self, contacts: PadContacts, row: np.ndarray) -> np.ndarray:
+        """Speeds (n,) at which contacts close [m/s]; ``row``: of each contact's environment here."""
+        at = row, contacts.pad, contacts.body
+        arm = contacts.centre - self.pad_from_body[at][:, :3, 3]
+        return -np.vecdot(self.velocity[at] + cross(self.spin[at], arm), contacts.normal)
+
+    def greatest_speed(self, radius: np.ndarray) -> np.ndarray:
+        """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies in balls of a radius (bodies,); of a half-space, within a metre.
+
+        The pads, which follow the bodies, are left out.
+        """
+        size, some = np.minimum(radius, 1.0), np.s_[:, :, : len(radius)]
+        return np.linalg.norm(self.velocity[some], axis=-1) + np.linalg.norm(self.spin[some], axis=-1) * size
 
 
 def motion_of(

@@ -18,12 +18,18 @@ viscous row gives. Of a ball m is 0, and its row is the friction of rolling.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-__all__ = ["ROWS", "PadRows", "cross", "tangents", "write_constraint", "write_contacts", "write_reference"]
+if TYPE_CHECKING:
+    from raytac.world.environment_models import EnvironmentModels
+
+__all__ = ["ROWS", "PadRows", "cross", "read_rows", "tangents", "write_rows"]
 
 ROWS = 6
 """Rows of a contact: normal, two tangents, spin, two of rolling."""
@@ -71,7 +77,54 @@ def tangents(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, cross(normal, first)
 
 
-def write_contacts(model: mujoco.MjModel, data: mujoco.MjData, rows: PadRows, chosen: slice, geoms: np.ndarray) -> bool:
+def write_rows(
+    models: Sequence[mujoco.MjModel] | EnvironmentModels,
+    datas: Sequence[mujoco.MjData],
+    rows: PadRows,
+    envs: np.ndarray,
+    geoms: np.ndarray,
+    failed: np.ndarray,
+) -> None:
+    """Put contacts after MuJoCo's own, after ``mj_step1``; environments whose memory for contacts is full are marked in ``failed``.
+
+    ``envs`` (n,): environments, sorted; ``geoms`` (n, 2): of gel and body.
+    """
+    inverse = rows.regularisation()
+    for b, some in _runs(envs):
+        model, data = models[b], datas[b]
+        if not _write_contacts(model, data, rows, some, geoms[some]):
+            failed[b] = True
+            continue
+        # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
+        mujoco.mj_makeConstraint(model, data)
+        _write_constraint(data, inverse[some], rows.friction[some])
+        mujoco.mj_island(model, data)
+        mujoco.mj_projectConstraint(model, data)
+        mujoco.mj_referenceConstraint(model, data)
+        _write_reference(data, inverse[some], rows.force[some], float(rows.step[some.start]))
+
+
+def read_rows(
+    models: Sequence[mujoco.MjModel] | EnvironmentModels, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Forces [N, N m] of rows, and their velocities [m/s, rad/s] at the end of the step, each (n, 6), after ``mj_step2``; 0 if failed."""
+    force, velocity = np.zeros((2, len(envs), ROWS))
+    for b, some in _runs(envs):
+        if not failed[b]:
+            last, whole = slice(-ROWS * (some.stop - some.start), None), np.empty(datas[b].nefc)
+            mujoco.mj_mulJacVec(models[b], datas[b], whole, datas[b].qvel)
+            force[some], velocity[some] = (values[last].reshape(-1, ROWS) for values in (datas[b].efc_force, whole))
+    return force, velocity
+
+
+def _runs(envs: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """Environments of sorted rows, and the rows of each."""
+    bounds = [*np.flatnonzero(np.diff(envs, prepend=-1)).tolist(), len(envs)]
+    for start, stop in pairwise(bounds):
+        yield int(envs[start]), slice(start, stop)
+
+
+def _write_contacts(model: mujoco.MjModel, data: mujoco.MjData, rows: PadRows, chosen: slice, geoms: np.ndarray) -> bool:
     """Put the chosen contacts after MuJoCo's own; False if its memory is full. ``geoms`` (n, 2): of gel and body."""
     count, blank = chosen.stop - chosen.start, _blank()
     for _ in range(count):
@@ -85,7 +138,7 @@ def write_contacts(model: mujoco.MjModel, data: mujoco.MjData, rows: PadRows, ch
     return True
 
 
-def write_constraint(data: mujoco.MjData, regularisation: np.ndarray, friction: np.ndarray) -> None:
+def _write_constraint(data: mujoco.MjData, regularisation: np.ndarray, friction: np.ndarray) -> None:
     """Set R (n, 6) of the last n contacts, after ``mj_makeConstraint``."""
     count = len(regularisation)
     data.efc_R[-ROWS * count :] = regularisation.ravel()
@@ -94,7 +147,7 @@ def write_constraint(data: mujoco.MjData, regularisation: np.ndarray, friction: 
     data.contact.mu[-count:] = np.maximum(friction[:, 0], _LEAST) * np.sqrt(regularisation[:, 1] / regularisation[:, 0])
 
 
-def write_reference(data: mujoco.MjData, regularisation: np.ndarray, force: np.ndarray, step: float) -> None:
+def _write_reference(data: mujoco.MjData, regularisation: np.ndarray, force: np.ndarray, step: float) -> None:
     """Set a* of the last n contacts, after ``mj_referenceConstraint``."""
     some = slice(-force.size, None)
     data.efc_aref[some] = (force * regularisation).ravel() - data.efc_vel[some] / step

@@ -79,8 +79,7 @@ class PadStepper:
         self.failed = np.zeros(num_envs, bool)
         self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
         self._pads = RigidPads(self.composed, EnvironmentModels(self.composed, num_envs), [mujoco.MjData(model)] * num_envs)
-        bodies = len(self.composed.touched)
-        self._before = {name: np.full((num_envs, bodies, 4, 4), np.nan) for name in self._frames.names}
+        self._before = self._pads.no_poses(num_envs)
         self._time = np.full(num_envs, -np.inf)
         self._put: Any = None
 
@@ -93,8 +92,7 @@ class PadStepper:
         self.failed[chosen], self._time[chosen], self._put = False, -np.inf, None
         self._pads.clear(chosen)
         self._frames.reset(chosen)
-        for poses in self._before.values():
-            poses[chosen] = np.nan
+        self._before[chosen] = np.nan
 
     def step(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.

@@ -16,9 +16,8 @@ Where something moves fast near a pad, that environment takes shorter steps (``S
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -28,44 +27,24 @@ from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.implicit_spring import NormalSpring, contact_rate, normal_spring
-from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear import ShearState
 from raytac.robots.frames import body_poses, site_poses
-from raytac.robots.mount import MountedSensor
 from raytac.shapes.underside import object_radius
-from raytac.specs.sensor import SensorSpec
 from raytac.world.environment_models import EnvironmentModels
-from raytac.world.forbidden_overlap import BondedFace
+from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
+from raytac.world.gel_rows import gel_rows, row_axes
 from raytac.world.hard_contacts import is_hard, write_hard_reference
-from raytac.world.near_pads import half_spaces, near_pad
+from raytac.world.near_pads import half_spaces
 from raytac.world.pad_motion import PadMotion, motion_of, relative, turned
-from raytac.world.pad_rows import ROWS, PadRows, cross, tangents, write_constraint, write_contacts, write_reference
+from raytac.world.pad_rows import PadRows, cross, read_rows, write_rows
 from raytac.world.pad_steps import StepChoice
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
 __all__ = ["RigidPads"]
-
-
-_EDGE = 0.7
-"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
-
-
-class _Pad:
-    """Pad of one sensor."""
-
-    def __init__(self, mounted: MountedSensor, spec: SensorSpec, model: mujoco.MjModel) -> None:
-        self.mounted, self.spec = mounted, spec
-        self.site, self.body = int(model.site(mounted.site).id), int(model.body(mounted.body).id)
-        self.gel = int(model.geom(mounted.gel).id)
-        self.face = BondedFace(spec.gelpad)
-
-
-_PadPoses = tuple[str, _Pad, np.ndarray]
-"""A pad with ``pad_from_body`` (n, bodies, 4, 4)."""
 
 
 @dataclass(frozen=True)
@@ -103,22 +82,17 @@ class RigidPads:
             rule = "must be 0 with rigid pads: the gel sticks by its shear, which a noslip pass would undo"
             raise InputError("option.noslip_iterations", value=int(option.noslip_iterations), rule=rule)
         self.composed, self.model, self._models = composed, composed.model, models
-        self.pads = {
-            mounted.name: _Pad(mounted, spec, composed.model)
-            for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
-        }
+        self._names = [mounted.name for mounted in composed.sensors]
         self.bodies = composed.touched
         self._count = len(self.bodies)
         self._body_index = np.array([body.index for body in self.bodies], int)
-        self._site_index = np.array([pad.site for pad in self.pads.values()], int)
-        self._pad_index = np.array([pad.body for pad in self.pads.values()], int)
-        self._gels = tuple(pad.spec.gelpad for pad in self.pads.values())
-        self._planes = half_spaces([body.parts for body in self.bodies])
-        self._frame = np.tile(np.eye(4), (len(self.bodies), 1, 1))
-        """Pose of a half-space in its body's frame; the identity of all else."""
-        self._frame[self._planes[0]] = self._planes[1]
+        self._site_index = np.array([composed.model.site(mounted.site).id for mounted in composed.sensors], int)
+        self._pad_index = np.array([composed.model.body(mounted.body).id for mounted in composed.sensors], int)
+        self._gels = tuple(spec.gelpad for spec in composed.sensor_specs)
+        shapes = [body.parts for body in self.bodies]
+        self._planes, self._faces = half_spaces(shapes)[0], BondedFaces(self._gels, shapes)
         self._radius = np.array([object_radius(body.parts) for body in self.bodies])
-        self._gel_geom = np.array([pad.gel for pad in self.pads.values()], int)
+        self._gel_geom = np.array([composed.model.geom(mounted.gel).id for mounted in composed.sensors], int)
         # What pads may touch: the bodies, then the gels of the pads.
         self._touched = np.concatenate([self._body_index, self._pad_index])
         geoms = [body.geoms[0] for body in self.bodies]
@@ -130,13 +104,12 @@ class RigidPads:
         # A model of one's own keeps the contacts that it has.
         self._hard = is_hard(composed.model) if composed.scene is not None else np.zeros(composed.model.ngeom, bool)
         self._fall = float(np.linalg.norm(option.gravity))
-        self._search = PadSearch(self._gels, [body.parts for body in self.bodies], num_envs=num_envs)
-        self._wrench = np.zeros((num_envs, len(self.pads), 6))
-        self._shear = ShearState(num_envs, len(self.pads), len(self._touched))
-        self._acceleration = np.zeros((num_envs, len(self.pads), len(self._touched)))
+        self._search = PadSearch(self._gels, shapes, num_envs=num_envs)
+        self._wrench = np.zeros((num_envs, len(self._names), 6))
+        self._shear = ShearState(num_envs, len(self._names), len(self._touched))
+        self._acceleration = np.zeros((num_envs, len(self._names), len(self._touched)))
         """At which contacts closed faster in their last step [m/s²]."""
-        shapes = [body.parts for body in self.bodies]
-        self._surfaces = PadSurfaces({name: pad.spec.gelpad for name, pad in self.pads.items()}, shapes, num_envs)
+        self._surfaces = PadSurfaces(dict(zip(self._names, self._gels, strict=True)), shapes, num_envs)
         self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -145,10 +118,10 @@ class RigidPads:
         Raises:
             OverlapError: a body starts beyond a pad's bonded face.
         """
-        for sensor, pad, pad_from_body in self._poses([datas[b] for b in envs]):
-            for row, i in np.argwhere(self._pierced(pad, pad_from_body)).tolist():
-                rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {sensor!r} is bonded to"
-                raise OverlapError(f"environment {envs[row]}: {rule}")
+        pierced = self._faces.pierced(self._pad_from_body([datas[b] for b in envs]))
+        for row, pad, i in np.argwhere(pierced).tolist():
+            rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {self._names[pad]!r} is bonded to"
+            raise OverlapError(f"environment {envs[row]}: {rule}")
         self.clear(envs)
 
     def clear(self, envs: Sequence[int]) -> None:
@@ -164,7 +137,7 @@ class RigidPads:
         So are those in which a body goes through a pad all the same.
         """
         scene = self.composed
-        before = {name: np.full((len(datas), len(self.bodies), 4, 4), np.nan) for name in self.pads}
+        before = self.no_poses(len(datas))
         for _ in range(round(scene.control_timestep / scene.timestep)):
             choice, done = StepChoice(scene.timestep), np.zeros(len(datas), int)
             while len(envs := np.flatnonzero(~failed & (done < choice.ticks))):
@@ -173,7 +146,7 @@ class RigidPads:
         for b in sound.tolist():
             mujoco.mj_kinematics(self._models[b], datas[b])  # so that poses are those of the end of the step
         if len(sound):
-            self._mark_pierced(list(self._poses([datas[b] for b in sound.tolist()])), sound, before, failed)
+            self._faces.mark(self._pad_from_body([datas[b] for b in sound.tolist()]), sound, before, failed)
 
     def _step(
         self,
@@ -182,7 +155,7 @@ class RigidPads:
         drive: Drive,
         choice: StepChoice,
         done: np.ndarray,
-        before: dict[str, np.ndarray],
+        before: np.ndarray,
         failed: np.ndarray,
     ) -> np.ndarray:
         """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
@@ -204,11 +177,11 @@ class RigidPads:
         self._after(datas, envs, put, failed)
         return ticks
 
-    def add(self, datas: Sequence[mujoco.MjData], before: dict[str, np.ndarray], failed: np.ndarray) -> _Put:
+    def add(self, datas: Sequence[mujoco.MjData], before: np.ndarray, failed: np.ndarray) -> _Put:
         """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``.
 
-        ``before``: poses (B, bodies, 4, 4) of bodies by pad, as this method left them the last time; NaN of none. The result is for
-        ``finish``, after ``mj_step2``. A step is as long as the model's: it is not divided where something moves fast.
+        ``before``: ``pad_from_body`` as this method left it the last time, ``no_poses`` at first. The result is for ``finish``, after
+        ``mj_step2``. A step is as long as the model's: it is not divided where something moves fast.
         """
         envs, choice = np.flatnonzero(~failed), StepChoice(self.composed.timestep)
         put, _, _ = self._insert(datas, envs, choice, np.zeros(len(envs), int), before, failed, whole=True)
@@ -227,7 +200,7 @@ class RigidPads:
         envs: np.ndarray,
         choice: StepChoice,
         done: np.ndarray,
-        before: dict[str, np.ndarray],
+        before: np.ndarray,
         failed: np.ndarray,
         *,
         whole: bool = False,
@@ -235,8 +208,7 @@ class RigidPads:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1``; returns also the ticks and the length [s] of each step, (n,)."""
         models, some = self._models, [datas[b] for b in envs.tolist()]
         motion = motion_of(self.model, some, self._site_index, self._pad_index, self._body_index)
-        poses = [(name, pad, motion.pad_from_body[:, k, : self._count]) for k, (name, pad) in enumerate(self.pads.items())]
-        self._mark_pierced(poses, envs, before, failed)
+        self._faces.mark(motion.pad_from_body[:, :, : self._count], envs, before, failed)
         left = choice.timestep * (1.0 - done / choice.ticks)
         contacts = self._contacts(motion, envs, left)
         # What has no law has gone through the gel, as two gels that overlap by more than one of them.
@@ -247,7 +219,7 @@ class RigidPads:
         compliance = compliance[at, self._pad_index[contacts.pad]] + compliance[at, self._touched[contacts.body]]
         movable = (compliance > 0.0) & ~failed[contacts.env]  # where the compliance is 0 neither moves
         contacts, row, compliance = contacts.of(movable), row[movable], compliance[movable]
-        speed = self._closing(contacts, motion, row)
+        speed = motion.closing(contacts, row)
         law = self._law(contacts)
         longest = np.minimum(self._beside_cases(choice, motion), choice.timestep)
         self._in_gels(choice, longest, contacts, row, compliance, speed, law, left)
@@ -260,8 +232,21 @@ class RigidPads:
         spring = NormalSpring(spring.force[held], spring.damping[held], spring.deepest[held])
         law = self._law(contacts)
         self._forget_apart(envs, contacts)
-        rows, turn = self._rows(contacts, law, spring, motion, row, step[row])
-        self._put(datas, contacts, rows, failed)
+        rows, turn = gel_rows(
+            contacts,
+            law,
+            spring,
+            motion,
+            row,
+            step[row],
+            shear=self._shear,
+            gels=self._gels,
+            softer=self._softer(contacts),
+            friction=self._friction(contacts),
+            mass_centre=self._mass_centre,
+        )
+        geoms = np.stack([self._gel_geom[contacts.pad], self._geom[contacts.body]], axis=1)
+        write_rows(models, datas, rows, contacts.env, geoms, failed)
         own = np.bincount(contacts.env, minlength=len(datas))
         for b, length in zip(envs.tolist(), step.tolist(), strict=True):
             count = datas[b].ncon - int(own[b])
@@ -281,13 +266,7 @@ class RigidPads:
         """Distance (n, pads) [m] that the fastest body may come nearer to each pad in the time ``left`` (n,) [s]."""
         if not len(self.bodies):
             return np.zeros(motion.world_from_pad.shape[:2])
-        return self._speed(motion).max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
-
-    def _closing(self, contacts: PadContacts, motion: PadMotion, row: np.ndarray) -> np.ndarray:
-        """Speeds (n,) at which contacts close [m/s]."""
-        at = row, contacts.pad, contacts.body
-        arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        return -np.vecdot(motion.velocity[at] + cross(motion.spin[at], arm), contacts.normal)
+        return motion.greatest_speed(self._radius).max(axis=2) * left[:, None] + self._fall * left[:, None] ** 2
 
     def _law(self, contacts: PadContacts) -> LoadTables:
         return LoadTables(contacts, self._thickness(contacts), self._softer(contacts))
@@ -306,15 +285,9 @@ class RigidPads:
             return np.full(len(motion.velocity), np.inf)
         apart = np.abs(motion.pad_from_body[:, :, : self._count, :3, 3] - self._case_centre[:, None]) - self._case_half[:, None]
         gap = np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - self._radius
-        longest = choice.beside_case(gap, self._speed(motion))
-        longest[..., self._planes[0]] = np.inf
+        longest = choice.beside_case(gap, motion.greatest_speed(self._radius))
+        longest[..., self._planes] = np.inf
         return longest.min(axis=(1, 2))
-
-    def _speed(self, motion: PadMotion) -> np.ndarray:
-        """Greatest speeds (n, pads, bodies) [m/s] of any point of bodies relative to pads; of a half-space, within a metre."""
-        size = np.minimum(self._radius, 1.0)
-        velocity, spin = motion.velocity[:, :, : self._count], motion.spin[:, :, : self._count]
-        return np.linalg.norm(velocity, axis=-1) + np.linalg.norm(spin, axis=-1) * size
 
     def _in_gels(
         self,
@@ -335,6 +308,12 @@ class RigidPads:
         acceleration = self._acceleration[contacts.env, contacts.pad, contacts.body]
         np.minimum.at(longest, row, choice.longest(contacts.depth, speed, rate, acceleration, thickness))
 
+    def _friction(self, contacts: PadContacts) -> np.ndarray:
+        """Coefficients (n,) of friction: the body's own against gel, else the gel's."""
+        models = self._models
+        own = np.append(models.friction_on_gel, np.full_like(models.gel_friction, np.nan), axis=1)[contacts.env, contacts.body]
+        return np.where(np.isnan(own), models.gel_friction[contacts.env, contacts.pad], own)
+
     def _forget_apart(self, envs: np.ndarray, contacts: PadContacts) -> None:
         """Clear the shear of contacts that have ended."""
         apart = np.zeros(self._acceleration.shape, bool)
@@ -344,119 +323,6 @@ class RigidPads:
         if apart.any():
             self._shear.clear(*np.nonzero(apart))
         self._acceleration[apart] = 0.0
-
-    def _rows(
-        self, contacts: PadContacts, law: LoadTables, spring: NormalSpring, motion: PadMotion, row: np.ndarray, step: np.ndarray
-    ) -> tuple[PadRows, np.ndarray]:
-        """Rows of the contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``)."""
-        models, at = self._models, (contacts.env, contacts.pad, contacts.body)
-        deepest = np.maximum(spring.deepest, 0.0)
-        radius, load = law.radius(deepest), law.force(deepest)[0]
-        softer = self._softer(contacts)
-        stiffness = np.ones((len(contacts), 2))
-        hysteresis = np.zeros(len(contacts))
-        tau = np.zeros(len(contacts))
-        for k, gel in enumerate(self._gels):
-            some = contacts.pad == k
-            size = radius[some]
-            stiffness[some] = np.stack([shear_stiffness(size, gel), twist_stiffness(size, gel)], axis=1)
-            hysteresis[some], tau[some] = gel.hysteresis, gel.relaxation_time
-        stiffness = np.maximum(stiffness * softer[:, None], 1e-12)
-        own = np.append(models.friction_on_gel, np.full_like(models.gel_friction, np.nan), axis=1)
-        friction = own[contacts.env, contacts.body]
-        friction = np.where(np.isnan(friction), models.gel_friction[contacts.env, contacts.pad], friction)
-        lever = 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
-        # As much at the end of a step as keeps both shear and spin stable, whatever its length.
-        time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
-        damping = stiffness[:, 0] * time
-        metacentric, height, turn = self._tilt(contacts, motion, row)
-        rolling = friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric)
-        # The cone must not cut this row before the centre of pressure is near the edge.
-        rolling = np.maximum(rolling, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
-        rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
-        pull = self._shear.begin(at, stiffness, contacts.centre)
-        force = np.zeros((len(contacts), ROWS))
-        force[:, 0] = spring.force - self._lift(contacts, spring, motion, row, friction, lever, damping, pull)
-        force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
-        force[:, 3] = -pull[:, 2]
-        rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
-        axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
-        return PadRows(
-            (rotation @ contacts.centre[..., None])[..., 0] + origin,
-            (axes @ np.swapaxes(rotation, 1, 2)).reshape(-1, 9),
-            np.stack([friction, friction, friction * lever, rolling[:, 0], rolling[:, 1]], axis=1),
-            force,
-            np.stack([spring.damping, damping], axis=1),
-            step,
-        ), turn
-
-    def _lift(
-        self,
-        contacts: PadContacts,
-        spring: NormalSpring,
-        motion: PadMotion,
-        row: np.ndarray,
-        friction: np.ndarray,
-        lever: np.ndarray,
-        damping: np.ndarray,
-        pull: np.ndarray,
-    ) -> np.ndarray:
-        """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
-
-        Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
-        """
-        at = row, contacts.pad, contacts.body
-        arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-        velocity = motion.velocity[at] + cross(motion.spin[at], arm)
-        one, two = tangents(contacts.normal)
-        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
-        spin = np.vecdot(motion.spin[at], contacts.normal)
-        tangential = pull[:, :2] + damping[:, None] * slip
-        torque = pull[:, 2] / lever + damping * spin * lever
-        excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
-        return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
-
-    @staticmethod
-    def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        first, second = tangents(normal)
-        one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
-        return one, cross(normal, one)
-
-    def _tilt(self, contacts: PadContacts, motion: PadMotion, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
-        tangents by the pad's, (n, 2, 2).
-
-        The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the
-        height of that centre over the gel: by nothing at all for a ball.
-        """
-        pose = motion.pad_from_body[row, contacts.pad, contacts.body]
-        middle = (pose[:, :3, :3] @ self._mass_centre[contacts.body][..., None])[..., 0] + pose[:, :3, 3]
-        height = np.vecdot(middle - contacts.centre, contacts.normal)
-        xx, xy, yy = contacts.spread.T
-        angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-        mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-        cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
-        # A rotation about one tangent moves the centre along the other.
-        spread = np.stack([mean - half, mean + half], axis=1)
-        return np.maximum(spread - height[:, None], 0.0), height, turn
-
-    def _put(self, datas: Sequence[mujoco.MjData], contacts: PadContacts, rows: PadRows, failed: np.ndarray) -> None:
-        """Put contacts among MuJoCo's; marks environments whose memory for contacts is full."""
-        geoms = np.stack([self._gel_geom[contacts.pad], self._geom[contacts.body]], axis=1)
-        inverse = rows.regularisation()
-        for b, some in _runs(contacts.env):
-            model, data = self._models[b], datas[b]
-            if not write_contacts(model, data, rows, some, geoms[some]):
-                failed[b] = True
-                continue
-            # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
-            mujoco.mj_makeConstraint(model, data)
-            write_constraint(data, inverse[some], rows.friction[some])
-            mujoco.mj_island(model, data)
-            mujoco.mj_projectConstraint(model, data)
-            mujoco.mj_referenceConstraint(model, data)
-            write_reference(data, inverse[some], rows.force[some], float(rows.step[some.start]))
 
     def _after(
         self,
@@ -468,15 +334,7 @@ class RigidPads:
         """Read forces and let the gels shear by what bodies moved in the step."""
         contacts, rows, turn = put.contacts, put.rows, put.turn
         self._wrench[envs] = 0.0
-        force, moved = np.zeros((2, len(contacts), ROWS))
-        for b, some in _runs(contacts.env):
-            if failed[b]:
-                continue
-            data = datas[b]
-            force[some] = data.efc_force[-ROWS * (some.stop - some.start) :].reshape(-1, ROWS)
-            velocity = np.empty(data.nefc)
-            mujoco.mj_mulJacVec(self._models[b], data, velocity, data.qvel)
-            moved[some] = velocity[-ROWS * (some.stop - some.start) :].reshape(-1, ROWS)
+        force, moved = read_rows(self._models, datas, contacts.env, failed)
         at = contacts.env, contacts.pad, contacts.body
         displacement = np.empty((len(contacts), 3))
         displacement[:, :2] = (turn @ moved[:, 1:3, None])[..., 0] * rows.step[:, None]
@@ -484,7 +342,7 @@ class RigidPads:
         limit = force[:, :1] * rows.friction[:, [0, 2]]
         self._shear.move(at, displacement, limit, contacts.centre, put.radius)
         self._acceleration[at] = (-moved[:, 0] - put.speed) / rows.step
-        axes = np.stack([contacts.normal, *self._tangents(contacts.normal, turn)], axis=1)
+        axes = row_axes(contacts.normal, turn)
         # MuJoCo's force is on the second body; the pad gets the opposite.
         push = -(force[:, None, :3] @ axes)[:, 0]
         torque = -(force[:, None, 3:] @ axes)[:, 0] + cross(contacts.centre, push)
@@ -499,28 +357,22 @@ class RigidPads:
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
-        return self._wrench[:, list(self.pads).index(name)].copy()
+        return self._wrench[:, self._names.index(name)].copy()
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
-        overlaps = []
-        for name, pad, pad_from_body in self._poses([data]):
-            overlaps += [
-                (name, self.bodies[i].name, np.inf) for i in np.flatnonzero(self._pierced(pad, pad_from_body)[0]).tolist()
-            ]
-        poses = np.stack([pad_from_body for _, _, pad_from_body in self._poses([data])], axis=1)
+        poses = self._pad_from_body([data])
         contacts = self._search.contacts(poses, np.zeros(1, int), 0.0)
-        names = list(self.pads)
-        for pad, body, depth in zip(contacts.pad.tolist(), contacts.body.tolist(), contacts.depth.tolist(), strict=True):
-            if (names[pad], self.bodies[body].name, np.inf) not in overlaps:
-                overlaps.append((names[pad], self.bodies[body].name, depth))
-        return overlaps
+        depth = np.zeros(poses.shape[1:3])
+        depth[contacts.pad, contacts.body] = contacts.depth
+        depth[self._faces.pierced(poses)[0]] = np.inf
+        return [(self._names[k], self.bodies[i].name, float(depth[k, i])) for k, i in np.argwhere(depth > 0.0).tolist()]
 
     def reading(
         self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
     ) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
-        rows, index = np.arange(len(datas)) if envs is None else np.asarray(envs), list(self.pads).index(name)
+        rows, index = np.arange(len(datas)) if envs is None else np.asarray(envs), self._names.index(name)
         some, failed = [datas[b] for b in rows.tolist()], failed[rows]
         world_from_pad = site_poses(some, self._site_index)
         return self._surfaces.reading(
@@ -534,44 +386,10 @@ class RigidPads:
             shear=lambda pressed: self._shear.of(rows, index, pressed),
         )
 
-    def _poses(self, datas: Sequence[mujoco.MjData]) -> Iterator[_PadPoses]:
-        """Every pad with ``pad_from_body`` (n, bodies, 4, 4) of the states given."""
-        world_from_pad, world_from_body = site_poses(datas, self._site_index), body_poses(datas, self._body_index)
-        for k, (name, pad) in enumerate(self.pads.items()):
-            yield name, pad, relative(world_from_pad[:, k, None], world_from_body)
+    def no_poses(self, num_envs: int) -> np.ndarray:
+        """Poses that are not known: NaN, (B, pads, bodies, 4, 4)."""
+        return np.full((num_envs, len(self._names), self._count, 4, 4), np.nan)
 
-    def _near(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
-        """True (n, bodies) where bodies at poses (n, bodies, 4, 4) may reach the pad's box."""
-        return near_pad(pad.spec.gelpad, self._radius, self._planes, pad_from_body)
-
-    def _pierced(self, pad: _Pad, pad_from_body: np.ndarray) -> np.ndarray:
-        """True (n, bodies) where bodies at poses (n, bodies, 4, 4) lie beyond the pad's bonded face."""
-        result = self._near(pad, pad_from_body)
-        for i, body in enumerate(self.bodies):
-            rows = np.flatnonzero(result[:, i])
-            if len(rows):
-                result[rows, i] = pad.face.pierced(body.parts, pad_from_body[rows, i], float(self._radius[i]))
-        return result
-
-    def _mark_pierced(
-        self, poses: Sequence[_PadPoses], envs: np.ndarray, before: dict[str, np.ndarray], failed: np.ndarray
-    ) -> None:
-        """Mark environments in which a body is beyond a pad's bonded face, or was on the path from ``before``, which is renewed."""
-        for name, pad, pad_from_body in poses:
-            was, beyond = before[name][envs], self._pierced(pad, pad_from_body)
-            before[name][envs] = pad_from_body
-            for i, body in enumerate(self.bodies):
-                radius, now, pierced = float(self._radius[i]), pad_from_body[:, i], beyond[:, i]
-                pieces = pad.face.pieces(was[:, i] @ self._frame[i], now @ self._frame[i], radius)
-                for row in np.flatnonzero(pieces > 1).tolist():
-                    path = pad.face.poses_between(was[row, i], now[row], int(pieces[row]))
-                    path = path[self._near(pad, np.repeat(path[:, None], len(self.bodies), axis=1))[:, i]]
-                    pierced[row] |= pad.face.pierced(body.parts, path, radius).any()
-                failed[envs[pierced]] = True
-
-
-def _runs(envs: np.ndarray) -> Iterator[tuple[int, slice]]:
-    """Environments of sorted rows, and the rows of each."""
-    bounds = [*np.flatnonzero(np.diff(envs, prepend=-1)).tolist(), len(envs)]
-    for start, stop in pairwise(bounds):
-        yield int(envs[start]), slice(start, stop)
+    def _pad_from_body(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
+        """Poses (n, pads, bodies, 4, 4) of bodies in the states given."""
+        return relative(site_poses(datas, self._site_index)[:, :, None], body_poses(datas, self._body_index)[:, None])

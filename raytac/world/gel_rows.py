@@ -1,0 +1,139 @@
+"""Rows of the contacts of gels in one step: normal spring, shear, spin and tilt, with the friction that bounds them (see ``PadRows``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from raytac.physics.rigid.contacts import LoadTables, PadContacts
+from raytac.physics.rigid.implicit_spring import NormalSpring
+from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
+from raytac.physics.rigid.shear import ShearState
+from raytac.specs.sensor import GelpadSpec
+from raytac.world.pad_motion import PadMotion
+from raytac.world.pad_rows import ROWS, PadRows, cross, tangents
+
+__all__ = ["gel_rows", "row_axes"]
+
+_EDGE = 0.7
+"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
+
+
+def gel_rows(
+    contacts: PadContacts,
+    law: LoadTables,
+    spring: NormalSpring,
+    motion: PadMotion,
+    row: np.ndarray,
+    step: np.ndarray,
+    *,
+    shear: ShearState,
+    gels: Sequence[GelpadSpec],
+    softer: np.ndarray,
+    friction: np.ndarray,
+    mass_centre: np.ndarray,
+) -> tuple[PadRows, np.ndarray]:
+    """Rows of n contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``).
+
+    Args:
+        contacts, law, spring: the contacts, their load laws and normal springs.
+        motion: of bodies relative to pads; ``row`` (n,): row of each contact's environment in it.
+        step: Δt [s], (n,).
+        shear: state of the contacts, which the step begins with.
+        gels: of the pads.
+        softer: factors of the gels' moduli, (n,).
+        friction: Coulomb's coefficients, (n,).
+        mass_centre: of what is touched, in its frame [m], (bodies, 3).
+    """
+    at = contacts.env, contacts.pad, contacts.body
+    deepest = np.maximum(spring.deepest, 0.0)
+    radius, load = law.radius(deepest), law.force(deepest)[0]
+    stiffness = np.ones((len(contacts), 2))
+    hysteresis = np.zeros(len(contacts))
+    tau = np.zeros(len(contacts))
+    for k, gel in enumerate(gels):
+        some = contacts.pad == k
+        size = radius[some]
+        stiffness[some] = np.stack([shear_stiffness(size, gel), twist_stiffness(size, gel)], axis=1)
+        hysteresis[some], tau[some] = gel.hysteresis, gel.relaxation_time
+    stiffness = np.maximum(stiffness * softer[:, None], 1e-12)
+    lever = 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
+    # As much at the end of a step as keeps both shear and spin stable, whatever its length.
+    time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
+    damping = stiffness[:, 0] * time
+    metacentric, height, turn = _tilt(contacts, motion, row, mass_centre)
+    rolling = friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric)
+    # The cone must not cut this row before the centre of pressure is near the edge.
+    rolling = np.maximum(rolling, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
+    rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
+    pull = shear.begin(at, stiffness, contacts.centre)
+    force = np.zeros((len(contacts), ROWS))
+    force[:, 0] = spring.force - _lift(contacts, spring, motion, row, friction, lever, damping, pull)
+    force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
+    force[:, 3] = -pull[:, 2]
+    rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
+    axes = row_axes(contacts.normal, turn)
+    return PadRows(
+        (rotation @ contacts.centre[..., None])[..., 0] + origin,
+        (axes @ np.swapaxes(rotation, 1, 2)).reshape(-1, 9),
+        np.stack([friction, friction, friction * lever, rolling[:, 0], rolling[:, 1]], axis=1),
+        force,
+        np.stack([spring.damping, damping], axis=1),
+        step,
+    ), turn
+
+
+def row_axes(normal: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Normal (n, 3) and tangents of rows, which ``turn`` (n, 2, 2) brings to the pad's, as rows of matrices (n, 3, 3)."""
+    first, second = tangents(normal)
+    one = turn[:, :1, 0] * first + turn[:, 1:, 0] * second
+    return np.stack([normal, one, cross(normal, one)], axis=1)
+
+
+def _lift(
+    contacts: PadContacts,
+    spring: NormalSpring,
+    motion: PadMotion,
+    row: np.ndarray,
+    friction: np.ndarray,
+    lever: np.ndarray,
+    damping: np.ndarray,
+    pull: np.ndarray,
+) -> np.ndarray:
+    """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
+
+    Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+    """
+    at = row, contacts.pad, contacts.body
+    arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
+    velocity = motion.velocity[at] + cross(motion.spin[at], arm)
+    one, two = tangents(contacts.normal)
+    slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
+    spin = np.vecdot(motion.spin[at], contacts.normal)
+    tangential = pull[:, :2] + damping[:, None] * slip
+    torque = pull[:, 2] / lever + damping * spin * lever
+    excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
+    return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
+
+
+def _tilt(
+    contacts: PadContacts, motion: PadMotion, row: np.ndarray, mass_centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
+    tangents by the pad's, (n, 2, 2).
+
+    The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the
+    height of that centre over the gel: by nothing at all for a ball.
+    """
+    pose = motion.pad_from_body[row, contacts.pad, contacts.body]
+    middle = (pose[:, :3, :3] @ mass_centre[contacts.body][..., None])[..., 0] + pose[:, :3, 3]
+    height = np.vecdot(middle - contacts.centre, contacts.normal)
+    xx, xy, yy = contacts.spread.T
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+    # A rotation about one tangent moves the centre along the other.
+    spread = np.stack([mean - half, mean + half], axis=1)
+    return np.maximum(spread - height[:, None], 0.0), height, turn
