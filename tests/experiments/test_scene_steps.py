@@ -35,13 +35,13 @@ def test_scripted_policies_succeed_without_losing_a_contact(name: str) -> None:
     assert played.sink_mm is None or played.sink_mm < 0.2
 
 
-def test_what_is_measured_is_written_and_the_old_step_shows(tmp_path) -> None:
-    args = scene_steps.Args(out=tmp_path / "run", scenes=("push_cube",), steps_ms=(10.0,), episodes=2, device="cpu")
+def test_what_is_measured_is_written_and_a_shorter_step_sinks_less(tmp_path) -> None:
+    args = scene_steps.Args(out=tmp_path / "run", scenes=("push_cube",), steps_ms=(10.0, 2.0), episodes=2, device="cpu")
     scene_steps.main(args)
     found = read_metrics(tmp_path / "run" / "metrics.json")
-    assert found["scene_steps.push_cube.shipped_ms"] == 1.0
+    assert found["scene_steps.push_cube.shipped_ms"] == 5.0
     for how in ("scripted", "pressed"):
-        assert float(found[f"scene_steps.push_cube.10ms.{how}.lost"]) > 1.0
-        assert float(found[f"scene_steps.push_cube.10ms.{how}.sink_mm"]) > 1.0
+        sink = [float(found[f"scene_steps.push_cube.{step}ms.{how}.sink_mm"]) for step in (10, 2)]
+        assert sink[1] < 0.3 * sink[0] and sink[0] > 0.01
     with pytest.raises(InputError, match=r"scenes = 'push'.*push_cube"):
         scene_steps.main(scene_steps.Args(scenes=("push",)))
