@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,14 @@ class LoadTables:
         slope[:, -1] = np.clip(2.0 * rise[:, -1] - slope[:, -2], 0.0, 3.0 * rise[:, -1])
         self._force, self._slope, self._radius = force, slope, contacts.radius
         self._rows = np.arange(len(force))
+
+    def of(self, rows: np.ndarray) -> LoadTables:
+        """The laws of some contacts, by their indices."""
+        some = copy(self)
+        for name, values in vars(self).items():
+            setattr(some, name, values[rows])
+        some._rows = np.arange(len(rows))
+        return some
 
     def force(self, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Force [N] and incremental stiffness [N/m] at depths (n,) [m]; at depths <= 0 no force, and the stiffness of the first touch."""

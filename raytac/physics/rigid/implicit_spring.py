@@ -67,26 +67,37 @@ def normal_spring(
     start, slope = law.force(depth)
     quickest = np.where(gap, speed + fall * step, speed)
     reach = depth + step * np.maximum(quickest, 0.0)
-    # The speed at the end of the step at which free bodies would close, by bisection: m (v − w) / Δt = f(w), f rising in w.
-    low, high = np.zeros_like(depth), np.maximum(quickest, 0.0)
-    # A step that hardly changes the depth is as good with all of its speed.
-    some = reach > 1.05 * np.maximum(depth, 0.0) + 1e-6
     end = reach
-    if some.any():
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            end = depth + step * middle
-            force, stiffness = law.force(end)
-            force = np.where(gap, force, start + stiffness * _time(stiffness, inverse_mass, step, relaxation) * middle)
-            above = (quickest - middle) < step * inverse_mass * force
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        end = np.where(some, depth + step * high, reach)
+    some = np.flatnonzero(reach > np.maximum(depth, 0.0) + 1e-7)
+    if len(some):
+        end = reach.copy()
+        end[some] = _end(law.of(some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some])
     force, stiffness = law.force(np.maximum(end, 0.0))
     secant = force / np.where(end > 0.0, end, 1.0)
     stiffness = np.maximum(stiffness, slope)
     touching = stiffness * _time(stiffness, inverse_mass, step, relaxation)
     closing = np.where(end > 0.0, secant * step, 0.0)
     return NormalSpring(np.where(gap, secant * depth, start), np.where(gap, closing, touching), end)
+
+
+def _end(
+    law: LoadTables,
+    depth: np.ndarray,
+    quickest: np.ndarray,
+    start: np.ndarray,
+    inverse_mass: np.ndarray,
+    step: np.ndarray,
+    relaxation: np.ndarray,
+) -> np.ndarray:
+    """Depths (n,) [m] to which free bodies close in the step: m (v − w) / Δt = f(w) by bisection, f rising in w."""
+    gap, low, high = depth <= 0.0, np.zeros_like(depth), np.maximum(quickest, 0.0)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        force, stiffness = law.force(depth + step * middle)
+        force = np.where(gap, force, start + stiffness * _time(stiffness, inverse_mass, step, relaxation) * middle)
+        above = (quickest - middle) < step * inverse_mass * force
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return depth + step * high
 
 
 def _time(stiffness: np.ndarray, inverse_mass: np.ndarray, step: np.ndarray, relaxation: np.ndarray) -> np.ndarray:
