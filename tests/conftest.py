@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests import one_thread  # isort: skip  (before NumPy)
+
 import math
 from pathlib import Path
 
@@ -23,7 +25,7 @@ from raytac.specs.sensor import (
     ResponseSpec,
     SensorSpec,
 )
-from tests import marks
+from tests import case_lights, marks
 
 BALL_RADIUS = 4e-3
 BALL_DEPTH = 1e-3
@@ -43,6 +45,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         for mark in marks.marks_of(item.path):
             item.add_marker(mark)
+
+
+def pytest_runtest_setup() -> None:
+    one_thread.limit_renderer()
+    case_lights.share(make_sensor_spec())
 
 
 def make_sensor_spec() -> SensorSpec:

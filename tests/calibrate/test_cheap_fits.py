@@ -109,7 +109,7 @@ def test_a_reader_of_one_sheet_gets_what_all_samples_say(samples: PressSamples, 
 def test_cast_shadows_are_levels_of_the_photographs() -> None:
     """Of a linear camera: over a background of twice the levels, shadows are twice as deep, and they end in the same places."""
     response = dataclasses.replace(SENSOR.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))
-    lit, settings, found = dataclasses.replace(SENSOR, response=response), BakeSettings(pins=32), []
+    lit, settings, found = dataclasses.replace(SENSOR, response=response), BakeSettings(pins=16), []
     for level in (60.0, 120.0):
         background = np.full((60, 80, 3), level, np.float32)
         table = PolyTable(

@@ -253,7 +253,9 @@ def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
         fresh = out.terminated & ~ended
         assert (out.terms["terminated"][fresh] == -2.0).all() and (out.terms["alive"][fresh] == 0.0).all()
         ended |= out.terminated
-    assert ended.sum() >= 2
+        if ended.sum() >= 2:
+            return
+    pytest.fail(f"{ended.sum()} of 4 fell in 150 steps")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 
@@ -37,8 +38,9 @@ def test_the_rate_of_a_scripted_policy_and_of_a_checkpoint(tmp_path: Path) -> No
     assert read_metrics(tmp_path / "trained" / "metrics.json")["episodes"] == 2
 
 
-def test_as_many_episodes_are_played_as_are_asked_for(tmp_path: Path) -> None:
+def test_as_many_episodes_are_played_as_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the same held-out seeds, however many environments there are."""
+    monkeypatch.setattr(RollBall, "max_episode_steps", 40)
     found = {}
     for episodes, num_envs in ((1, 16), (3, 16), (3, 2)):
         args = Args(policy="scripted", task="RollBall", episodes=episodes, num_envs=num_envs, film=False, out=tmp_path / "run")

@@ -1,0 +1,14 @@
+"""One thread a process, imported before NumPy: the suite runs in as many processes as there are cores, and idle threads wait busily."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")})
+
+
+def limit_renderer() -> None:
+    """One thread for Dr.Jit, once it is imported, which reads no number from the environment."""
+    if "mitsuba" in sys.modules:
+        sys.modules["drjit"].set_thread_count(1)
