@@ -176,6 +176,7 @@ def summary(world: TactileWorld, controller: RollingController, record: Record, 
     """What counts, from the true place of the ball."""
     ball, pad = np.array(record.ball), np.array(record.pad)
     wrench, phase = np.array(record.wrench), np.array(record.phase)
+    assert world.scene is not None
     start = np.array(world.scene.body("ball").position[:2])
     off = ball[:, :2] - pad[:, :2, 3]
     rolling = phase == PHASES.index("roll")
@@ -210,6 +211,7 @@ def draw(record: Record, world: TactileWorld, args: Args, path: Path) -> None:
     from matplotlib.figure import Figure
 
     ball, pad, wrench = np.array(record.ball), np.array(record.pad), np.array(record.wrench)
+    assert world.scene is not None
     start = np.array(world.scene.body("ball").position[:2])
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     grid = figure.add_gridspec(3, 2)

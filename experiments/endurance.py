@@ -104,6 +104,7 @@ def endure(args: Args, out: Path) -> None:
     world = make_world(args)
     cycle = args.close_steps + args.lift_steps + args.hold_steps + args.lower_steps + args.open_steps
     rows, done, spent = resume(out, world, args)
+    assert world.scene is not None
     first = np.array(world.scene.body(OBJECT).position)
     sitting = round(rows[-1][ROW.index("sitting")]) + 1 if rows else 0
     while done < args.steps:
@@ -143,7 +144,7 @@ def make_world(args: Args) -> TactileWorld:
 def one_cycle(world: TactileWorld, args: Args, first: np.ndarray) -> list[float]:
     """Pick up, hold, put down, let go; the row of it."""
     assert world.soft is not None
-    begin, dt = float(world.data[0].time), world.scene.control_timestep
+    begin, dt = float(world.data[0].time), world.control_timestep
     ends = np.cumsum([args.close_steps, args.lift_steps, args.hold_steps, args.lower_steps, args.open_steps])
     up = (ends[0] * dt, ends[1] * dt, ends[2] * dt, ends[3] * dt)
 
@@ -187,7 +188,7 @@ def bond_share(world: TactileWorld, pad: str) -> float:
     """Force on a pad's bond less the gel's weight, against the force of what touches the gel: difference, as a share of the latter."""
     assert world.soft is not None
     touched = world.soft.wrench(pad)[0, :3]
-    weight = world.soft.world.rigid_motion(pad).mass * np.array(world.scene.gravity)
+    weight = world.soft.world.rigid_motion(pad).mass * world.model.opt.gravity
     return float(np.linalg.norm(world.soft.bond_wrench(pad)[0, :3] - weight - touched) / np.linalg.norm(touched))
 
 

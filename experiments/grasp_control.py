@@ -60,7 +60,7 @@ class GraspController:
     def update(self, state: WorldState) -> float:
         """Takes in what the pads feel; returns the smaller normal force [N]."""
         felt = [-float(state.wrench[name][0, 2]) for name in self.world.sensor_names]
-        dt = self.world.scene.control_timestep
+        dt = self.world.control_timestep
         if self.is_closing:
             missing = self.force - min(felt)
             slow = self.gain * missing

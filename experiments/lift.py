@@ -161,7 +161,7 @@ def lift(world: TactileWorld, args: Args, times: Times) -> tuple[Record, list]:
     state = world.reset()
     grasp = GraspController(world, path, force=args.force)
     grasp.is_closing = True
-    dt = world.scene.control_timestep
+    dt = world.control_timestep
     record, pictures = Record([], [], [], [], [], [], [], [], []), []
     steps = round(times.end / dt)
     for step in range(steps):
@@ -200,7 +200,7 @@ def summary(world: TactileWorld, record: Record, times: Times) -> dict[str, floa
     lost = np.flatnonzero((away > SLIPPED) & (t > times.lift))
     last = t[lost[0]] if len(lost) else t[-1]
     late = t >= 0.5 * (times.hold + times.end)
-    weight = mass_of(world) * -world.scene.gravity[2]
+    weight = mass_of(world) * -world.model.opt.gravity[2]
     seen = np.array(record.borne)[late] / weight
     found = {
         "slip_mm": 1e3 * float(away[-1]),

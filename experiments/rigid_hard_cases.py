@@ -118,7 +118,9 @@ def measured(name: str, case: Callable[[], Outcome]) -> Row:
             outcome = case()
     except Exception as error:  # a case that cannot be run is a case that fails; the others go on
         text = (str(error).splitlines() or [""])[0]
-        where = "" if isinstance(error, RaytacError) else f" ({Path(traceback.extract_tb(error.__traceback__)[-1].filename).name})"
+        where = (
+            "" if isinstance(error, RaytacError) else f" ({Path(traceback.extract_tb(error.__traceback__)[-1].filename).name})"
+        )
         outcome = Outcome([Check(f"error: {type(error).__name__}: {text}{where}", 1.0, 0.0)])
     return {
         "case": name,

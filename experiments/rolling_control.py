@@ -52,7 +52,7 @@ class RollingController:
         self.strokes = Strokes() if strokes is None else strokes
         self.goals, self.arm = np.asarray(goals, float), world.arm
         self.goal, self.phase, self.strokes_done = 0, "press", 0
-        self.dt = world.scene.control_timestep
+        self.dt = world.control_timestep
         start = world.composed.start[self.arm.qpos]
         self._ik = DifferentialIk(self.arm, max_velocity=np.array(MAX_VELOCITY), posture=start)
         self._law = JointImpedance(self.arm, frequency=60.0)

@@ -111,7 +111,7 @@ def twist(world: TactileWorld, args: Args) -> tuple[Record, list, tuple[float, .
     grasp = GraspController(world, path, force=args.force)
     grasp.is_closing = True
     record, pictures = Record([], [], [], [], [], [], [], [], [], [], [], [], []), []
-    steps = round(end / world.scene.control_timestep)
+    steps = round(end / world.control_timestep)
     ring = world.mesh(BEAM)[0][0]
     top = ring[:, 2] > ring[:, 2].max() - 1e-6
     rest = ring[top, :2] - ring[top, :2].mean(axis=0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["IpcError", "OverlapError", "SolverError"]
-
 
 class IpcError(ValueError):
     """Input that breaks a rule of the solver."""

@@ -14,8 +14,6 @@ import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray
 
-__all__ = ["BLOCK", "MAX", "MIN", "SUM", "Reducer", "chunks_of", "raise_if_any", "total_of"]
-
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256

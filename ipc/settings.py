@@ -8,8 +8,6 @@ from typing import Literal
 
 from ipc.errors import IpcError
 
-__all__ = ["Settings"]
-
 
 @dataclass(frozen=True)
 class Settings:

@@ -11,8 +11,6 @@ from ipc.bodies.body import AffineBody, Body, rotation_matrix
 from ipc.bodies.layout import Layout
 from ipc.errors import IpcError
 
-__all__ = ["State", "env_mask", "per_env", "start_state", "teleported", "unit_pose"]
-
 Floats = NDArray[np.float64]
 
 

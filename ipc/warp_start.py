@@ -12,8 +12,6 @@ from pathlib import Path
 
 import warp as wp
 
-__all__ = ["start_warp", "use_writable_cache"]
-
 
 def start_warp() -> None:
     """``wp.init()`` after ``use_writable_cache``."""

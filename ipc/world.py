@@ -21,8 +21,6 @@ from ipc.solver.potential import Potential
 from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
 from ipc.warp_start import start_warp
 
-__all__ = ["State", "World"]
-
 Floats = NDArray[np.float64]
 
 

@@ -7,8 +7,6 @@ from typing import Literal
 
 from raytac.errors import AssetError, InputError
 
-__all__ = ["ASSET_KINDS", "AssetKind", "asset_root", "find_asset_root"]
-
 AssetKind = Literal["scenes", "lights"]
 ASSET_KINDS: tuple[AssetKind, ...] = ("scenes", "lights")
 

@@ -6,8 +6,6 @@ import importlib.util
 import warnings
 from pathlib import Path
 
-__all__ = ["foreign_ipc", "warn_of_foreign_ipc"]
-
 
 def foreign_ipc() -> str | None:
     """Return where ``import ipc`` would come from if that is not raytac's own ``ipc`` package; None if all is well.

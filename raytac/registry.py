@@ -8,8 +8,6 @@ from typing import Any, Generic, TypeVar
 
 from raytac.errors import InputError
 
-__all__ = ["Registry"]
-
 Config = TypeVar("Config")
 
 

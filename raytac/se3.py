@@ -10,26 +10,6 @@ from numpy.typing import ArrayLike
 from raytac.checks import check_numbers
 from raytac.errors import InputError
 
-__all__ = [
-    "about_z",
-    "batch_of",
-    "between",
-    "check_pose",
-    "inverse",
-    "nearest_rotation",
-    "pose",
-    "pose_error",
-    "pose_of",
-    "quaternion",
-    "quaternions",
-    "rigid_poses",
-    "rotation_of",
-    "rotation_vector",
-    "rotations",
-    "shifted_wrench",
-    "turn_angle",
-]
-
 _ORTHONORMAL = 1e-6
 """Largest entry of RᵀR − 1 of a matrix R that counts as a rotation."""
 

@@ -201,7 +201,8 @@ def test_what_a_changed_specification_holds_is_checked(spec: Any, changes: dict[
 
 
 def test_a_changed_specification_takes_what_its_fields_name() -> None:
-    assert TactileWorld(replace(TASK, robot=replace(TASK.robot, sensor=MINI.source))).scene.robot.sensor == MINI.source
+    world = TactileWorld(replace(TASK, robot=replace(TASK.robot, sensor=MINI.source)))
+    assert world.scene is not None and world.scene.robot.sensor == MINI.source
     noise = {"noise_px": 0.5, "dropout": 0.1, "shift": 1e-3, "turn": 0.1}
     assert replace(SWEEP, marker_perturbation=noise).marker_perturbation == noise
     assert replace(SWEEP, randomization={"noise": np.float64(2.0)}).randomization == {"noise": 2.0}

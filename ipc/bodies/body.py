@@ -12,18 +12,6 @@ from ipc.bodies.material import Material, Stiff
 from ipc.errors import IpcError
 from ipc.meshes.mesh import TetMesh, TriMesh
 
-__all__ = [
-    "AffineBody",
-    "Body",
-    "HalfSpace",
-    "KinematicBody",
-    "Pose",
-    "SoftBody",
-    "rotation_matrix",
-    "vertices_in_box",
-    "vertices_near",
-]
-
 
 def rotation_matrix(quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrices of unit quaternions (w, x, y, z), shape (..., 4) to (..., 3, 3)."""

@@ -18,8 +18,6 @@ from ipc.bodies.material import MODEL_CODES
 from ipc.errors import IpcError
 from ipc.meshes.mesh import TriMesh, surface_of, surface_topology
 
-__all__ = ["Layout", "build_layout"]
-
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
 Arrays = dict[str, NDArray]

@@ -7,8 +7,6 @@ from typing import Literal
 
 from ipc.errors import IpcError
 
-__all__ = ["MODEL_CODES", "Material", "Stiff"]
-
 MODEL_CODES = {"stable": 0, "stable_log": 1, "orthogonal": 2}
 """The stored energies that the element kernels know (see ``ipc.solver.elasticity``)."""
 

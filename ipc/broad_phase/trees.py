@@ -25,8 +25,6 @@ from ipc.arrays import IntArray, IntArray2d, filled
 from ipc.bodies.layout import Layout
 from ipc.broad_phase.lists import Boxes, Candidates, Surface, add_pair, overlap, prim_box, prim_vertices
 
-__all__ = ["Trees", "trees_pay"]
-
 wp.set_module_options({"enable_backward": False})
 
 ROUNDING = wp.constant(wp.float32(2.4e-7))

@@ -18,8 +18,6 @@ from ipc.broad_phase.trees import Trees, trees_pay
 from ipc.contact import ccd, contacts, friction, normal
 from ipc.reduce import SUM, Reducer
 
-__all__ = ["Collision"]
-
 _GROW = 2
 
 

@@ -15,8 +15,6 @@ from ipc.bodies.layout import Layout
 from ipc.errors import OverlapError
 from ipc.state import State
 
-__all__ = ["APART", "CROSSING", "TOUCHING", "check_overlap", "find_overlap", "meet", "orientation"]
-
 Floats = NDArray[np.float64]
 Signs = NDArray[np.int8]
 

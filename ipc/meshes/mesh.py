@@ -10,20 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ipc.errors import IpcError
 
-__all__ = [
-    "Cut",
-    "TetMesh",
-    "TriMesh",
-    "box_mesh",
-    "box_surface",
-    "domed_pad",
-    "graded",
-    "icosphere",
-    "surface_of",
-    "surface_topology",
-    "tet_volumes",
-]
-
 
 @dataclass(frozen=True)
 class TetMesh:

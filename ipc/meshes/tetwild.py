@@ -23,8 +23,6 @@ import numpy as np
 from ipc.errors import IpcError
 from ipc.meshes.mesh import TetMesh, TriMesh, tet_volumes
 
-__all__ = ["tetrahedralize"]
-
 _DIGEST = hashlib.sha256().digest_size
 _FILL = """
 import sys

@@ -13,8 +13,6 @@ from ipc.bodies.layout import Layout
 from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
 from ipc.solver.potential import Potential
 
-__all__ = ["bond_wrench", "contact_pairs", "contact_wrench", "host", "pair_forces", "rigid_motion", "touching"]
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
 

@@ -20,19 +20,6 @@ from ipc.arrays import FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.frames import VertexMap
 
-__all__ = [
-    "BlockJacobi",
-    "Preconditioner",
-    "SystemView",
-    "add_row",
-    "block_row",
-    "multiply_blocks",
-    "multiply_rows",
-    "push_blocks",
-    "push_rows",
-    "slice_rows",
-]
-
 wp.set_module_options({"enable_backward": False})
 
 

@@ -37,8 +37,6 @@ from ipc.solver.potential import Potential
 from ipc.solver.preconditioners import make_preconditioner
 from ipc.solver.step_state import StepState
 
-__all__ = ["Newton"]
-
 
 class Newton:
     """The step of a batch; it moves the state of ``potential``."""

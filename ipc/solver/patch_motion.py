@@ -23,8 +23,6 @@ from ipc.solver.potential import Potential
 from ipc.solver.preconditioners.rest_stiffness import rest_blocks
 from ipc.solver.preconditioners.substructure import MAX_ENTRIES, choose_partition, condense, entries
 
-__all__ = ["RestPatches"]
-
 Floats = NDArray[np.float64]
 
 _STATIC = 1e3

@@ -21,8 +21,6 @@ from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
 
-__all__ = ["Pcg"]
-
 wp.set_module_options({"enable_backward": False})
 
 ROUNDS = 4

@@ -17,8 +17,6 @@ from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.linear import SystemView, add_row, block_row
 
-__all__ = ["THREADS", "Scalars", "solve_in_one_block"]
-
 wp.set_module_options({"enable_backward": False})
 
 THREADS = 256

@@ -21,8 +21,6 @@ from ipc.settings import Settings
 from ipc.solver import dynamics, elasticity, frames
 from ipc.solver.linear import SystemView, push_blocks, push_rows, slice_rows
 
-__all__ = ["Potential"]
-
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
 

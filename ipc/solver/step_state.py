@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from ipc.arrays import FloatArray, IntArray
 
-__all__ = ["Decisions", "Flags", "StepState"]
-
 wp.set_module_options({"enable_backward": False})
 
 

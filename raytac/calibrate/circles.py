@@ -15,8 +15,6 @@ from raytac.calibrate.presses import RealPresses
 from raytac.errors import InputError
 from raytac.gel.interpolate import sampled
 
-__all__ = ["DOUBTFUL", "FoundCircles", "circle_score", "find_circles", "with_found_circles"]
-
 DOUBTFUL = 5.0
 """Score [levels] below which a circle is no more than a guess: some three times the noise of a Mini's pixel."""
 _REACH = 0.08

@@ -31,8 +31,6 @@ from raytac.calibrate.light_parameters import (
 from raytac.calibrate.photographs import Photographs, decode, encode
 from raytac.specs import LightsSpec, SensorSpec
 
-__all__ = ["DirectFit", "FitSettings", "FitState"]
-
 SIGMA = {
     "place": 4.0,
     "aim": 0.6,

@@ -17,8 +17,6 @@ import numpy as np
 from raytac.calibrate.imprint import PixelGeometry
 from raytac.optics.trace.led import lobe_gain, lobe_slopes
 
-__all__ = ["ExtraLight", "LedLight", "Light", "case_light", "led_light"]
-
 _BEHIND = 1e-3
 """Least cosine of an LED's lobe: keeps a power of it differentiable behind the LED, where it is next to nothing."""
 _SOFT = 1e-2

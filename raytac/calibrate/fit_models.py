@@ -26,8 +26,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
 from raytac.specs import SensorSpec
 
-__all__ = ["ALONE", "MODES", "SHADOW_TABLES", "Models", "check_fit", "fit_models", "images_of", "mode_times", "raytrace_mode"]
-
 ALONE = "raytrace_alone"
 """The fitted ray tracer without a photograph: colour shading (``with_shading``) in place of the flat field, as a sensor file has it."""
 MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")

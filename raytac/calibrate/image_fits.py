@@ -29,8 +29,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import total
 from raytac.specs import SensorSpec
 
-__all__ = ["PressSamples", "ShadingSettings", "fit_mlp", "fit_table", "press_samples", "with_cast_shadows", "with_shading"]
-
 
 @dataclass(frozen=True)
 class TableSettings:

@@ -18,18 +18,6 @@ from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 from raytac.specs.sensor_check import led_corners
 
-__all__ = [
-    "CEILING",
-    "HEIGHT",
-    "HEIGHTS",
-    "LightParameters",
-    "darkest",
-    "leds_at_walls",
-    "leds_split",
-    "side_ties",
-    "with_parameters",
-]
-
 CHANNELS = ("red", "green", "blue")
 SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
 """Outward direction (x, y) of the wall that the LEDs of a layer start at."""

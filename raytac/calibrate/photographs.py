@@ -12,8 +12,6 @@ from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.errors import InputError
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FAR", "Photographs", "decode", "encode", "photographs_of", "read_photographs"]
-
 FAR = 3.0
 """Radii from a contact's centre beyond which a press counts as changing nothing."""
 

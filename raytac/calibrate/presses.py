@@ -24,8 +24,6 @@ from raytac.errors import CalibrationError, InputError
 from raytac.io.images import read_png
 from raytac.optics.taxim.restricted_pickle import npz_arrays
 
-__all__ = ["RealPresses", "Split", "by_half", "by_press", "read_presses", "shallow_to_deep"]
-
 LAYOUTS = ("labels.csv", "catalog.csv", "dataPack.npz")
 """The file that tells a layout."""
 

@@ -20,8 +20,6 @@ from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state
 from raytac.errors import InputError
 from raytac.specs import SensorSpec
 
-__all__ = ["INNER", "STRENGTHS", "choose_strength"]
-
 INNER = "inner"
 """Name of the choice by cross-validation, beside the names of ``STRENGTHS``."""
 

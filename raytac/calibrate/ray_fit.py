@@ -25,8 +25,6 @@ from raytac.optics.base import casts_shadows
 from raytac.optics.trace.config import RayTraced
 from raytac.specs import SensorSpec
 
-__all__ = ["FEWEST", "Fitted", "brightened", "extra_light", "first_state", "fit_lights", "refine_circles"]
-
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
 FACTOR = 2

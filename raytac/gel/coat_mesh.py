@@ -9,8 +9,6 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["CoatMesh", "DeformedCoat", "bind_to_coat"]
-
 _OUTSIDE = -1e-6
 """Barycentric coordinate from which a point counts as outside a triangle: rounding on a shared edge is not outside."""
 

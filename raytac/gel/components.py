@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["find_edges", "find_runs", "join_runs", "span"]
-
 
 def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Runs of True along the rows of B masks (B, Ny, Nx): (row of all B · Ny, first column, column after the last), each (R,), in order."""

@@ -6,8 +6,6 @@ import numpy as np
 
 from raytac.gel.matmul import product
 
-__all__ = ["GaussianBlur", "fast_gaussian_matrix", "gaussian_matrix"]
-
 _LOW_RANK_FROM = 6.0
 """Width [nodes] from which the truncated cosine basis beats the banded product (measured on a 399 × 328 grid, two cores)."""
 _TAIL = 1e-6

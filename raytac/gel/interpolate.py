@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["SplineAxis", "cell_lengths", "hat_matrix", "sampled"]
-
 
 class SplineAxis:
     """The natural cubic spline through values at n lines: C², with zero curvature at both ends.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["product", "sandwich"]
-
 _ONE_THREAD = 250_000
 """Multiply-adds in one product. OpenBLAS wakes its threads above 262,144, which for work so small costs more than it saves, and
 far more on a busy machine; below it, the result does not depend on the number of threads either."""

@@ -9,8 +9,6 @@ import numpy as np
 from raytac.gel.surface import GelSurface
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["without_pierced"]
-
 _ROUNDING = 1e-8
 """Rounding of a height in float32, and some [m]."""
 

@@ -12,17 +12,6 @@ from raytac.gel.gaussian import GaussianBlur, fast_gaussian_matrix
 from raytac.gel.matmul import product
 from raytac.gel.surface import GelSurface, PadGrid
 
-__all__ = [
-    "CONTACT_RULES",
-    "CONTACT_SCALE",
-    "FINAL_SIGMA",
-    "PYRAMID_SIGMAS",
-    "ComposedGaussians",
-    "ElasticSurround",
-    "LocalField",
-    "WholeField",
-]
-
 _TAXIM_PIXEL = 0.0295e-3
 PYRAMID_SIGMAS = tuple(s * _TAXIM_PIXEL for s in (30.5, 15.5, 8.0, 3.5, 2.0, 1.1))
 """Standard deviations of Taxim's pyramid [m]: OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""

@@ -15,20 +15,6 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = [
-    "COARSEST_PITCH",
-    "MOST_CELLS",
-    "GelSurface",
-    "PadGrid",
-    "check_grid",
-    "chosen_envs",
-    "grid_pitch",
-    "make_grid",
-    "rest_height",
-    "rounded_envs",
-    "summary",
-]
-
 
 def summary(record: Any, names: Sequence[str] | None = None) -> str:
     """A dataclass on one line: arrays by type and shape, without empty fields; ``names``: fields that are shown, None for all."""

@@ -8,8 +8,6 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh, bind_to_coat
 from raytac.gel.surface import GelSurface, PadGrid
 
-__all__ = ["CoatTraction", "cell_areas", "foundation_traction"]
-
 
 def cell_areas(grid: PadGrid) -> np.ndarray:
     """Area of each node [m²], (Ny, Nx): a cell, half of one at edges, a quarter in corners."""

@@ -15,8 +15,6 @@ from raytac.markers.perturbation import MarkerPerturbation
 from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MarkerModel", "MarkersConfig", "marker_motion_of"]
-
 
 class MarkerModel(Protocol):
     """A model that moves the markers of B pads."""

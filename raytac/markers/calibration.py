@@ -22,8 +22,6 @@ from raytac.markers.tracker import MarkerTracker
 from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
-__all__ = ["ModelError", "ProbeData", "fit_motion", "model_errors", "pattern_search", "probe_sensor"]
-
 PROBE_PITCH = 1e-3
 """Spacing of the markers that errors are averaged over [m]: a grid over the view, whatever the sensor's own pattern."""
 _MARGIN = 0.4e-3

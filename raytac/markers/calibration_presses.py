@@ -14,9 +14,6 @@ from raytac.gel.surface import GelSurface
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["FIT", "HELD_OUT", "LOADS", "QUICK_FIT", "QUICK_HELD_OUT"]
-__all__ += ["Press", "PressFrame", "PressStates", "press_frames", "simulate_press"]
-
 LOADS = ("normal", "shear", "twist", "combined")
 """Kinds of load that errors are given for."""
 _PITCH = 0.1e-3

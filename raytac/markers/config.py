@@ -12,8 +12,6 @@ from raytac.markers.contacts import ContactCells
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["ForceField", "Fots", "FotsPublished", "Superposition", "SurfaceMarkers"]
-
 
 @dataclass(frozen=True)
 class Fots(MarkersConfig):

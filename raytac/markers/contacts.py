@@ -16,8 +16,6 @@ from raytac.errors import InputError
 from raytac.gel.components import find_edges, join_runs
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
 
-__all__ = ["ContactCells", "ContactSamples", "ContactSettings", "ContactTracker", "Contacts", "contact_boxes"]
-
 
 @dataclass(frozen=True)
 class ContactSettings:

@@ -19,8 +19,6 @@ from raytac.markers.contacts import Contacts, ContactSamples
 from raytac.markers.sampling import height_and_slope, object_displacement
 from raytac.specs.marker_motion import MarkerMotionSpec
 
-__all__ = ["ForceFieldModel", "contact_at"]
-
 
 def contact_at(rest: np.ndarray, surface: GelSurface, contacts: Contacts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Penetration δ (B, M) [m], n_xy (B, M, 2) and the object's displacement s (B, M, 2) [m] at markers at ``rest`` (B, M, 3) [m]."""

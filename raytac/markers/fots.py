@@ -45,8 +45,6 @@ from raytac.markers.contacts import ContactCells, Contacts, ContactSamples
 from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.marker_motion import MarkerMotionSpec
 
-__all__ = ["TWIST_SLIP", "FotsKernel", "FotsModel"]
-
 _NEGLIGIBLE = 16.0
 """Exponent of a Gaussian beyond which it is neglected: float32 cannot add e⁻¹⁶ to 1."""
 _ROW = 12

@@ -11,8 +11,6 @@ from raytac.gel.surface import PadGrid, rest_height
 from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
-__all__ = ["MarkerPattern", "camera_of", "dot_ink", "marker_centres"]
-
 
 def marker_centres(spec: MarkerSpec) -> np.ndarray:
     """x, y of the dots at rest [m], pad frame, shape (M, 2), row by row: dot (j, i) of ``rows`` and ``columns`` is j · columns + i."""

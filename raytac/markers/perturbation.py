@@ -10,8 +10,6 @@ import numpy as np
 from raytac.checks import is_number
 from raytac.errors import InputError
 
-__all__ = ["MarkerPerturbation", "Perturber"]
-
 
 @dataclass(frozen=True)
 class MarkerPerturbation:

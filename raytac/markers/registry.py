@@ -6,8 +6,6 @@ from raytac.errors import InputError
 from raytac.markers.base import MarkersConfig
 from raytac.registry import Registry
 
-__all__ = ["MARKERS", "markers_config", "models_without_coat", "register"]
-
 MARKERS: Registry[MarkersConfig] = Registry(
     "markers",
     {

@@ -7,8 +7,6 @@ import numpy as np
 from raytac.gel.surface import GelSurface
 from raytac.markers.contacts import Contacts
 
-__all__ = ["height_and_slope", "height_at", "object_displacement"]
-
 
 def _cells(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Flat index in ``height`` of the first node of each point's cell, and its place in the cell along x and y, each (B, M).

@@ -30,8 +30,6 @@ from raytac.physics.soft.correction import mesh_compliance
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = ["SuperpositionModel", "cached_compliance", "coat_compliance"]
-
 
 class SuperpositionModel:
     """Model of ``Superposition``; ``level`` and ``rounds`` as there."""

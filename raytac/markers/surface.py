@@ -12,8 +12,6 @@ from raytac.gel.coat_mesh import CoatMesh, bind_to_coat
 from raytac.gel.surface import GelSurface
 from raytac.markers.contacts import Contacts, ContactSamples
 
-__all__ = ["CoatPoints", "SurfaceModel", "bind_to_coat"]
-
 
 class CoatPoints:
     """Markers bound to a coat mesh; they are bound again when mesh or pattern change."""

@@ -17,8 +17,6 @@ from raytac.markers.registry import markers_config
 from raytac.markers.sampling import height_at
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["MarkerFrame", "MarkerTracker"]
-
 
 @dataclass(frozen=True, repr=False)
 class MarkerFrame:

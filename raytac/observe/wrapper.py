@@ -14,8 +14,6 @@ from raytac.frame import TactileFrame
 from raytac.observe.observer import TactileObserver
 from raytac.observe.spaces import gymnasium_space
 
-__all__ = ["AddTactile", "AddTactileVector"]
-
 Frames = Callable[..., Mapping[str, TactileFrame]]
 """Function that returns the present frame of each sensor, as ``TactileWorld.observe``. Where some environments of a vector are reset it
 is called with ``envs=``, a list of them, and returns frames of these alone."""

@@ -15,17 +15,6 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.specs.sensor import SensorSpec
 
-__all__ = [
-    "OPTICAL_OUTPUTS",
-    "BuiltOptics",
-    "OpticalMode",
-    "OpticsConfig",
-    "OpticsImages",
-    "Variant",
-    "casts_shadows",
-    "check_shadows",
-]
-
 OPTICAL_OUTPUTS = ("rgb", "layers", "normals", "depth")
 """Outputs that need an optical mode; without them no renderer is imported."""
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     # The ray tracer's side of the slab needs Dr.Jit; a camera without one does not.
     from raytac.optics.refraction import Slab
 
-__all__ = ["Pinhole"]
-
 
 @dataclass(frozen=True)
 class Pinhole:

@@ -13,8 +13,6 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.device_mode import Float, UInt8, upload
 from raytac.optics.runtime import no_collection
 
-__all__ = ["DeviceImage", "ImageCut"]
-
 
 @dataclass(frozen=True)
 class ImageCut:

@@ -22,8 +22,6 @@ from raytac.optics.refraction import Slab
 from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["DeviceFrame", "DeviceMode", "Float", "FrameInputs", "UInt8"]
-
 Float = Any  # Dr.Jit array of float32
 UInt8 = Any  # Dr.Jit array of bytes
 

@@ -18,8 +18,6 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 
-__all__ = ["CoatField", "CoatLayout", "PixelSample", "check_view", "see", "seen_images"]
-
 TILE = 0.5e-3
 """Edge of a tile of the bounds map [m]. The bounds on z hold two edges around a place: a camera ray of slope t may be that over t above
 or below the height where its tile is looked up, 2.8 mm for the Mini's steepest ray. The bound on the indentation holds one edge."""

@@ -17,8 +17,6 @@ SPECULAR = 0.57
 coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21, the Mini
 of that day). Where s = 0, as in the shipped sensors, q does not matter."""
 
-__all__ = ["checked_ink", "darkened", "ink_at", "inked_albedo"]
-
 
 def checked_ink(surface: GelSurface) -> np.ndarray | None:
     """The surface's ink, (B, Ny, Nx) float32; None if it has none.

@@ -21,8 +21,6 @@ import numpy as np
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_check import check_slab
 
-__all__ = ["Link", "Slab"]
-
 STEPS = 5
 """Newton steps of ``Slab.meet``: enough for float32 at any angle (a test compares with bisection)."""
 

@@ -8,8 +8,6 @@ from raytac.checks import check_methods
 from raytac.optics.base import BuiltOptics, OpticalMode, OpticsConfig
 from raytac.registry import Registry
 
-__all__ = ["OPTICS", "chosen_optics", "register"]
-
 OPTICS: Registry[OpticsConfig[Any]] = Registry(
     "optics",
     {

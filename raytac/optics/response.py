@@ -13,8 +13,6 @@ from raytac.errors import InputError, SpecError
 from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import ResponseSpec, SensorSpec, shading_degree
 
-__all__ = ["SATURATED", "Response", "fit_log_gain", "mid_grey_exposure", "saturated_share", "shading_gain"]
-
 SATURATED = 0.05
 """Share of pixels at full scale above which an image at rest counts as saturated: shipped sensors have none."""
 _LIMITS = (1e-9, 1e9)

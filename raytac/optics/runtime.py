@@ -13,8 +13,6 @@ import drjit as dr
 from raytac.device import llvm_library, resolve_device
 from raytac.errors import BackendError
 
-__all__ = ["VARIANTS", "load_mitsuba", "no_collection", "peak_bytes"]
-
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
 
 

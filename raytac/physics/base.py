@@ -18,8 +18,6 @@ from raytac.shapes.part import Part
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Pad", "PadReading", "PhysicsConfig"]
-
 OfSurface = np.ndarray | Callable[[GelSurface], np.ndarray]
 """An array, or a function that computes it from the surface when it is first asked for."""
 

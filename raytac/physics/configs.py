@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from raytac.physics.soft.mesh import PadMesh
     from raytac.physics.soft.pad import SoftPad
 
-__all__ = ["Ipc", "Rigid"]
-
 
 @dataclass(frozen=True)
 class Rigid:

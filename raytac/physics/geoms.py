@@ -13,8 +13,6 @@ from raytac.physics.mjcf_size import check_mjcf_size
 from raytac.se3 import rotation_of
 from raytac.shapes.part import Part, hfield_part, mesh_part, primitive
 
-__all__ = ["GEOM_TYPES", "body_parts", "geom_part", "load_mjcf"]
-
 GEOM_TYPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 """Every type that a geom of a compiled MuJoCo model can have."""
 

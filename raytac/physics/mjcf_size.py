@@ -13,8 +13,6 @@ from pathlib import Path
 
 from raytac.errors import InputError
 
-__all__ = ["MOST_COPIES", "MOST_NODES", "check_mjcf_size"]
-
 MOST_COPIES = 100_000
 """Copies that ``replicate``, ``composite`` and ``flexcomp`` elements within each other may make of what is in them."""
 MOST_NODES = 2**22

@@ -15,8 +15,6 @@ from raytac.shapes.relief import relief_part
 from raytac.specs.press import ObjectSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA
 
-__all__ = ["Shape", "object_parts"]
-
 
 class Shape(Protocol):
     """Named shape: the object of a press scene, or a body of a task scene."""

@@ -19,8 +19,6 @@ from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = ["CLEARANCE", "PressPad", "PressTargets"]
-
 
 class PressTargets:
     """Targets of B environments; a number that is not finite marks its environment as ``lost``: it fails from the start.

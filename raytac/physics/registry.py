@@ -12,8 +12,6 @@ from raytac.physics.base import PhysicsConfig
 from raytac.registry import Registry
 from raytac.specs.press import PADS
 
-__all__ = ["PHYSICS", "checked_physics", "register", "scene_physics"]
-
 PHYSICS: Registry[PhysicsConfig] = Registry(
     "physics", {"rigid": "raytac.physics.configs:Rigid", "ipc": "raytac.physics.configs:Ipc"}
 )

@@ -10,8 +10,6 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.robots.frames import world_from_site
 
-__all__ = ["Arm"]
-
 
 class Arm:
     """``n`` hinge or slide joints and the site that they carry, e.g. a sensor's pad frame. Holds indices only, no state.

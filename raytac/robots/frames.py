@@ -9,8 +9,6 @@ import numpy as np
 
 from raytac.se3 import pose
 
-__all__ = ["body_poses", "site_poses", "world_from_site"]
-
 
 def world_from_site(data: mujoco.MjData, site: int) -> np.ndarray:
     """Pose (4, 4) of a site by its index."""

@@ -14,8 +14,6 @@ from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
-__all__ = ["FACING", "FRAME_JOINTS", "GripperSettings", "add_opening_servo", "floating_gripper"]
-
 FRAME_JOINTS: Final = ("x", "y", "z", "yaw", "pitch", "roll")
 """Joints of the driven frame, in order: slides along the world's axes, then hinges about z, y and x, each in the frame that those before it
 have turned. The position actuators of the same names take the displacement from the start [m, rad]."""

@@ -36,8 +36,6 @@ from raytac.robots.arm import Arm
 from raytac.robots.frames import site_poses
 from raytac.se3 import check_pose, pose_error, quaternion
 
-__all__ = ["DifferentialIk", "IkResult", "PoseServo"]
-
 _STRIDE = 0.1
 """Duration [s] of each step of ``reach``: at 2 rad/s, a fifth of a radian."""
 

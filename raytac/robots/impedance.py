@@ -16,8 +16,6 @@ from raytac.errors import InputError
 from raytac.robots.arm import Arm
 from raytac.se3 import check_pose, pose_error
 
-__all__ = ["CartesianImpedance", "JointImpedance", "JointTorque"]
-
 _SINGULAR = 1e-3
 """Added to J M⁻¹ Jᵀ [1/kg]: near a singularity the arm then has a finite mass of 1000 kg in the singular direction."""
 

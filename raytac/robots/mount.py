@@ -20,8 +20,6 @@ from raytac.se3 import pose as rigid
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
-__all__ = ["MountedSensor", "RobotModel", "SensorChoice", "case_depth", "mount", "mounted_sensors", "standing_on"]
-
 _WALL = 0.8e-3
 """Thickness of a case's walls and back [m]: a guess, with which the Mini's inside gives its outside of 32 × 28 mm."""
 _CASE_DENSITY = 1000.0

@@ -20,8 +20,6 @@ from raytac.se3 import pose
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
-__all__ = ["JOINTS", "MAX_TORQUE", "MAX_VELOCITY", "READY", "one_sensor_panda", "two_finger_panda"]
-
 JOINTS: Final = tuple(f"joint{i}" for i in range(1, 8))
 """Names of the arm's joints."""
 MAX_VELOCITY: Final = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["coin_elevation"]
-
 _SPACING = 0.03e-3
 """Sample spacing of the map [m]: finer than a sensor's pixel, so that no sample shows."""
 

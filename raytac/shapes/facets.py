@@ -6,8 +6,6 @@ import numpy as np
 
 from raytac.shapes.part import Part
 
-__all__ = ["SAG", "around", "coarse_relief", "grid_facets"]
-
 SAG = 2e-6
 """Greatest distance of a facet inside a curved part [m]: far below the error of a pad's own triangles."""
 _FEWEST, _MOST = 16, 256

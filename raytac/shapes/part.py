@@ -9,8 +9,6 @@ import numpy as np
 from raytac.checks import check_numbers
 from raytac.errors import InputError
 
-__all__ = ["PART_KINDS", "Part", "hfield_part", "mesh_part", "primitive"]
-
 _SIZES = {
     "plane": 0,
     "sphere": 1,

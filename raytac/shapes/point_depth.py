@@ -6,8 +6,6 @@ import numpy as np
 
 from raytac.shapes.part import Part
 
-__all__ = ["SOLIDS", "point_depth"]
-
 SOLIDS = ("plane", "box", "sphere", "cylinder", "capsule")
 """Kinds of part that ``point_depth`` takes."""
 

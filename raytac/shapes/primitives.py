@@ -15,8 +15,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["UNDERSIDES", "bounds", "line_in_part", "radius_about_origin"]
-
 Underside = Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Interval = tuple[np.ndarray, np.ndarray]
 _ROOT_STEPS = 100

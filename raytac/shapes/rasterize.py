@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["lowest_of_triangles"]
-
 _BARELY_FLAT = 1e-12
 """Projected area relative to the triangle's squared size below which it counts as vertical and its neighbours carry its edges."""
 

@@ -8,8 +8,6 @@ from raytac.errors import InputError
 from raytac.shapes.part import Part
 from raytac.shapes.primitives import line_in_part
 
-__all__ = ["looks_down", "relief_part", "relief_underside"]
-
 _STEPS = 60
 _LIMIT = 0.7
 """Greatest slope · tan τ for the iteration: the factor on the error in each step, at worst."""

@@ -14,8 +14,6 @@ from raytac.errors import InputError
 from raytac.shapes.facets import SAG, around, coarse_relief, grid_facets
 from raytac.shapes.part import Part
 
-__all__ = ["enclosed_volume", "object_surface", "part_surface"]
-
 
 def object_surface(parts: Sequence[Part], sag: float = SAG) -> ipc.TriMesh:
     """Surfaces of all parts in one mesh, object frame [m].

@@ -13,9 +13,6 @@ from raytac.shapes.primitives import UNDERSIDES, bounds, radius_about_origin
 from raytac.shapes.rasterize import lowest_of_triangles
 from raytac.shapes.relief import looks_down, relief_underside
 
-__all__ = ["object_bounds", "object_height", "object_radius"]
-
-
 _NODES = 32768
 """Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 

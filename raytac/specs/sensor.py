@@ -18,25 +18,6 @@ from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fi
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
-__all__ = [
-    "AUTO",
-    "BONDED",
-    "LED_SCHEMA",
-    "SENSOR_PARTS",
-    "SENSOR_SCHEMA",
-    "CameraSpec",
-    "CaseSpec",
-    "CoatSpec",
-    "GelpadSpec",
-    "LedSpec",
-    "LightsSpec",
-    "MarkerSpec",
-    "OpticsSpec",
-    "RefractionSpec",
-    "ResponseSpec",
-    "SensorSpec",
-]
-
 AUTO: Final = "auto"
 """In place of an exposure: that which makes the image at rest mid-grey."""
 BONDED = ("back", "back_and_sides")

@@ -24,8 +24,6 @@ from raytac.specs.sensor import (
 from raytac.specs.sensor_check import validate_sensor
 from raytac.specs.toml import Table, Text, read_toml, split_unit
 
-__all__ = ["lights_text", "load_lights", "load_sensor", "response_text", "sensor_files", "sensor_spec", "with_lights"]
-
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
 _MAY_LACK = ("optics",)

@@ -24,8 +24,6 @@ from raytac.world.hard_contacts import HARD_MARGIN
 from raytac.world.touched import TouchedBody
 from raytac.world.world_model import WorldModel, compiled_model
 
-__all__ = ["compose"]
-
 _GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,

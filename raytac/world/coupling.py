@@ -39,8 +39,6 @@ from raytac.se3 import rotation_vector, rotations, shifted_wrench
 if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
 
-__all__ = ["STIFFENING", "CoupledContact", "Coupling", "CouplingInput", "SolverBody", "coupling_inputs"]
-
 STIFFENING = 2.0
 """Stiffness assumed of a bonded soft body over that at rest: it stiffens as it is stretched, twisted or sheared (docs/coupling.md)."""
 _HARD = 2e5

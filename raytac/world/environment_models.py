@@ -17,8 +17,6 @@ from raytac.errors import InputError
 from raytac.se3 import quaternion, rigid_poses, rotation_of
 from raytac.world.world_model import WorldModel
 
-__all__ = ["EnvironmentModels", "Variation"]
-
 
 @dataclass(frozen=True)
 class Variation:

@@ -20,8 +20,6 @@ from raytac.specs.sensor import GelpadSpec
 from raytac.world.near_pads import half_spaces, near_pad
 from raytac.world.world_model import WorldModel
 
-__all__ = ["BondedFace", "BondedFaces", "Inside", "RobotOverlap"]
-
 _PITCH = 0.2e-3
 """Spacing of the vertical lines along which a bonded face is checked [m]."""
 _MAX_PIECES = 100_000

@@ -20,8 +20,6 @@ from raytac.shapes.part import Part, mesh_part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["GelPairs"]
-
 _PITCH = 0.8e-3
 """Spacing of the vertices of a gel's surface [m]: of a dome of 100 mm its facets are off by 1 µm."""
 

@@ -14,8 +14,6 @@ from raytac.specs.sensor import GelpadSpec
 from raytac.world.pad_motion import PadMotion
 from raytac.world.pad_rows import ROWS, PadRows, cross, tangents
 
-__all__ = ["gel_rows", "row_axes"]
-
 _EDGE = 0.7
 """Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
 

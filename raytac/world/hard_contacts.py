@@ -13,8 +13,6 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-__all__ = ["HARD_MARGIN", "is_hard", "write_hard_reference"]
-
 HARD_MARGIN = 3e-3
 """Margin of such geoms [m]: by how much bodies may near each other in a step and not overlap at its end."""
 _BACK = 0.1

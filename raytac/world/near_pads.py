@@ -9,8 +9,6 @@ import numpy as np
 from raytac.shapes.part import Part
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["half_spaces", "near_pad"]
-
 
 def half_spaces(bodies: Sequence[Sequence[Part]]) -> tuple[np.ndarray, np.ndarray]:
     """Indices (n,) of the bodies that are half-spaces, and these' poses (n, 4, 4) in their bodies' frames."""

@@ -12,8 +12,6 @@ from raytac.physics.rigid.contacts import PadContacts
 from raytac.robots.frames import body_poses, site_poses
 from raytac.world.pad_rows import cross
 
-__all__ = ["PadMotion", "motion_of", "relative", "turned"]
-
 
 @dataclass(frozen=True)
 class PadMotion:

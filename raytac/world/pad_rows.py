@@ -29,8 +29,6 @@ import numpy as np
 if TYPE_CHECKING:
     from raytac.world.environment_models import EnvironmentModels
 
-__all__ = ["ROWS", "PadRows", "cross", "read_rows", "tangents", "write_rows"]
-
 ROWS = 6
 """Rows of a contact: normal, two tangents, spin, two of rolling."""
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])

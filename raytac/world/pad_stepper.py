@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
 
-__all__ = ["PadStepper"]
-
 
 class PadStepper:
     """Rigid pads that act on the states of a model that somebody else steps.

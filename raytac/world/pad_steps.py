@@ -6,8 +6,6 @@ import numpy as np
 
 from raytac.world.hard_contacts import HARD_MARGIN
 
-__all__ = ["StepChoice"]
-
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
 _TRAVEL = 0.025

@@ -18,8 +18,6 @@ from raytac.specs.sensor import GelpadSpec
 from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.near_pads import half_spaces, near_pad
 
-__all__ = ["PadSurfaces"]
-
 
 class PadSurfaces:
     """Surfaces of all pads of B environments, and the body that each showed deepest last."""

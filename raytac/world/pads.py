@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from raytac.physics.soft.scene import SoftScene
 
-__all__ = ["WORLD_PADS", "WorldPads"]
-
 WORLD_PADS: Registry[Any] = Registry(
     "physics", {"rigid": "raytac.world.rigid_pads:RigidPads", "ipc": "raytac.world.soft_pads:SoftPads"}
 )

@@ -44,8 +44,6 @@ from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
-__all__ = ["RigidPads"]
-
 
 @dataclass(frozen=True)
 class _Put:

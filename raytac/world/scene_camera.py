@@ -10,8 +10,6 @@ import numpy as np
 from raytac.errors import BackendError, InputError
 from raytac.world.world import TactileWorld
 
-__all__ = ["SceneCamera"]
-
 _BACKGROUND = 235
 _BALL = 4e-3
 """Radius of the balls that mark points [m]."""

@@ -14,8 +14,6 @@ from raytac.physics.base import PadReading
 from raytac.robots.mount import MountedSensor
 from raytac.sensor import TactileSensor
 
-__all__ = ["SensorFrames"]
-
 Read = Callable[[str, PadGrid, list[int] | None], PadReading]
 """Reading of a sensor on a grid, for the environments named; None is all."""
 

@@ -38,8 +38,6 @@ from raytac.world.forbidden_overlap import Inside, RobotOverlap
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
-__all__ = ["SoftPads"]
-
 _TOUCH = 1e-5
 """Distance from a soft body's holder within which its vertices are bonded to it [m]."""
 _CELLS = 8

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
 
-__all__ = ["DEPTHS", "TactileReader"]
-
 DEPTHS = ("force", "geometry")
 """Depths of an imprint: that at which the gel's load law gives MuJoCo's normal force, or the overlap that MuJoCo's state has."""
 _HALVINGS = 50

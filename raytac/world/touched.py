@@ -14,8 +14,6 @@ from raytac.physics.geoms import geom_part
 from raytac.robots.mount import MountedSensor
 from raytac.shapes.part import Part, mesh_part
 
-__all__ = ["TouchChoice", "TouchedBody", "touched_bodies"]
-
 TouchChoice = Sequence[str] | Mapping[str, float | None]
 """Names of bodies or geoms that pads touch; a mapping has their friction coefficients against gel, None for the gel's own."""
 

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
 
-__all__ = ["TactileWorld"]
-
 _OVERLAP = 1e-4
 """Greatest overlap of rigid bodies at the start [m]: rounding of a scene's lengths."""
 
@@ -181,6 +179,11 @@ class TactileWorld:
     def soft(self) -> SoftScene | None:
         """The contact solver's scene, with everything that it knows; None with the rigid pad."""
         return self._pads.soft
+
+    @property
+    def control_timestep(self) -> float:
+        """Time of one ``step`` [s]."""
+        return self.composed.control_timestep
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

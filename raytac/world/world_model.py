@@ -18,8 +18,6 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 from raytac.world.touched import TouchChoice, TouchedBody, touched_bodies
 
-__all__ = ["WorldModel", "checked_states", "compiled_model", "own_world_model"]
-
 _OVERLAP = 1e-4
 """Greatest depth to which a gel may lie in the robot at the start [m]: rounding of a model's lengths."""
 

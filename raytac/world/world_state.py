@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-__all__ = ["BatchController", "Control", "Controller", "Drive", "WorldState", "lost"]
-
 _LARGEST_SPEED = 1e4
 """Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
 

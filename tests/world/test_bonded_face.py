@@ -83,7 +83,7 @@ def test_a_slow_body_is_carried_at_the_same_step() -> None:
 
 def test_a_skew_path_counts_where_it_crosses_the_gel() -> None:
     """In one step from beside the pad to behind it: once through the gel's face, once past the case's edge."""
-    face, half, radius = BondedFace(MINI.gelpad), 0.5 * MINI.gelpad.size[0], SHAPES["grain"].params["radius"]
+    face, half, radius = BondedFace(MINI.gelpad), 0.5 * MINI.gelpad.size[0], float(SHAPES["grain"].params["radius"])
     parts = object_parts(SHAPES["grain"])
     for beside, move, crosses in ((half + 0.01, [-0.03, 0.0, -0.06], True), (half + 0.025, [-0.01, 0.0, -0.08], False)):
         before, after = np.tile(np.eye(4), (2, 1, 1, 1))

@@ -46,7 +46,7 @@ class Drop:
             return ticks
 
         pads._step = watched
-        for _ in range(round(seconds / world.scene.control_timestep)):
+        for _ in range(round(seconds / world.control_timestep)):
             self.state = world.step()
 
 
@@ -106,7 +106,7 @@ def test_a_ball_thrown_between_closing_pads_touches_both_and_goes_through_neithe
 
 def test_a_heavy_block_lies_still_at_the_depth_of_the_press() -> None:
     """1 kg on a face of 12 mm at the scene's longest step: it carries its weight to 1e-4 and does not creep."""
-    size = {"length": 0.012, "width": 0.012, "height": 0.02}
+    size: dict[str, float | int | str] = {"length": 0.012, "width": 0.012, "height": 0.02}
     world = TactileWorld(
         scene_of(BodySpec("block", "box", size, position=(0.0, 0.0, 0.0101), mass=1.0), timestep=0.01), outputs=()
     )

@@ -161,7 +161,8 @@ def test_reset_forgets_the_shear_and_a_batch_shears_as_its_environments_alone() 
     assert not pads._shear.stretch[0].any() and pads._shear.stretch[1].any()
     both.data[1].qpos[0] += 1e-3
     for _ in range(15):
-        both.step(), alone.step()
+        both.step()
+        alone.step()
     np.testing.assert_array_equal(both.data[0].qpos, alone.data[0].qpos)
     np.testing.assert_array_equal(both.state().wrench["sensor"][0], alone.state().wrench["sensor"][0])
 

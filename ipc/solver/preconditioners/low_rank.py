@@ -23,8 +23,6 @@ from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.linear import SystemView, row_column
 from ipc.solver.pcg_block import wait_for_block
 
-__all__ = ["LANES", "LowRank", "Rest", "Small", "fits", "rest_entry", "sum_of_parts"]
-
 wp.set_module_options({"enable_backward": False})
 
 REGULAR = 1e-6

@@ -25,8 +25,6 @@ from ipc.solver.preconditioners.low_rank import LANES, LowRank, Rest, Small, fit
 from ipc.solver.preconditioners.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.solver.preconditioners.substructure import Patch, choose_partition, condense
 
-__all__ = ["RestInverse"]
-
 wp.set_module_options({"enable_backward": False})
 
 TILE_ENVS, TILE_OUT, TILE_IN = 32, 64, 32

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from ipc.bodies.layout import Layout
 from ipc.settings import Settings
 
-__all__ = ["bonded_bodies", "dense_block", "free_nodes", "rest_blocks"]
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer]
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from ipc.bodies.layout import Layout
 from ipc.solver.preconditioners.rest_stiffness import Floats, Ints, dense_block, free_nodes
 
-__all__ = ["MAX_ENTRIES", "Patch", "Substructure", "choose_partition", "condense", "entries", "partition"]
-
 Singles = NDArray[np.float32]
 
 MAX_ENTRIES = 60_000_000

@@ -20,8 +20,6 @@ from raytac.optics.device_mode import DeviceMode, Float, FrameInputs, UInt8
 from raytac.optics.geometry import CoatLayout, bilinear
 from raytac.optics.ink import darkened, ink_at
 
-__all__ = ["ImageHeights", "ImageMode", "see_heights"]
-
 
 @dataclass(frozen=True)
 class ImageHeights:

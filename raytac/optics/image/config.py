@@ -16,8 +16,6 @@ from raytac.specs.sensor import Vec3
 if TYPE_CHECKING:
     from raytac.optics.image.mlp_weights import MlpWeights
 
-__all__ = ["PHONG_LIGHTS", "Mlp", "Phong", "PhongLight"]
-
 
 @dataclass(frozen=True)
 class PhongLight:

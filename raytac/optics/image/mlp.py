@@ -15,8 +15,6 @@ from raytac.optics.image.config import Mlp
 from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
 from raytac.optics.taxim.mode import padded, resized
 
-__all__ = ["MlpMode"]
-
 _VIEW_TOLERANCE = 0.01
 """By which share the view may differ from that of the sensor that a network was fitted to."""
 

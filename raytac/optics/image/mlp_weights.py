@@ -24,8 +24,6 @@ from raytac.errors import CalibrationError
 from raytac.optics.taxim.restricted_pickle import check_file_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["INPUTS", "LEVELS", "MlpWeights", "forward", "inputs", "load_mlp", "save_mlp", "view_size", "view_slope"]
-
 FORMAT, VERSION = "raytac mlp", 1
 """Format and version in a file. The version goes up whenever inputs, arithmetic or arrays change their meaning."""
 INPUTS = 16

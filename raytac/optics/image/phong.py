@@ -24,8 +24,6 @@ from raytac.optics.image.config import Phong
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.sampled_tracer import ray_tracer
 
-__all__ = ["PhongMode"]
-
 AMBIENT = 0.8
 """k_a."""
 THICKNESS = 4e-3

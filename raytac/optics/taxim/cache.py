@@ -25,8 +25,6 @@ NO_MARKERS = MarkerSpec(0, 0, (0.0, 0.0), (0.0, 0.0), 0.0, 0.0)
 CHECKSUMS = "SHA256SUMS"
 """File of a kept table that lists the digests of the others, as ``sha256sum -c`` reads it."""
 
-__all__ = ["CHECKSUMS", "cached", "keep", "table_folder", "table_key"]
-
 
 def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
     """Digest of sensor and lights (not of where their files lie), settings, and the code that bakes; the device is not in it.

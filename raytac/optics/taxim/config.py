@@ -14,8 +14,6 @@ from raytac.specs.sensor import SensorSpec
 if TYPE_CHECKING:
     from raytac.optics.taxim.table import PolyTable
 
-__all__ = ["Taxim"]
-
 
 @dataclass(frozen=True)
 class Taxim(OpticsConfig[Any]):

@@ -31,8 +31,6 @@ from raytac.optics.taxim.params import params_of, read_params
 from raytac.optics.taxim.restricted_pickle import check_file_numbers, file_bytes, npy_array, npz_arrays, npz_names
 from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants
 
-__all__ = ["CALIBRATION_FILES", "load_calibration", "processed_background", "save_calibration"]
-
 CALIBRATION_FILES = ("polycalib.npz", "dataPack.npz", "gelmap.npy", "shadowTable.npz", "params.json", "raytac.npz")
 _MOST_BINS = 1024
 """Bins a side of a table; upstream's have 80 to 125."""

@@ -26,8 +26,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["TableArrays", "TableShader", "TaximMode"]
-
 _ASPECT_TOLERANCE = 0.01
 _UNCOVERED = 2
 """Flag of a pixel in contact whose bin no calibration sample reached."""

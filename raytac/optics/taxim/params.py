@@ -16,8 +16,6 @@ from raytac.gel.pyramid import CONTACT_SCALE, PYRAMID_SIGMAS
 from raytac.optics.taxim.restricted_pickle import file_bytes
 from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants
 
-__all__ = ["CalibrationParams", "params_of", "read_params"]
-
 
 @dataclass(frozen=True)
 class CalibrationParams:

@@ -21,9 +21,6 @@ import numpy as np
 
 from raytac.errors import CalibrationError, RaytacError
 
-__all__ = ["check_file_numbers", "file_bytes", "load_restricted", "npy_array", "npz_arrays", "npz_names"]
-
-
 _NUMBERS = "biuf"
 """Kinds of NumPy numbers that are admitted."""
 _MOST_ITEMS = 2**22

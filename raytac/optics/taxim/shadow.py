@@ -14,8 +14,6 @@ import numpy as np
 from raytac.optics.image.base import ImageHeights
 from raytac.optics.taxim.table import ShadowTable, TaximConstants
 
-__all__ = ["ShadowArrays", "ShadowCaster", "gaussian_taps"]
-
 _DILATION = 2
 """Pixels by which a 5 × 5 square grows a mask."""
 _FINAL_TAPS = 2

@@ -20,8 +20,6 @@ import numpy as np
 
 from raytac.errors import InputError
 
-__all__ = ["DEPTHS_OF", "SLOPES_OF", "PolyTable", "ShadowTable", "TaximConstants", "polynomial_basis", "slope_bins"]
-
 SLOPES_OF = ("height", "displacement")
 """Fields whose slopes index a table: the surface itself (upstream) or its displacement from rest (tables baked by raytac)."""
 

@@ -13,8 +13,6 @@ from raytac.checks import check_known, check_truth, check_whole, is_whole
 from raytac.errors import InputError
 from raytac.optics.base import OPTICAL_OUTPUTS, OpticsConfig, Variant, check_shadows
 
-__all__ = ["INTEGRATORS", "RayTraced"]
-
 INTEGRATORS = ("fast", "reference", "path")
 """Integrators of the ray tracer."""
 

@@ -13,8 +13,6 @@ import numpy as np
 
 from raytac.errors import BackendError
 
-__all__ = ["make_denoiser"]
-
 _TRY_OPTIX = """
 import mitsuba as mi
 mi.set_variant("cuda_ad_rgb")

@@ -20,8 +20,6 @@ from raytac.optics.refraction import Slab
 from raytac.optics.trace.led import Lamp
 from raytac.specs.sensor import CoatSpec
 
-__all__ = ["direct_light"]
-
 
 def direct_light(
     mi: Any,

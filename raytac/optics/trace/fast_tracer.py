@@ -23,8 +23,6 @@ from raytac.optics.trace.scene import SensorScene
 from raytac.optics.trace.tracer import Tracer, total
 from raytac.specs.sensor import AUTO, SensorSpec
 
-__all__ = ["FastTracer", "with_exposure"]
-
 
 @dataclass(frozen=True)
 class FastArrays:

@@ -27,8 +27,6 @@ from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
 from raytac.optics.trace.scene import UNIT, SensorScene
 
-__all__ = ["BounceField", "CaseLight"]
-
 SAMPLES = 1 << 18
 """Paths that the fit of the case's light uses."""
 DEGREE = 3

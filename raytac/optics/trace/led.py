@@ -14,8 +14,6 @@ import numpy as np
 
 from raytac.specs.sensor import LedSpec
 
-__all__ = ["PLUGIN", "Lamp", "LampTable", "lobe_gain", "lobe_slopes", "register"]
-
 PLUGIN = "raytac_led"
 """Name of the emitter in Mitsuba's scenes."""
 LEAST_COSINE = 1e-6

@@ -29,8 +29,6 @@ from raytac.optics.refraction import Link, Slab
 from raytac.optics.trace.led import Lamp, LampTable
 from raytac.optics.trace.scene import UNIT, SensorScene
 
-__all__ = ["ReferenceIntegrator", "StockPathIntegrator", "connect", "trace"]
-
 OFFSET = 1e-3
 """Start of a ray off a surface [scene units]."""
 GHOST = 0.1

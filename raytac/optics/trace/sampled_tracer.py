@@ -21,8 +21,6 @@ from raytac.optics.trace.scene import SensorScene
 from raytac.optics.trace.tracer import Tracer, total
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["SampledTracer", "ray_tracer"]
-
 _GLANCE = 16
 """Samples a pixel that show how bright an image is."""
 

@@ -25,8 +25,6 @@ than a pixel on the pad, so the scene is built in millimetres."""
 PLATES = ("wall_left", "wall_right", "wall_top", "wall_bottom", "floor")
 """The rectangles of the case: its walls at −x, x, −y and y, and its floor."""
 
-__all__ = ["PLATES", "UNIT", "SensorScene", "coat_bsdf", "grid_faces"]
-
 
 def coat_bsdf(coat: CoatSpec, *, dotted: bool = False) -> dict[str, Any]:
     """Mitsuba's dictionary of the coat: a Lambertian base blended with a rough conductor of full reflectance.

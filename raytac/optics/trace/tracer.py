@@ -19,8 +19,6 @@ from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.scene import UNIT
 from raytac.specs.sensor import AUTO
 
-__all__ = ["Tracer", "total"]
-
 
 def total(layers: dict[str, np.ndarray]) -> np.ndarray:
     """The linear image: the sum of its layers."""

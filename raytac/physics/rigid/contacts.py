@@ -10,8 +10,6 @@ import numpy as np
 
 from raytac.physics.rigid.load_law import hard_back
 
-__all__ = ["LAW_POINTS", "LoadTables", "PadContacts"]
-
 LAW_POINTS = 33
 """Entries M of a load law's table."""
 

@@ -20,8 +20,6 @@ import numpy as np
 
 from raytac.physics.rigid.contacts import LoadTables
 
-__all__ = ["NormalSpring", "contact_rate", "normal_spring"]
-
 _HALVINGS = 12
 """Bisections for the speed at the end of a step: its upper bound is taken, off by a 4000th of the speed at the start."""
 

@@ -16,8 +16,6 @@ import warp as wp
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.shape_kernels import infinity
 
-__all__ = ["BINS", "Bins", "add_node", "clear_bins", "tabulate"]
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _FINER = 4

@@ -13,20 +13,6 @@ from raytac.shapes.part import Part
 from raytac.shapes.underside import object_bounds, object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = [
-    "FirstTouch",
-    "LoadLaw",
-    "first_touch",
-    "first_touch_z",
-    "gap_at_touch",
-    "hard_back",
-    "layer_stiffening",
-    "reduced_modulus",
-    "shear_stiffness",
-    "twist_stiffness",
-]
-
-
 _TABLE = 512
 _DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
 """Depths of the table over the pad's thickness."""

@@ -21,8 +21,6 @@ from raytac.shapes.underside import object_height
 from raytac.specs.press import DYNAMICS, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["RigidPad"]
-
 
 @dataclass
 class _Environment:

@@ -11,8 +11,6 @@ import warp as wp
 
 from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive, under_surface
 
-__all__ = ["Pads", "Placed", "bottom_of", "lowest_of", "place_parts", "under", "under_nodes", "width_of", "window"]
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _PLANE, _MESH = wp.constant(wp.int32(0)), wp.constant(wp.int32(8))

@@ -7,8 +7,6 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-__all__ = ["IMPEDANCE", "PressRig", "contact_solref"]
-
 IMPEDANCE = 0.5
 """Constant impedance d of the contact (solimp = d, d, …): regularisation R = A (1 − d) / d equals the contact's own A."""
 _TIME_STEP = 1e-3

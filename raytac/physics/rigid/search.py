@@ -17,8 +17,6 @@ from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PadSearch"]
-
 _LAST = 2
 _LANES = 128
 """Threads of a block on CUDA."""

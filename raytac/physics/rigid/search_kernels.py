@@ -28,8 +28,6 @@ from raytac.physics.rigid.placed_kernels import (
 )
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
-__all__ = ["ENOUGH", "PITCHES", "Rows", "find_near", "measure"]
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 PITCHES = 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3

@@ -18,8 +18,6 @@ from raytac.shapes.primitives import bounds, radius_about_origin
 from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PadArrays", "ShapeArrays"]
-
 
 class ShapeArrays:
     """All bodies' parts; one ``wp.Mesh`` for each set of triangles, however many parts share it."""

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import warp as wp
 
-__all__ = ["Shapes", "first_hit", "infinity", "part_box", "under_primitive", "under_surface"]
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, CONE, TORUS, MESH, RELIEF = (wp.constant(wp.int32(k)) for k in range(10))

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["ELEMENTS", "ContactShear", "ShearState", "element_limits"]
-
 ELEMENTS = 8
 """Elements in parallel of every contact, all of one stiffness."""
 

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import warp as wp
 
-__all__ = ["start_warp"]
-
 
 @functools.cache
 def start_warp() -> None:

@@ -11,8 +11,6 @@ from raytac.device import cuda_device_count
 from raytac.errors import BackendError
 from raytac.installation import foreign_ipc
 
-__all__ = ["check_solver", "quiet_solver"]
-
 
 def check_solver(user: str) -> None:
     """Refuse in one line if the solver is missing, before an ``ImportError`` from deep inside.

@@ -24,9 +24,6 @@ from raytac.specs.mesh_crossing import find_crossings
 from raytac.specs.press import DYNAMICS, ObjectSpec
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 
-__all__ = ["BODY_KINDS", "OBJECT", "PAD", "SceneBody", "ScenePad", "SceneRegistry", "object_body", "pad_body", "scene_body"]
-
-
 PAD, OBJECT = "pad", "object"
 """Names of the two bodies of a press."""
 BODY_KINDS = ("kinematic", "affine", "soft", "half_space")

@@ -12,8 +12,6 @@ from raytac.gel.matmul import sandwich
 from raytac.gel.surface import rest_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["BarrierClearance", "CoatPlaces", "CoatSurface"]
-
 _FINER = 3
 """Cells of the lattice to one cell of the coat."""
 _ITERATIONS = 8

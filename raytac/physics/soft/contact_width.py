@@ -13,8 +13,6 @@ from raytac.gel.surface import GelSurface
 from raytac.specs import PressScene
 from raytac.specs.press import PADS
 
-__all__ = ["LEAST_CELLS", "NarrowContactWarning", "cells_across", "holds_force", "warn_if_narrow"]
-
 LEAST_CELLS = 6.0
 """Least number of cells across a contact for an accurate force: three to its radius (docs/ipc.md, the pad of a sensor)."""
 _SMALL = 0.1

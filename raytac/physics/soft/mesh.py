@@ -11,8 +11,6 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PAD_LEVELS", "PadLevel", "PadMesh", "pad_mesh", "pad_stiffness"]
-
 
 @dataclass(frozen=True)
 class PadLevel:

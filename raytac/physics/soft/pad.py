@@ -24,8 +24,6 @@ from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Co
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["SoftPad"]
-
 _SAG = 0.1
 """Largest depth of the object's facets below its true surface, in units of d̂."""
 

@@ -15,8 +15,6 @@ from raytac.shapes.part import Part
 from raytac.specs.press import PressScene
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PressPlacement"]
-
 
 class PressPlacement:
     """Poses of one scene's object over one pad, for B environments with their own offsets."""

@@ -11,8 +11,6 @@ from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.reading import SoftReader
 from raytac.specs.press import PressScene, StageSpec
 
-__all__ = ["PressController"]
-
 
 class PressController:
     """Moves the object of a press through its stages, B environments together.

@@ -15,8 +15,6 @@ from raytac.physics.soft.settings import PressControl
 from raytac.se3 import inverse
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["GRAVITY", "PressSolver"]
-
 GRAVITY = 9.81
 """Acceleration that makes a free body's mass its weight [m/s²]."""
 

@@ -23,8 +23,6 @@ from raytac.shapes.part import Part, mesh_part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["CoatState", "ContactObject", "SoftReader", "SoftReading", "UnsolvedContactWarning"]
-
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
 _BEHIND = 1e-3

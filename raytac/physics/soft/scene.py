@@ -20,8 +20,6 @@ from raytac.physics.soft.settings import SceneSettings
 from raytac.physics.soft.substeps import Substeps
 from raytac.se3 import batch_of, inverse, nearest_rotation, quaternion, quaternions, rigid_poses
 
-__all__ = ["SoftScene"]
-
 _GRAVITY = 0.0, 0.0, -9.81
 _ACCURACY = SceneSettings()
 _Poses = Mapping[str, ArrayLike]

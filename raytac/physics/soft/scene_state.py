@@ -9,8 +9,6 @@ import numpy as np
 import ipc
 from raytac.se3 import between
 
-__all__ = ["Poses", "SceneReport", "SceneState"]
-
 
 @dataclass(frozen=True)
 class Poses:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, fields
 from raytac.checks import check_number, check_truth, check_whole
 from raytac.errors import InputError
 
-__all__ = ["DEFAULT_CONTROL", "DEFAULT_CORRECTION", "Correction", "PressControl", "SceneSettings", "SubstepLimits"]
-
 
 @dataclass(frozen=True)
 class _Settings:

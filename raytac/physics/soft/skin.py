@@ -10,8 +10,6 @@ import ipc
 from raytac.shapes.part import Part
 from raytac.shapes.triangulate import object_surface
 
-__all__ = ["SoftSkin"]
-
 _FINEST = 1e-6
 """Greatest distance of the skin's facets inside a curved part [m]."""
 _EDGE = 0.3

@@ -16,8 +16,6 @@ from raytac.physics.soft.scene_state import Poses
 from raytac.physics.soft.settings import SubstepLimits
 from raytac.se3 import inverse, rotations, turn_angle
 
-__all__ = ["BoxMotion", "Pair", "SceneQuery", "Substeps", "allowed_share"]
-
 Pair = tuple[str, str]
 _NOTHING = 1e-15
 _CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)

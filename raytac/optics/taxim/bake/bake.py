@@ -25,8 +25,6 @@ from raytac.optics.taxim.cache import cached, keep, table_folder
 from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["PLAIN", "Baked", "bake", "bake_shadow", "baked_table", "calibrate"]
-
 MOVED = 5e-6
 """Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from raytac.optics.taxim.table import polynomial_basis
 
-__all__ = ["BinFit", "BinSums", "two_sheets"]
-
 _TERMS = [5], [3, 4, 5], [0, 1, 2, 3, 4, 5]
 """Monomials of a polynomial of degree 0, 1 and 2."""
 _MIN_COUNT = {1: 15.0, 2: 60.0}

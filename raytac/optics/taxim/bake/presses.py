@@ -20,8 +20,6 @@ from raytac.shapes.part import Part, primitive
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["ball_presses", "even_sequence", "pin_presses", "pressed", "view_half"]
-
 _GAP = 1.5e-3
 """Least distance between the rims of two balls in one image [m]: the widest Gaussian of the surround is 0.9 mm."""
 _PIN_HALF_LENGTH = 2e-3

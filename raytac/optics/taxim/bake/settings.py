@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from raytac.checks import check_number, check_numbers, check_whole
 from raytac.errors import InputError
 
-__all__ = ["BakeSettings"]
-
 
 @dataclass(frozen=True)
 class BakeSettings:

@@ -13,8 +13,6 @@ import numpy as np
 from raytac.optics.taxim.bake.views import Views
 from raytac.optics.taxim.table import ShadowTable
 
-__all__ = ["NOTHING", "ShadowSums", "dilated"]
-
 DIRECTION_PRECISION, STEP = 0.1, 1.25
 """Upstream's: width of a direction bin [rad], and distance between the values of a list [px]."""
 DEPTH_PRECISION = 0.05e-3

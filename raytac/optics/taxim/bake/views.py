@@ -16,8 +16,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.sampled_tracer import ray_tracer
 from raytac.specs.sensor import SensorSpec
 
-__all__ = ["Calibration", "Views"]
-
 _BATCH = {"cpu": 8, "cuda": 32}
 
 

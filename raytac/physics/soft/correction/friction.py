@@ -14,9 +14,6 @@ from raytac.physics.soft.correction.layer import CosineSeries, layer_shear
 from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["FrictionCorrection", "PlaneMotion", "TangentialContact", "plane_displacement", "plane_waves"]
-
-
 Response = Callable[[np.ndarray], np.ndarray]
 """A: displacement [m] of a traction [Pa], (2, n, m) each."""
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["CosineSeries", "layer_compliance", "layer_shear", "layer_spread"]
-
 _DEEP = 20.0
 """Wave number times thickness above which a layer is a half-space to rounding."""
 _LONG = 1e-3

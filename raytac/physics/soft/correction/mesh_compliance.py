@@ -10,8 +10,6 @@ import numpy as np
 from raytac.physics.soft.mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["coat_compliance", "rest_stiffness"]
-
 _SAME_PLACE = 1e-9
 """Vertices nearer than this are mirror images [m]."""
 _SAME = 1e-9

@@ -14,8 +14,6 @@ from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["ContactSampler", "NormalContact", "NormalCorrection"]
-
 
 @dataclass(frozen=True)
 class NormalContact:

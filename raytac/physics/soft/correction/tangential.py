@@ -11,8 +11,6 @@ from raytac.physics.soft.correction.layer import layer_compliance, layer_spread
 from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["TangentialCorrection"]
-
 
 class TangentialCorrection:
     """Corrects the skin's spread under pressure and its drag by friction, one pad at a time.
