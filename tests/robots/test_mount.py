@@ -95,7 +95,7 @@ def test_several_sensors_of_several_kinds_share_a_robot():
 
 def test_what_cannot_be_mounted_is_refused():
     def put(**options: Any) -> None:
-        mount(mujoco.MjSpec.from_string(ROBOT), "gelsight_mini", **({"body": "base"} | options))
+        mount(mujoco.MjSpec.from_string(ROBOT), "gelsight_mini", **{"body": "base", **options})
 
     with pytest.raises(InputError, match=r"site = 'tpi': must be the name of a site.*did you mean 'tip'\?.*tip, tool"):
         put(site="tpi", body=None)
