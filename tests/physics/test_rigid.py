@@ -110,6 +110,19 @@ def test_load_law_is_the_bonded_layer_solution_for_a_sphere(depth: float) -> Non
     assert math.isclose(LoadLaw(gap, cell, pad).force(depth), expected, rel_tol=0.02)
 
 
+@pytest.mark.parametrize("pitch", [0.1e-3, 0.2e-3, 0.8e-3])
+def test_cells_on_the_pad_s_edges_and_corners_are_cut_by_them(pitch: float) -> None:
+    """A plate touches the area of the pad whatever the pitch; a ball over a corner a quarter of its circle."""
+    grid = make_grid(PAD, pitch)
+    cell = grid.pitch[0] * grid.pitch[1]
+    law = LoadLaw(np.zeros(grid.shape), cell, PAD)
+    assert law.contact_radius(1e-3) == pytest.approx(math.sqrt(PAD.size[0] * PAD.size[1] / math.pi), rel=1e-3 * pitch / 0.1e-3)
+    x, y = grid.x - grid.x[-1], grid.y - grid.y[-1]
+    corner = LoadLaw((x[None, :] ** 2 + y[:, None] ** 2) / (2.0 * 30e-3), cell, PAD)
+    whole = math.sqrt(30e-3 * 1e-3)
+    assert corner.contact_radius(1e-3) == pytest.approx(0.5 * whole, rel=0.01)
+
+
 def test_load_law_of_a_flat_punch_is_linear_and_inverts() -> None:
     x = np.linspace(-8e-3, 8e-3, 1601)
     gap = np.where(np.hypot(x[None, :], x[:, None]) < 1e-3, 0.0, np.inf)

@@ -115,16 +115,16 @@ class LoadLaw:
     """
 
     def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
-        """``gap`` [m]: distance along z from the resting gel to the object at first touch, any shape, >= 0, ``inf`` where there
-        is none; ``cell_area`` [m²] of one node; ``deepest`` [m]: where there is gel for, at most the pad's thickness."""
+        """``gap`` (Ny, Nx) [m]: distance along z from the resting gel to the object at first touch on nodes of the whole pad, >= 0, ``inf``
+        where there is none; ``cell_area`` [m²] of one node, of which those on the pad's edges have half and those on its corners a quarter;
+        ``deepest`` [m]: where there is gel for, at most the pad's thickness."""
         self._gelpad = gelpad
         self.deepest = min(deepest, gelpad.thickness)
         """Greatest depth that a press may have [m]."""
         self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
-        near = np.sort(gap[gap < 0.5 * gelpad.thickness], axis=None)
-        # Count half a node where the gap reaches the limit, so that the area grows continuously from 0 instead of in steps.
-        counts = np.interp(0.5 * self.depth, near, np.arange(len(near)) + 0.5) if len(near) else np.zeros(_TABLE)
+        near, counted = _cells_by_gap(gap, 0.5 * gelpad.thickness)
+        counts = np.interp(0.5 * self.depth, near, counted) if len(near) else np.zeros(_TABLE)
         self.radius = np.sqrt(np.maximum(counts, 0.5) * cell_area / np.pi)
         """Contact radius of the table [m]: that of a disc of the contact's area."""
         stiffness = 2.0 * reduced_modulus(gelpad) * self.radius * layer_stiffening(self.radius, gelpad)
@@ -189,6 +189,24 @@ class LoadLaw:
     def twist_stiffness(self, depth: float) -> float:
         """Torque per angle [N m/rad] at ``depth`` [m], see ``twist_stiffness``."""
         return float(twist_stiffness(np.asarray(self.contact_radius(depth)), self._gelpad))
+
+
+def _cells_by_gap(gap: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps of nodes less than ``below`` [m], ascending, and the cells counted up to the middle of each.
+
+    Half a node counts where the gap reaches the limit, so that the area grows continuously from 0 instead of in steps.
+    """
+    some = gap < below
+    if not (some[0].any() or some[-1].any() or some[:, 0].any() or some[:, -1].any()):
+        near = np.sort(gap[some])
+        return near, np.arange(len(near)) + 0.5
+    cells = np.ones(gap.shape)
+    for line in (cells[0], cells[-1], cells[:, 0], cells[:, -1]):
+        line *= 0.5
+    near, share = gap[some], cells[some]
+    order = np.argsort(near)
+    share = share[order]
+    return near[order], np.cumsum(share) - 0.5 * share
 
 
 _ZOOMS, _FINE = 4, 17
