@@ -26,7 +26,19 @@ from raytac.shapes.part import Part
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor
 from raytac.world import TactileWorld
 
-__all__ = ["GEL", "Bench", "Check", "G", "Grasps", "Outcome", "contact_radius", "on_pad", "press_depth", "within_grip"]
+__all__ = [
+    "GEL",
+    "Bench",
+    "Check",
+    "G",
+    "Grasps",
+    "Outcome",
+    "contact_radius",
+    "normal_force",
+    "on_pad",
+    "press_depth",
+    "within_grip",
+]
 
 G = 9.81
 SENSOR = "gelsight_mini"
@@ -108,6 +120,8 @@ class Bench:
         """Height of a gripper over its start [m]."""
         self.wrench: list[np.ndarray] = []
         """After every step, on all pads, (pads, 6), world axes for the force."""
+        self.felt = np.zeros((0, 3))
+        """Forces on pads in the last step [N], pad frames, (pads, 3)."""
         self.normal: list[np.ndarray] = []
         """Normal loads [N] after every step, (pads,)."""
         self.cone = 0.0
@@ -149,6 +163,7 @@ class Bench:
             state = self.world.step(self._steer)
             self.failed = bool(state.failed[0])
             felt = np.array([state.wrench[name][0] for name in self.names])
+            self.felt = felt[:, :3]
             self.normal.append(-felt[:, 2])
             turn = np.array([state.world_from_pad[name][0, :3, :3] for name in self.names])
             self.wrench.append(np.concatenate([(turn @ felt[:, :3, None])[..., 0], felt[:, 3:]], axis=1))
@@ -164,11 +179,20 @@ class Bench:
                 return
             before = load
 
+    def press_pads_together(self) -> None:
+        """Let a gripper close beyond where its gels meet, which is as far as its joints and its servo go."""
+        opening, fingers = self.world.composed.opening, self.world.composed.fingers
+        assert opening is not None
+        joints = np.isin(self.model.jnt_qposadr, fingers)
+        self.model.jnt_range[joints, 0] = -GEL.thickness
+        self.model.actuator_ctrlrange[opening, 0] = -4.0 * GEL.thickness
+
     def _steer(self, data: mujoco.MjData, time: float) -> None:
         opening = self.world.composed.opening
         if opening is not None:
             gap = float(data.qpos[self.world.composed.fingers].sum())
-            data.ctrl[opening] = max(gap - self.force(time) / SERVO, 0.0)
+            lowest = float(self.model.actuator_ctrlrange[opening, 0])
+            data.ctrl[opening] = max(gap - self.force(time) / SERVO, lowest)
             data.ctrl[self.model.actuator("z").id] = self.raised(time)
 
     @property
@@ -279,7 +303,8 @@ class Grasps:
         body = body_poses(sound, self._index)
         for mounted in self.world.composed.sensors:
             pads = site_poses(sound, int(self.world.model.site(mounted.site).id))
-            low = _lowest(self._parts, np.linalg.inv(pads) @ body, COARSE)
+            # What lies higher than the lowest so far cannot change it.
+            low = _lowest(self._parts, np.linalg.inv(pads) @ body, COARSE, -GEL.thickness - self.penetration)
             self.penetration = max(self.penetration, -GEL.thickness - float(low.min()))
 
 
@@ -295,11 +320,21 @@ def cone_excess(model: mujoco.MjModel, data: mujoco.MjData, gels: set[int]) -> f
     return excess
 
 
-def _lowest(parts: Sequence[Part], poses: np.ndarray, grid: PadGrid) -> np.ndarray:
-    """Height of bodies' lowest point over the pad [m], (n,)."""
+def _lowest(parts: Sequence[Part], poses: np.ndarray, grid: PadGrid, below: float = np.inf) -> np.ndarray:
+    """Height of bodies' lowest point over the pad [m], (n,); may be inf where that is above ``below`` [m]."""
     if not len(poses):
         return np.zeros(0)
-    return object_height(parts, poses, grid.x, grid.y).min(axis=(1, 2))
+    return object_height(parts, poses, grid.x, grid.y, below=below).min(axis=(1, 2))
+
+
+def normal_force(force: np.ndarray, pose: np.ndarray, parts: Sequence[Part]) -> float:
+    """Share of a force (3,) [N], pad frame, along the resting gel's normal where a body at ``pose`` (4, 4) overlaps it."""
+    height = object_height(parts, pose[None], GRID.x, GRID.y, below=float(GRID.rest.max()))[0]
+    overlap = np.maximum(GRID.rest - height, 0.0)
+    slopes = np.gradient(GRID.rest, GRID.y, GRID.x)
+    along_y, along_x = ((overlap * slope).sum() / overlap.sum() for slope in slopes)
+    normal = np.array([-along_x, -along_y, 1.0])
+    return float(-force @ normal / np.linalg.norm(normal))
 
 
 def _object(body: BodySpec, pose: np.ndarray) -> ObjectSpec:

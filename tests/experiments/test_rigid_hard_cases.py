@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from experiments import rigid_hard_cases as hard
-from experiments.rigid_hard_bench import GEL, Bench, Outcome, on_pad
+from experiments.rigid_hard_bench import GEL, Bench, Outcome, normal_force, on_pad, within_grip
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
+from raytac.physics.objects import object_parts
 from raytac.specs import BodySpec
 
 
@@ -63,6 +64,32 @@ def test_penetration_is_seen_at_sub_steps_whatever_the_pad_says() -> None:
         assert bench.penetration() == pytest.approx(0.006 - GEL.thickness, abs=1e-5)
         outcome = bench.common(Outcome())
     assert not outcome.passed and [c.name for c in outcome.checks if not c.passed] == ["beyond the bonded face"]
+
+
+def test_the_normal_load_is_that_along_the_gel_where_a_body_presses() -> None:
+    """A ball beside the pad's centre presses along the dome's normal, which goes through its own centre."""
+    ball = BodySpec("ball", "sphere", {"radius": 8e-3}, position=(0.0, 0.0, 0.0), mass=0.02)
+    pose, (x, y) = np.eye(4), (6e-3, -4e-3)
+    dome = 0.5 * GEL.size[0] ** 2 / 4.0 / float(GEL.sag(0.5 * GEL.size[0], 0.0))
+    pose[:3, 3] = x, y, 8e-3 - float(GEL.sag(x, y)) - 0.3e-3
+    normal = np.array([x, y, dome + 8e-3]) / np.linalg.norm([x, y, dome + 8e-3])
+    along = np.cross(normal, [0.0, 1.0, 0.0])
+    load = normal_force(-2.0 * normal + 0.7 * along, pose, object_parts(ball))
+    assert load == pytest.approx(2.0, abs=1e-3)
+
+
+def test_two_pads_press_each_other_beyond_where_their_gels_meet() -> None:
+    with Bench(within_grip([], 5e-3, 0.5e-3)) as bench:
+        bench.press_pads_together()
+        bench.force = lambda t: 2.0 * min(t / 0.1, 1.0)
+        bench.run(0.4)
+        assert bench.normal[-1] == pytest.approx([2.0, 2.0], rel=0.01)
+        assert bench.between_pads()[-1] < -0.05e-3
+
+
+def test_drops_begin_at_one_height_whatever_the_step() -> None:
+    begun = [hard.drop(0.05, 0.1, dt).curves["depth"][0] for dt in (2e-3, 10e-3)]
+    assert begun[0] == begun[1]
 
 
 def test_full_runs_have_every_combination() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from raytac.gel.surface import make_grid
 from raytac.physics.rigid.shear import ShearState
-from raytac.specs import BodySpec, RobotSpec, TaskScene
+from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.world import TactileWorld
 
@@ -62,6 +62,73 @@ def test_unloading_follows_masing_s_rule_and_a_loop_closes() -> None:
     assert force[-1] == pytest.approx(force[len(up) - 1], rel=0.01)
     # The loop takes energy: a tangential force without history would take none.
     assert np.trapezoid(np.r_[force[len(up) - 1], back], np.r_[top, down]) > 0.05 * LIMIT * top
+
+
+def sheared(displacement: np.ndarray, over_gel: np.ndarray, radius: float, slack: float = 1e3) -> np.ndarray:
+    """Mean stretch (n, 2) after every step of a contact that never slips, by displacements of the body and places of the centre (n, 2)."""
+    state, result = ShearState(1, 1, 1), []
+    limit = np.array([[slack, slack]])
+    for step, place in zip(displacement, over_gel, strict=True):
+        centre = np.array([[*place, 0.0]])
+        state.begin(ROW, np.array([[STIFFNESS, STIFFNESS * radius**2]]), centre)
+        state.move(ROW, np.array([[*step, 0.0]]), limit, centre, np.array([radius]))
+        result.append(state.stretch[ROW][0, :, :2].mean(axis=0))
+    return np.array(result)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_what_sticks_keeps_its_stretch_however_far_it_shears(share: float) -> None:
+    """A pin sheared by more than twice its contact's radius, then held for 10 s of 1 ms steps while its centre jitters by a node's share.
+
+    The centre stays on the gel (a wide plate), goes half as far (another gel), or with the body (a pin).
+    """
+    rng, radius, shear = np.random.default_rng(1), 0.5e-3, 1.2e-3
+    step = np.zeros((10_300, 2))
+    step[:300, 0] = shear / 300
+    place = share * np.cumsum(np.vstack([np.zeros(2), step[:-1]]), axis=0) + rng.uniform(-20e-6, 20e-6, step.shape)
+    stretch = sheared(step, place, radius)
+    np.testing.assert_allclose(stretch[299:], [[shear, 0.0]] * 10_001, atol=1e-12)
+
+
+def test_what_rolls_leaves_its_stretch_behind_over_the_diameter_of_the_contact() -> None:
+    """A ball that is sheared and then rolled: the centre travels over gel and body alike; to and fro within a sixteenth nothing is lost."""
+    radius, shear, steps = 2e-3, 0.1e-3, 400
+    start = np.vstack([np.full((10, 2), [shear / 10, 0.0]), np.zeros((steps, 2))])
+    travel = np.concatenate([shear * np.arange(10) / 10, shear + 4.0 * radius * np.arange(1, steps + 1) / steps])
+    place = np.stack([travel, np.zeros(steps + 10)], axis=1)
+    stretch = sheared(start, place, radius)[:, 0]
+    assert stretch[9] == pytest.approx(shear, rel=1e-9)
+    # Two diameters, of which the play of an eighth of the radius does not count.
+    assert stretch[-1] == pytest.approx(shear * np.exp(-(4.0 - 0.125) / 2.0), rel=1e-6)
+    # As much across its stretch, or back.
+    for way in (np.array([0.0, 1.0]), np.array([-1.0, 0.0])):
+        place[10:] = [shear, 0.0] + way * (4.0 * radius * np.arange(1, steps + 1) / steps)[:, None]
+        assert sheared(start, place, radius)[-1, 0] == pytest.approx(shear * np.exp(-(4.0 - 0.125) / 2.0), rel=0.05)
+    place[10:] = [shear, 0.0] + 0.06 * radius * np.stack([np.sin(np.arange(steps)), np.cos(np.arange(steps))], axis=1)
+    assert sheared(start, place, radius)[-1, 0] == pytest.approx(shear, rel=1e-9)
+
+
+def test_a_pin_thinner_than_its_shear_is_held_at_half_of_the_slip_limit() -> None:
+    """A pin of 1 mm that stands between two pads shears them by more than its diameter and stays where it is."""
+    pin = BodySpec(
+        "pin", "cylinder", {"radius": 0.5e-3, "length": 25e-3}, quaternion=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0), mass=1e-3
+    )
+    dt, press, friction = 2e-3, 1.0, load_sensor("gelsight_mini").gelpad.friction
+    gripper = RobotSpec("floating_gripper", "gelsight_mini", opening=25e-3 + 1.5e-3)
+    scene = TaskScene("pin", gripper, (pin,), None, None, dt, dt, dt, gravity=(0.0, 0.0, 0.0))
+    world = TactileWorld(scene, outputs=(), device="cpu")
+    opening, fingers = world.composed.opening, world.composed.fingers
+    assert opening is not None
+    servo = -float(world.model.actuator_biasprm[opening, 1])
+    places = []
+    for k in range(750):
+        data = world.data[0]
+        load = min(max(k - 250, 0) / 150, 1.0) * 0.5 * friction * 2.0 * press
+        data.xfrc_applied[world.composed.bodies["pin"].index, 2] = -load
+        world.step(lambda d, t: d.ctrl.__setitem__(opening, d.qpos[fingers].sum() - min(t / 0.2, 1.0) * press / servo))
+        places.append(float(data.qpos[world.composed.bodies["pin"].qpos + 2]))
+    assert places[400] < -0.8e-3  # more than its radius of elastic shear
+    assert abs(places[-1] - places[-150]) < 20e-6
 
 
 def cube_on(share: float, mu: float = 0.6, timestep: float = 0.01, num_envs: int = 1) -> TactileWorld:

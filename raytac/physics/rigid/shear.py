@@ -31,6 +31,8 @@ def element_limits(count: int = ELEMENTS) -> np.ndarray:
 
 
 _LIMITS = element_limits()
+_PLAY = 0.125
+"""Share of the contact's radius that its centre may go to and fro over gel and body without rolling: the centroid of nodes jitters."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,10 @@ class ShearState:
         self.load = np.zeros((*shape, 2))
         """Tangential force and torque at which the contact slips [N, N m]."""
         self.centre = np.zeros((*shape, 3))
+        self.play = np.zeros((*shape, 2, 2))
+        """Travel of the centre over the gel and over the body that does not count as rolling yet, along both tangents [m]."""
+        self.moved = np.zeros((*shape, 2))
+        """Displacement of the body over the gel in the last step, along both tangents [m]."""
 
     def clear(self, *rows: np.ndarray) -> None:
         """Forget the contacts named by indices of environments, pads and bodies, or all of some environments."""
@@ -95,16 +101,32 @@ class ShearState:
     ) -> None:
         """Add a step's displacement (n, 3) and let elements slip.
 
-        ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact and its ``radius``
-        (n,) [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
+        ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact at the start of the
+        step and its ``radius`` (n,) [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
         """
         stretch = self.stretch[rows] + displacement[:, None]
         largest = 1.5 * limit / np.maximum(self.stiffness[rows], 1e-30)
         part = stretch / np.maximum(largest[:, None, [0, 0, 1]] * _LIMITS[None, :, None], 1e-30)
         stretch /= np.maximum(np.sqrt(np.vecdot(part, part)), 1.0)[..., None]
-        travel = np.linalg.norm(centre - self.centre[rows], axis=1) - np.linalg.norm(displacement[:, :2], axis=1)
-        stretch *= np.exp(-np.maximum(travel, 0.0) / np.maximum(2.0 * radius, 1e-9))[:, None, None]
+        radius = np.maximum(radius, 0.5e-9)
+        stretch *= np.exp(-self._rolled(rows, centre, radius) / (2.0 * radius))[:, None, None]
         self.stretch[rows], self.load[rows], self.centre[rows] = stretch, limit, centre
+        self.moved[rows] = displacement[:, :2]
+
+    def _rolled(self, rows: tuple[np.ndarray, ...], centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] that contacts have rolled on in the last step: what their centres travel over gel and body alike.
+
+        A body that shears the gel, or slides, takes the centre with it or leaves it where it is on the gel: one of both is zero. Between
+        two gels the centre goes half as far as the body, and back over it.
+        """
+        over_gel = (centre - self.centre[rows])[:, :2]
+        play = self.play[rows] + np.stack([over_gel, over_gel - self.moved[rows]], axis=1)
+        size = np.linalg.norm(play, axis=2)
+        beyond = np.maximum(size - _PLAY * radius[:, None], 0.0)
+        play_share = beyond / np.maximum(size, 1e-30)
+        same_way = np.vecdot(play[:, 0], play[:, 1]) > 0.0
+        self.play[rows] = play * (1.0 - play_share[:, :, None])
+        return np.where(same_way, beyond.min(axis=1), 0.0)
 
     def of(self, envs: np.ndarray, pad: int, body: np.ndarray) -> ContactShear:
         """Shear of one contact of each environment; body −1 is none."""
