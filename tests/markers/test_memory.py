@@ -117,7 +117,7 @@ def test_a_slide_one_way_moves_the_dots_as_without_memory(grid: PadGrid) -> None
         samples = cells.sample(surface)
         kept, whole = (model.displacement(rest, surface, samples, tracker.update(surface, samples)) for tracker in trackers)
     assert np.abs(whole).max() > 1e-4
-    np.testing.assert_allclose(kept, whole, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(kept, whole, rtol=0, atol=1e-9)
 
 
 @pytest.mark.renderer
