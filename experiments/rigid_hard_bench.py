@@ -15,14 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from raytac.gel.surface import PadGrid, make_grid
-from raytac.physics.objects import object_parts
-from raytac.physics.rigid.load_law import first_touch, first_touch_z
-from raytac.physics.rigid.pad import RigidPad
-from raytac.robots.frames import body_poses, site_poses
+from raytac.gel import PadGrid, make_grid
+from raytac.physics import RigidPad, first_touch, object_parts
+from raytac.robots import body_poses, site_poses
 from raytac.se3 import quaternion
-from raytac.shapes import object_height
-from raytac.shapes.part import Part
+from raytac.shapes import Part, object_height
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor
 from raytac.world import TactileWorld
 
@@ -224,7 +221,7 @@ class Bench:
     def depth(self, pad: int = 0, body: int = 0) -> float:
         """Present overlap of the resting gel and a body [m], by its distance from where it touched."""
         pose = self.in_pad(pad, body)[-1]
-        return first_touch_z(self._parts[body], pose, GEL, GRID) - float(pose[2, 3])
+        return first_touch(self._parts[body], pose, GEL, GRID).z - float(pose[2, 3])
 
     def penetration(self) -> float:
         """Greatest distance of a body beyond a bonded face in all sub-steps [m]; of pad on pad that of the other gel."""

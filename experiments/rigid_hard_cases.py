@@ -52,10 +52,10 @@ from experiments.running import resumed, run, store
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, FolderLock, Metric, versions, write_metrics
-from raytac.physics.objects import object_parts
+from raytac.physics import object_parts
 from raytac.report import machine
 from raytac.se3 import pose_of
-from raytac.shapes.underside import object_bounds
+from raytac.shapes import object_bounds
 from raytac.specs import BodySpec, load_press
 
 STEEL = 7800.0

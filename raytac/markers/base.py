@@ -45,12 +45,18 @@ class MarkersConfig(ABC):
     """Sampling and tracking of contacts, for models that need them."""
     needs_coat: ClassVar[bool] = False
     """True if it reads ``GelSurface.coat``, which only a soft pad has."""
+    follows_shear: ClassVar[bool] = False
+    """True if the gel's shear that the physics knows (``PadReading.shear``) takes the place of the object's motion since first touch."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.perturbation, (MarkerPerturbation, type(None))):
             raise InputError("perturbation", value=self.perturbation, rule="must be a MarkerPerturbation or None")
         if not isinstance(self.contacts, ContactSettings):
             raise InputError("contacts", value=self.contacts, rule="must be a ContactSettings")
+
+    def slip(self, sensor: SensorSpec) -> float | None:
+        """Shear at which a contact slips, over its mean indentation and its radius [1/m]; None: its history never slips."""
+        return None
 
     @abstractmethod
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:

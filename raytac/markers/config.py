@@ -18,6 +18,12 @@ class Fots(MarkersConfig):
     """FOTS: dilation, shear and twist by closed forms, around a disc that sticks if the sensor's marker motion has a ``punch``."""
 
     takes_punch: ClassVar[bool] = True
+    follows_shear: ClassVar[bool] = True
+
+    def slip(self, sensor: SensorSpec) -> float | None:
+        """As of the sensor's marker motion."""
+        motion = marker_motion_of(sensor)
+        return motion.punch.slip if self.takes_punch and motion.punch else None
 
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.fots import FotsModel
@@ -32,6 +38,7 @@ class FotsPublished(Fots):
     """FOTS as published: Gaussians with one λ for all contacts, whether or not the sensor's marker motion has a ``punch``."""
 
     takes_punch: ClassVar[bool] = False
+    follows_shear: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,7 @@ class SurfaceMarkers(MarkersConfig):
 class Superposition(MarkersConfig):
     """Superposition of the pad's unit-load fields; needs ``raytac[ipc]`` for the pad's tetrahedra, and no fit."""
 
+    follows_shear: ClassVar[bool] = True
     level: str = "coarse"
     """Level of the soft pad whose unit-load fields are used; their memory grows with the square of its vertices."""
     rounds: int = 8

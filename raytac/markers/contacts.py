@@ -15,6 +15,14 @@ from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.gel.components import find_edges, join_runs
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
+from raytac.physics.rigid.shear import ContactShear
+
+TWIST_SLIP = 3 * math.pi / 16
+"""Displacement at the edge of a contact when it spins over the shear when it slides, each at its limit of sticking.
+
+Of a ball on incompressible rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so
+9π/32 / (2 − ν)."""
+_LIMIT_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -180,12 +188,12 @@ class Contacts:
 
     @property
     def shear(self) -> np.ndarray:
-        """Tangential displacement of the object at the contact since first touch [m], (B, K, 2)."""
+        """Tangential displacement of the object at the contact since first touch, less known slip [m], (B, K, 2)."""
         return self.table[..., 3:5]
 
     @property
     def twist(self) -> np.ndarray:
-        """Rotation of the object about +z since first touch [rad], (B, K)."""
+        """Rotation of the object about +z since first touch, less known slip [rad], (B, K)."""
         return self.table[..., 5]
 
     @property
@@ -239,11 +247,14 @@ class ContactTracker:
     frame). A contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's rotation about z to its twist. This is the motion
     of the object's material where it touches, which is zero in rolling. A contact is an earlier one if it lies where D carries that one,
     to within its radius and ``ContactSettings.reach``; otherwise it is new and starts from zero. Without contact the history is dropped.
+
+    With ``slip`` c, what exceeds Δs_max = c h̄ A and Δθ_max = ``TWIST_SLIP`` c h̄ slips and is forgotten, so a reversal unloads first. The
+    shear that the physics knows takes the place of the history of the contact that it belongs to.
     """
 
-    def __init__(self, batch: int, settings: ContactSettings | None = None) -> None:
-        """For ``batch`` environments; ``settings``: None is the default ones."""
-        self.batch, self._reach = batch, (settings or ContactSettings()).reach
+    def __init__(self, batch: int, settings: ContactSettings | None = None, *, slip: float | None = None) -> None:
+        """For ``batch`` environments; ``settings``: None is the default ones; ``slip`` [1/m]: None never slips."""
+        self.batch, self._reach, self._slip = batch, (settings or ContactSettings()).reach, slip
         self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
         self._pose: list[_Pose | None] = [None] * batch
 
@@ -253,7 +264,9 @@ class ContactTracker:
             self._contacts[b] = []
             self._pose[b] = None
 
-    def update(self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None) -> Contacts:
+    def update(
+        self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None, shear: ContactShear | None = None
+    ) -> Contacts:
         """Contacts of ``surface``, whose ``samples`` are given; arguments and errors as of ``MarkerTracker.update``."""
         chosen = range(self.batch) if envs is None else envs
         if surface.batch != len(chosen):
@@ -265,6 +278,11 @@ class ContactTracker:
             self._continued(now, before, _motion(last, pose)) if now and before else now
             for now, (before, last), pose in zip(_detect(samples), history, poses, strict=True)
         ]
+        if shear is not None:
+            for now, place, stretch, spin in zip(
+                contacts, shear.centre.tolist(), shear.stretch.tolist(), shear.spin.tolist(), strict=True
+            ):
+                self._set_shear(now, place, stretch, spin)
         for b, now, pose in zip(chosen, contacts, poses, strict=True):
             self._contacts[b], self._pose[b] = now, pose
         count = max(1, max(map(len, contacts)))
@@ -279,10 +297,37 @@ class ContactTracker:
             at = now.x, now.y
             c, cx, cy = min(carried, key=lambda one: math.dist(at, one[1:]))
             if math.dist(at, (cx, cy)) <= max(now.radius, c.radius) + self._reach:
-                result.append(_Contact(*at, c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + angle, *now[5:]))
+                moved = c.shear_x + cx - c.x, c.shear_y + cy - c.y, c.twist + angle
+                result.append(_Contact(*at, *(moved if self._slip is None else _slipped(moved, now, self._slip)), *now[5:]))
             else:
                 result.append(now)
         return result
+
+    def _set_shear(self, contacts: list[_Contact], place: list[float], stretch: list[float], spin: float) -> None:
+        """Give the physics' shear to the contact at its ``place``; zeros or NaN are no contact."""
+        if not contacts or not any(place) or not math.isfinite(sum((*place, *stretch, spin))):
+            return
+        distances = [math.dist((c.x, c.y), place[:2]) for c in contacts]
+        k = distances.index(min(distances))
+        if distances[k] <= contacts[k].radius + self._reach:
+            contacts[k] = contacts[k]._replace(shear_x=stretch[0], shear_y=stretch[1], twist=spin)
+
+
+def _slipped(moved: tuple[float, float, float], contact: _Contact, slip: float) -> tuple[float, float, float]:
+    """Shear and twist that a contact keeps: the closest point, in elastic energy, of the ellipsoid of sticking."""
+    radius = max(contact.xx * contact.yy - contact.xy**2, 1e-24) ** 0.25
+    shear_max, twist_max = slip * contact.depth * radius, TWIST_SLIP * slip * contact.depth
+    x0, y0 = math.hypot(*moved[:2]) / max(shear_max, 1e-12), abs(moved[2]) / max(twist_max, 1e-12)
+    if x0 * x0 + y0 * y0 <= 1.0:
+        return moved
+    ratio = 1 / TWIST_SLIP**2
+    gamma = max(x0 - 1, (y0 - 1) / ratio, 0.0)
+    for _ in range(_LIMIT_STEPS):
+        p, q = 1 + gamma, 1 + ratio * gamma
+        x2, y2 = (x0 / p) ** 2, (y0 / q) ** 2
+        n = math.sqrt(x2 + y2)
+        gamma += n * n * max(n - 1, 0.0) / max(x2 / p + ratio * y2 / q, 1e-12)
+    return moved[0] / (1 + gamma), moved[1] / (1 + gamma), moved[2] / (1 + ratio * gamma)
 
 
 def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:

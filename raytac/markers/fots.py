@@ -41,7 +41,7 @@ import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples
+from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactSamples
 from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.marker_motion import MarkerMotionSpec
 
@@ -51,11 +51,6 @@ _ROW = 12
 """Floats a contact, in three packet gathers: active, G, Δs, Δθ, T_xx, T_xy, T_yy, h̄ and two that are not read here."""
 _PACKET = 4
 """Samples a gather."""
-TWIST_SLIP = 3 * math.pi / 16
-"""Displacement at the edge of a contact when it spins over the shear when it slides, each at its limit of sticking.
-
-Of a ball on incompressible rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so
-9π/32 / (2 − ν)."""
 _LIMIT_STEPS = 3
 """Newton steps of ``_limited``: to float32's rounding at any shear and twist (a test compares with bisection)."""
 

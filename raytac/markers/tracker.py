@@ -15,6 +15,7 @@ from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.registry import markers_config
 from raytac.markers.sampling import height_at
+from raytac.physics.rigid.shear import ContactShear
 from raytac.specs.sensor import SensorSpec
 
 
@@ -93,7 +94,8 @@ class MarkerTracker:
         self._place(range(num_envs))
         self.model = config.build(sensor, grid, num_envs=num_envs, device=device)
         self._cells = ContactCells.over(grid, config.contacts) if self.model.needs_contacts else None
-        self._contacts = ContactTracker(num_envs, config.contacts)
+        self._contacts = ContactTracker(num_envs, config.contacts, slip=config.slip(sensor))
+        self._follows_shear = config.follows_shear
 
     def _place(self, envs: range | list[int]) -> None:
         moves: dict[str, np.ndarray] = {}
@@ -128,16 +130,17 @@ class MarkerTracker:
         zero = np.zeros(pixel.shape)
         return MarkerFrame(zero, zero, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
 
-    def follow(self, surface: GelSurface) -> None:
-        """Add a surface to the history without computing markers."""
+    def follow(self, surface: GelSurface, shear: ContactShear | None = None) -> None:
+        """Add a surface to the history without computing markers; ``shear`` as in ``update``."""
         if self._cells is not None:
-            self._contacts.update(surface, self._cells.sample(surface))
+            self._contacts.update(surface, self._cells.sample(surface), None, shear if self._follows_shear else None)
 
-    def update(self, surface: GelSurface, envs: Sequence[int] | None = None) -> MarkerFrame:
+    def update(self, surface: GelSurface, envs: Sequence[int] | None = None, *, shear: ContactShear | None = None) -> MarkerFrame:
         """Markers on ``surface``; call once for every surface of the motion, in order.
 
         ``envs``: environment of each row of the surface; None is all of them. Others keep their history and draw nothing; one that is named
-        twice advances and draws once.
+        twice advances and draws once. ``shear``: of the gel in one contact of each row, where the physics knows it; models that follow it
+        (``MarkersConfig.follows_shear``) then need no earlier surface for that contact.
 
         Raises:
             InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
@@ -150,7 +153,9 @@ class MarkerTracker:
         heights = surface.height.reshape(count, -1)
         failed = ~np.isfinite(np.vecdot(heights, heights))
         samples = None if self._cells is None else self._cells.sample(surface)
-        contacts = None if samples is None else self._contacts.update(surface, samples, envs)
+        contacts = (
+            None if samples is None else self._contacts.update(surface, samples, envs, shear if self._follows_shear else None)
+        )
         rest = self._rest if envs is None else self._rest[envs]
         moved = self.model.displacement(rest, surface, samples, contacts)
         if moved.shape[-1] == 3:

@@ -4,11 +4,13 @@ from .base import PhysicsConfig as PhysicsConfig
 from .configs import Ipc as Ipc
 from .configs import Rigid as Rigid
 from .geoms import body_parts as body_parts
+from .objects import object_parts as object_parts
 from .press import CLEARANCE as CLEARANCE
 from .press import PressPad as PressPad
 from .registry import PHYSICS as PHYSICS
 from .registry import register as register
 from .rigid.contacts import PadContacts as PadContacts
+from .rigid.load_law import first_touch as first_touch
 from .rigid.pad import RigidPad as RigidPad
 from .rigid.search import PadSearch as PadSearch
 from .soft.availability import quiet_solver as quiet_solver

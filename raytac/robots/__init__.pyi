@@ -1,4 +1,6 @@
 from .arm import Arm as Arm
+from .frames import body_poses as body_poses
+from .frames import site_poses as site_poses
 from .ik import DifferentialIk as DifferentialIk
 from .impedance import CartesianImpedance as CartesianImpedance
 from .impedance import JointImpedance as JointImpedance

@@ -286,7 +286,7 @@ class TactileSensor:
         time_ms = {"surface": 1e3 * (done - start)}
         markers = None
         if self.markers is not None:
-            markers = self.marker_tracker.update(surface, envs)
+            markers = self.marker_tracker.update(surface, envs, shear=reading.shear)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
         return self._frame(surface, markers, done, time_ms, **forces)
@@ -386,7 +386,7 @@ class TactileSensor:
         """The same readings, while markers that need it see every one of them."""
         for reading in readings:
             if self.markers is not None:
-                self.marker_tracker.follow(reading.surface)
+                self.marker_tracker.follow(reading.surface, reading.shear)
             yield reading
 
     def _dotted(self, surface: GelSurface, markers: MarkerFrame) -> GelSurface:
