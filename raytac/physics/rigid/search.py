@@ -11,13 +11,12 @@ import warp as wp
 from raytac.errors import InputError
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
 from raytac.physics.rigid.law_kernels import BINS
-from raytac.physics.rigid.search_kernels import PITCHES, Rows, Work, find_near, measure
+from raytac.physics.rigid.search_kernels import LAST, PITCHES, Rows, Work, find_near, measure
 from raytac.physics.rigid.shape_arrays import PadArrays, ShapeArrays
 from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part
 from raytac.specs.sensor import GelpadSpec
 
-_LAST = 2
 _LANES = 128
 """Threads of a block on CUDA."""
 _MEMORY = 256e6
@@ -43,7 +42,7 @@ class PadSearch:
         """Bodies by their parts, body frame; ``device``: "cpu" or "cuda"."""
         start_warp()
         self.device = wp.get_device(device)
-        self._pads = PadArrays(gelpads, PITCHES, _LAST, self.device)
+        self._pads = PadArrays(gelpads, PITCHES, LAST, self.device)
         self._shapes = ShapeArrays(bodies, self.device)
         self._shape = len(gelpads), len(bodies)
         self._capacity = 0

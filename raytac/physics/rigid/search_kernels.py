@@ -30,14 +30,15 @@ from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-PITCHES = 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
-"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes. The last two are for bodies that are
-narrower there than two cells of the third."""
-ENOUGH = 150
-"""Nodes: 96 mm² of the first grid, 24 mm² of the second."""
-_ENOUGH = wp.constant(wp.int32(ENOUGH))
-_LAST = wp.constant(wp.int32(2))
+PITCHES = 1.6e-3, 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
+"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, but not on the coarsest, which only
+says where a convex body may touch. The last two are for bodies that are narrower there than two cells of the one before."""
+LAST = 3
 """Last grid of bodies that are not narrow."""
+ENOUGH = 150
+"""Nodes: 96 mm² of the second grid, 24 mm² of the third."""
+_ENOUGH = wp.constant(wp.int32(ENOUGH))
+_FIRST, _LAST = wp.constant(wp.int32(1)), wp.constant(wp.int32(LAST))
 _FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
 _NEAR = wp.constant(wp.float64(0.75))
 """Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
@@ -54,6 +55,8 @@ _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
 _NAN = wp.constant(wp.float64(float("nan")))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
+_TORUS = wp.constant(wp.int32(7))
+"""First of the kinds of parts that may not be convex."""
 _SEARCH, _ZOOM, _LAW = (wp.constant(wp.int32(k)) for k in range(3))
 """Purpose of a pass over nodes: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
 
@@ -186,10 +189,11 @@ def height_at(
 def vertex_of(before: wp.float64, middle: wp.float64, after: wp.float64, pitch: wp.float64) -> wp.vec2d:
     """Drop below the middle of a parabola through three values at −1, 0, 1, and where; (0, 0) if it is none.
 
-    Where a neighbour is higher by half the pitch, it lies beyond an edge, through which no parabola goes.
+    Where a neighbour is higher by half the pitch, it lies beyond an edge, through which no parabola goes. Where one is lower, the least
+    value is beyond the nodes that were looked at.
     """
     curve = before + after - _2 * middle
-    if curve > _0 and wp.max(before, after) < middle + _HALF * pitch:
+    if curve > _0 and wp.min(before, after) >= middle and wp.max(before, after) < middle + _HALF * pitch:
         rise = after - before
         return wp.vec2d(wp.float64(0.125) * rise * rise / curve, -_HALF * rise / curve)
     return wp.vec2d(_0, _0)
@@ -217,6 +221,56 @@ def between_nodes(
 
 
 @wp.func
+def least_around(
+    gap: wp.array2d(dtype=wp.float64), block: wp.int32, k: wp.int32, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32, steep: wp.float64
+) -> wp.float64:
+    """Lower bound of a convex gap [m] up to one node away from node k of a window, which is its i-th along x and its j-th along y.
+
+    A convex function falls on one side of a node by no more than it rises on the other. ``steep``: fall [m] where both neighbours along
+    an axis are missing.
+    """
+    middle = gap[block, k]
+    result = wp.float64(middle)
+    m = wp.int32(0)
+    while m < 2:
+        step, at, count = wp.where(m == 0, 1, nx), wp.where(m == 0, i, j), wp.where(m == 0, nx, ny)
+        rise = -infinity()
+        if at > 0 and gap[block, k - step] < _INF:
+            rise = gap[block, k - step] - middle
+        if at < count - 1 and gap[block, k + step] < _INF:
+            rise = wp.max(rise, gap[block, k + step] - middle)
+        if rise == -_INF:
+            rise = steep
+        result -= wp.max(rise, _0)
+        m += 1
+    return result
+
+
+@wp.func
+def box_around(
+    pads: Pads, fx: wp.int32, fy: wp.int32, i0: wp.int32, i1: wp.int32, j0: wp.int32, j1: wp.int32, step_x: wp.float64, step_y: wp.float64
+) -> wp.vec4d:
+    """x from, to, y from, to [m] of nodes and one node's spacing around them."""
+    return wp.vec4d(
+        pads.lines[fx + i0][0] - step_x,
+        pads.lines[fx + i1][0] + step_x,
+        pads.lines[fy + j0][0] - step_y,
+        pads.lines[fy + j1][0] + step_y,
+    )
+
+
+@wp.func
+def is_convex(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.bool:
+    """True if one part alone is near and is convex: its gap to the resting gel, which is a cap, is convex over the line of sight."""
+    parts, convex = wp.int32(0), wp.int32(1)
+    for k in range(placed.count[block]):
+        if placed.part[block, k] >= 0:
+            parts += 1
+            convex = wp.where(shapes.kind[placed.part[block, k]] < _TORUS, convex, 0)
+    return parts == 1 and convex == 1
+
+
+@wp.func
 def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
     """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
     deepest = wp.max(_DEEPER * depth, depth + reach)
@@ -239,7 +293,8 @@ def measure_pair(
     bond, thickness, highest = -pads.thickness[pad], pads.thickness[pad], pads.highest[pad]
     bottom, width = bottom_of(placed, block), width_of(placed, block)
     # Nodes up to there are counted by the law.
-    clear = wp.max(reach, (_HALF * _DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness))
+    deeper = (_HALF * _DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness)
+    clear = wp.max(reach, deeper)
     last = wp.int32(_LAST)
     while last < _FINEST and pads.pitch[last] > _HALF * width[0]:
         last += 1
@@ -248,9 +303,14 @@ def measure_pair(
         lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, last)
     pierced = lowest < _INF
 
-    mode, level, touching = wp.int32(_SEARCH), wp.int32(0), wp.int32(0)
-    left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+    convex = is_convex(shapes, placed, block)
+    mode, level, touching = wp.int32(_SEARCH), wp.int32(_FIRST), wp.int32(0)
+    if convex and pads.pitch[0] <= _HALF * wp.min(width[0], width[1]):
+        level = 0
+    everywhere = wp.vec4d(-_INF, _INF, -_INF, _INF)  # x from, to, y from, to
+    outer, box = wp.vec4d(everywhere), wp.vec4d(everywhere)  # where the gap may be below ``clear``; where nodes are looked at
     zero = wp.float64(0.0)  # gap below which nodes count
+    lowest_before = infinity()  # of the body, on coarser grids
     depth, deepest, least = wp.float64(0.0), wp.float64(0.0), infinity()
     refined_x, refined_y = wp.float64(0.0), wp.float64(0.0)
     i0, j0, nx, n = wp.int32(0), wp.int32(0), wp.int32(1), wp.int32(0)
@@ -267,11 +327,11 @@ def measure_pair(
         x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
         i0, j0 = area[0], area[2]
         i1, j1 = area[1], area[3]
-        if left > -_INF:
-            i0 = wp.max(i0, wp.int32(wp.ceil((left - x0) / step_x)))
-            i1 = wp.min(i1, wp.int32(wp.floor((right - x0) / step_x)) + 1)
-            j0 = wp.max(j0, wp.int32(wp.ceil((front - y0) / step_y)))
-            j1 = wp.min(j1, wp.int32(wp.floor((rear - y0) / step_y)) + 1)
+        if box[0] > -_INF:
+            i0 = wp.max(i0, wp.int32(wp.ceil((box[0] - x0) / step_x)))
+            i1 = wp.min(i1, wp.int32(wp.floor((box[1] - x0) / step_x)) + 1)
+            j0 = wp.max(j0, wp.int32(wp.ceil((box[2] - y0) / step_y)))
+            j1 = wp.min(j1, wp.int32(wp.floor((box[3] - y0) / step_y)) + 1)
         nx = wp.max(i1 - i0, 0)
         n = nx * wp.max(j1 - j0, 0)
         if level < last and n < _ENOUGH:  # so few cannot be enough
@@ -311,7 +371,7 @@ def measure_pair(
             k += lanes
         count = count_of(count)
         if mode == _LAW:
-            if count >= _ENOUGH or level >= last:
+            if (count >= _ENOUGH and level >= _FIRST) or level >= last:
                 busy = 0
             level += 1
             continue
@@ -322,32 +382,67 @@ def measure_pair(
         a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
         if mode == _ZOOM and count > 0:  # it does touch, between the nodes that were looked at
             mode, may_zoom = wp.int32(_SEARCH), wp.int32(0)
-            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+            box = wp.vec4d(outer)
             continue
         i, j = wp.int32(0), wp.int32(0)  # of the least gap
         if least < _INF:
             j = near_node // nx
             i = i0 + near_node - j * nx
             j += j0
-        done = level >= last or count >= _ENOUGH
+        done = level >= last or (count >= _ENOUGH and level >= _FIRST)
         beyond = wp.bool(False)
-        if not done and wide and least >= near:
+        if not done and wide and convex:
+            # Nodes around which the gap may be below what the law counts, and those around which it may be least.
+            b = wp.vec4i(_MANY, _MANY, _MANY, _MANY)
+            a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
+            bound, floor = infinity(), wp.min(least, _0)
+            counted = wp.max(deeper, _HALF * (reach + least))
+            p, q = wp.int32(lane), wp.int32(0)
+            k = wp.int32(lane)
+            while k < n:
+                while p >= nx:
+                    p -= nx
+                    q += 1
+                if work.gap[block, k] < _INF:
+                    around = least_around(work.gap, block, k, p, q, nx, n // nx, _NEAR * pitch)
+                    bound = wp.min(bound, around)
+                    if around <= counted:
+                        a0, a1, b0, b1 = wp.min(a0, i0 + p), wp.min(a1, -i0 - p), wp.min(b0, j0 + q), wp.min(b1, -j0 - q)
+                    if around <= floor or (count == 0 and around <= least):
+                        b = wp.vec4i(wp.min(b[0], i0 + p), wp.min(b[1], -i0 - p), wp.min(b[2], j0 + q), wp.min(b[3], -j0 - q))
+                p += lanes
+                k += lanes
+            bound = least_of(bound)
+            a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
+            beyond = bound >= reach and count == 0
+            done = beyond
+            if not done and count == 0 and may_zoom == 1:
+                if mode == _SEARCH and a0 < _MANY:
+                    outer = box_around(pads, fx, fy, a0, a1, b0, b1, step_x, step_y)
+                mode = wp.int32(_ZOOM)
+                box = box_around(pads, fx, fy, first_of(b[0]), -first_of(b[1]), first_of(b[2]), -first_of(b[3]), step_x, step_y)
+        elif not done and wide and least >= near:
             beyond = least >= reach + near
             done = beyond
             if not done and may_zoom == 1:
                 mode = wp.int32(_ZOOM)
+                box = box_around(pads, fx, fy, i, i, j, j, step_x, step_y)
         if not done:
             following = level + 1
-            if mode == _ZOOM:
-                left, right = pads.lines[fx + i][0] - step_x, pads.lines[fx + i][0] + step_x
-                front, rear = pads.lines[fy + j][0] - step_y, pads.lines[fy + j][0] + step_y
-            else:
-                # With half the spacing there are four times as many nodes: of few, at most half of enough.
-                if count < _ENOUGH // 8:
-                    following = wp.max(following, wp.min(last, _LAST))
-                if wide and width[1] == _INF and a0 < _MANY:
-                    left, right = pads.lines[fx + a0][0] - step_x, pads.lines[fx + a1][0] + step_x
-                    front, rear = pads.lines[fy + b0][0] - step_y, pads.lines[fy + b1][0] + step_y
+            if low < _INF:
+                q = low_node // nx
+                p = i0 + low_node - q * nx
+                q += j0
+                lowest_before = wp.min(lowest_before, low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0])
+            if mode != _ZOOM:
+                # With half the spacing there are four times as many nodes: a grid with fewer than half of enough is left out.
+                expected = 4 * count
+                while following < wp.min(last, _LAST) and expected < _ENOUGH // 2:
+                    following += 1
+                    expected *= 4
+                if wide and (convex or width[1] == _INF) and a0 < _MANY:
+                    box = box_around(pads, fx, fy, a0, a1, b0, b1, step_x, step_y)
+                    outer = wp.vec4d(box)
             level = following
             continue
         busy = 0
@@ -356,7 +451,9 @@ def measure_pair(
             q = low_node // nx
             p = i0 + low_node - q * nx
             q += j0
-            lowest = wp.max(low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0], bond)
+            lowest = wp.max(
+                wp.min(low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0], lowest_before), bond
+            )
         if beyond or least == _INF:
             least = _INF
             continue
@@ -371,9 +468,9 @@ def measure_pair(
         elif -depth >= reach:
             least = _INF
         else:
-            mode, level, busy = wp.int32(_LAW), wp.int32(0), wp.int32(1)
+            mode, level, busy = wp.int32(_LAW), wp.int32(_FIRST), wp.int32(1)
             zero = _HALF * deepest - depth
-            left, right, front, rear = -infinity(), infinity(), -infinity(), infinity()
+            box = wp.vec4d(outer)
     level -= 1
 
     if least == _INF:
