@@ -27,6 +27,11 @@ _STEP = wp.constant(wp.int32(_FINER))
 _0 = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
+_STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
+DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
+"""Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own."""
+_SHALLOWEST = wp.constant(wp.float64(10e-6))
+"""Least depth up to which a law is tabulated [m]."""
 _PI = wp.constant(wp.float64(3.141592653589793))
 
 
@@ -38,6 +43,17 @@ class Bins:
     low: wp.array2d(dtype=wp.float64)
     """Least gap [m]; inf in an empty bin."""
     high: wp.array2d(dtype=wp.float64)
+
+
+@wp.func
+def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
+    """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
+    deepest = wp.max(DEEPER * depth, depth + reach)
+    if depth > _0 and deepest < thickness:
+        k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
+        if k >= wp.float64(6.0):
+            deepest = depth * (_STEPS / k) * (_STEPS / k)
+    return wp.max(wp.min(deepest, thickness), wp.max(depth, _SHALLOWEST))
 
 
 @wp.func

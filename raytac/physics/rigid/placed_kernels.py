@@ -13,7 +13,8 @@ from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-_PLANE, _MESH = wp.constant(wp.int32(0)), wp.constant(wp.int32(8))
+_PLANE, _BOX, _MESH = wp.constant(wp.int32(0)), wp.constant(wp.int32(5)), wp.constant(wp.int32(8))
+_PARALLEL = wp.constant(wp.float64(1e-14))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -67,6 +68,15 @@ class Placed:
     """Least width of the part as seen along z."""
     blunt: wp.array2d(dtype=wp.float64)
     """See ``Shapes``."""
+
+
+@wp.func
+def is_finite(pose: wp.mat44d) -> wp.bool:
+    total = wp.float64(0.0)
+    for i in range(3):
+        for j in range(4):
+            total += wp.abs(pose[i, j])
+    return wp.isfinite(total)
 
 
 @wp.func
@@ -227,6 +237,26 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
 
 
 @wp.func
+def entries_of(size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d):
+    """Heights at which vertical lines enter the three slabs of a box, as rows of factors of x, y and 1, and lengths inside [m].
+
+    Of a slab that is parallel to the lines both ends are far away, on one side of the line or on both.
+    """
+    entry, length = wp.mat33d(), wp.vec3d()
+    k = wp.int32(0)
+    while k < 3:
+        d = rotation[2, k]
+        inverse = _1 / wp.where(d < _0, wp.min(d, -_PARALLEL), wp.max(d, _PARALLEL))
+        a, b = -rotation[0, k] * inverse, -rotation[1, k] * inverse
+        entry[k, 0] = a
+        entry[k, 1] = b
+        entry[k, 2] = at[2] - size[k] * wp.abs(inverse) - a * at[0] - b * at[1]
+        length[k] = _2 * size[k] * wp.abs(inverse)
+        k += 1
+    return entry, length
+
+
+@wp.func
 def under_nodes(
     shapes: Shapes, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, lines: wp.array(dtype=wp.vec3d),
     first_x: wp.int32, first_y: wp.int32, nx: wp.int32, n: wp.int32,
@@ -244,6 +274,7 @@ def under_nodes(
             c, h = placed.centre[block, m], placed.half[block, m]
             rotation, at = placed.rotation[block, m], placed.at[block, m]
             kind, size = shapes.kind[part], shapes.size[part]
+            entry, length = entries_of(size, rotation, at)
             i, j = wp.int32(lane), wp.int32(0)
             k = wp.int32(lane)
             while k < n:
@@ -253,7 +284,12 @@ def under_nodes(
                 x, y = lines[first_x + i][0], lines[first_y + j][0]
                 if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
                     z = wp.float64(0.0)
-                    if kind < _MESH:
+                    if kind == _BOX:
+                        start = entry * wp.vec3d(x, y, _1)
+                        z = wp.max(wp.max(start[0], start[1]), start[2])
+                        if z > wp.min(wp.min(start[0] + length[0], start[1] + length[1]), start[2] + length[2]):
+                            z = _INF
+                    elif kind < _MESH:
                         z = under_primitive(kind, size, rotation, at, x, y)
                     else:
                         z = under_surface(shapes, part, rotation, at, x, y)

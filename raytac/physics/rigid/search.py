@@ -9,9 +9,10 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
+from raytac.physics.rigid.contact_rows import LAST, Rows
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
 from raytac.physics.rigid.law_kernels import BINS
-from raytac.physics.rigid.search_kernels import LAST, PITCHES, Rows, Work, find_near, measure
+from raytac.physics.rigid.search_kernels import PITCHES, Work, find_near, measure
 from raytac.physics.rigid.shape_arrays import PadArrays, ShapeArrays
 from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part

@@ -13,15 +13,26 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.contacts import LAW_POINTS
-from raytac.physics.rigid.law_kernels import Bins, add_node, clear_bins, tabulate
+from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
+from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, tabulate
+from raytac.physics.rigid.node_kernels import (
+    between_nodes,
+    box_around,
+    count_of,
+    first_of,
+    is_convex,
+    least_around,
+    least_of,
+    pierced_at,
+    total_of,
+)
 from raytac.physics.rigid.placed_kernels import (
     Pads,
     Placed,
     bottom_of,
+    is_finite,
     lowest_of,
     place_parts,
-    under,
     under_nodes,
     width_of,
     window,
@@ -33,51 +44,24 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 PITCHES = 1.6e-3, 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
 """Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, but not on the coarsest, which only
 says where a convex body may touch. The last two are for bodies that are narrower there than two cells of the one before."""
-LAST = 3
-"""Last grid of bodies that are not narrow."""
 ENOUGH = 150
 """Nodes: 96 mm² of the second grid, 24 mm² of the third."""
 _ENOUGH = wp.constant(wp.int32(ENOUGH))
 _FIRST, _LAST = wp.constant(wp.int32(1)), wp.constant(wp.int32(LAST))
+"""First and last grid on which bodies that are not narrow are measured."""
 _FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
 _NEAR = wp.constant(wp.float64(0.75))
 """Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
 _JUST_TOUCHING = wp.constant(wp.float64(50e-6))
 """The place of a gap is the centroid of the overlap that the body would have so much deeper [m]."""
-_DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
-"""Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own."""
-_STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
-_SHALLOWEST = wp.constant(wp.float64(10e-6))
-"""Least depth up to which a law is tabulated [m]."""
 _0 = wp.constant(wp.float64(0.0))
 _2 = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
 _NAN = wp.constant(wp.float64(float("nan")))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
-_TORUS = wp.constant(wp.int32(7))
-"""First of the kinds of parts that may not be convex."""
 _SEARCH, _ZOOM, _LAW = (wp.constant(wp.int32(k)) for k in range(3))
 """Purpose of a pass over nodes: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
-
-
-@wp.struct
-class Rows:
-    """Results, one row for each pair that is near; see ``PadContacts``."""
-
-    valid: wp.array(dtype=wp.int32)
-    """1 where the pair touches, is within reach or has gone through."""
-    env: wp.array(dtype=wp.int32)
-    pad: wp.array(dtype=wp.int32)
-    body: wp.array(dtype=wp.int32)
-    depth: wp.array(dtype=wp.float64)
-    centre: wp.array(dtype=wp.vec3d)
-    normal: wp.array(dtype=wp.vec3d)
-    clearance: wp.array(dtype=wp.float64)
-    spread: wp.array(dtype=wp.vec3d)
-    deepest: wp.array(dtype=wp.float64)
-    force: wp.array2d(dtype=wp.float64)
-    radius: wp.array2d(dtype=wp.float64)
 
 
 @wp.struct
@@ -115,173 +99,6 @@ def find_near(
 
 
 @wp.func
-def is_finite(pose: wp.mat44d) -> wp.bool:
-    total = wp.float64(0.0)
-    for i in range(3):
-        for j in range(4):
-            total += wp.abs(pose[i, j])
-    return wp.isfinite(total)
-
-
-@wp.func
-def total_of(value: wp.float64) -> wp.float64:
-    """Sum over the block; also a barrier."""
-    return wp.tile_sum(wp.tile(value))[0]
-
-
-@wp.func
-def count_of(value: wp.int32) -> wp.int32:
-    return wp.tile_sum(wp.tile(value))[0]
-
-
-@wp.func
-def least_of(value: wp.float64) -> wp.float64:
-    return wp.tile_min(wp.tile(value))[0]
-
-
-@wp.func
-def first_of(value: wp.int32) -> wp.int32:
-    return wp.tile_min(wp.tile(value))[0]
-
-
-@wp.func
-def pierced_at(
-    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, pad: wp.int32, level: wp.int32
-) -> wp.float64:
-    """Lowest z [m] of the body on lines on which it lies in the layer of one thickness behind the bonded face; inf if on none.
-
-    Lines on which it lies wholly behind that layer do not count, nor the pad's outermost lines: MuJoCo lets bodies some hundredths of a
-    millimetre into walls, and a case may be as wide as its gel.
-    """
-    bond = -pads.thickness[pad]
-    area = window(pads, placed, block, pad, level, bond)
-    i0, j0 = wp.max(area[0], 1), wp.max(area[2], 1)
-    nx = wp.min(area[1], pads.nx[pad, level] - 1) - i0
-    n = wp.max(nx, 0) * wp.max(wp.min(area[3], pads.ny[pad, level] - 1) - j0, 0)
-    lowest = infinity()
-    k = wp.int32(lane)
-    while k < n:
-        x = pads.lines[pads.first_x[pad, level] + i0 + k % nx][0]
-        y = pads.lines[pads.first_y[pad, level] + j0 + k // nx][0]
-        z = under(shapes, placed, block, x, y, False)
-        if z < bond and z < lowest:
-            if under(shapes, placed, block, x, y, True) > bond - pads.thickness[pad]:
-                lowest = z
-        k += lanes
-    return least_of(lowest)
-
-
-@wp.func
-def height_at(
-    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32
-) -> wp.vec2d:
-    """z [m] of the body over node i, j, and its gap to the gel; inf where there is none or it is below the bonded face."""
-    if i < 0 or j < 0 or i >= pads.nx[pad, level] or j >= pads.ny[pad, level]:
-        return wp.vec2d(_INF, _INF)
-    x, y = pads.lines[pads.first_x[pad, level] + i], pads.lines[pads.first_y[pad, level] + j]
-    z = under(shapes, placed, block, x[0], y[0], False)
-    if z < -pads.thickness[pad]:
-        return wp.vec2d(_INF, _INF)
-    return wp.vec2d(z, z - x[1] - y[1])
-
-
-@wp.func
-def vertex_of(before: wp.float64, middle: wp.float64, after: wp.float64, pitch: wp.float64) -> wp.vec2d:
-    """Drop below the middle of a parabola through three values at −1, 0, 1, and where; (0, 0) if it is none.
-
-    Where a neighbour is higher by half the pitch, it lies beyond an edge, through which no parabola goes. Where one is lower, the least
-    value is beyond the nodes that were looked at.
-    """
-    curve = before + after - _2 * middle
-    if curve > _0 and wp.min(before, after) >= middle and wp.max(before, after) < middle + _HALF * pitch:
-        rise = after - before
-        return wp.vec2d(wp.float64(0.125) * rise * rise / curve, -_HALF * rise / curve)
-    return wp.vec2d(_0, _0)
-
-
-@wp.func
-def between_nodes(
-    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32,
-    middle: wp.float64, of: wp.int32,
-) -> wp.vec3d:  # fmt: skip
-    """Drop [m] below ``middle``, the z (``of`` 0) or gap (1) at node i, j, and the place of the least along x and y [nodes].
-
-    By parabolas through the neighbours along both axes.
-    """
-    beside = wp.vec4d()
-    k = wp.int32(0)
-    while k < 4:  # a loop that is not unrolled: the compiler's time goes by the code
-        step = wp.where(k % 2 == 0, -1, 1)
-        p, q = i + wp.where(k < 2, step, 0), j + wp.where(k < 2, 0, step)
-        beside[k] = height_at(shapes, pads, placed, block, pad, level, p, q)[of]
-        k += 1
-    across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
-    along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
-    return wp.vec3d(across[0] + along[0], across[1], along[1])
-
-
-@wp.func
-def least_around(
-    gap: wp.array2d(dtype=wp.float64), block: wp.int32, k: wp.int32, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32, steep: wp.float64
-) -> wp.float64:
-    """Lower bound of a convex gap [m] up to one node away from node k of a window, which is its i-th along x and its j-th along y.
-
-    A convex function falls on one side of a node by no more than it rises on the other. ``steep``: fall [m] where both neighbours along
-    an axis are missing.
-    """
-    middle = gap[block, k]
-    result = wp.float64(middle)
-    m = wp.int32(0)
-    while m < 2:
-        step, at, count = wp.where(m == 0, 1, nx), wp.where(m == 0, i, j), wp.where(m == 0, nx, ny)
-        rise = -infinity()
-        if at > 0 and gap[block, k - step] < _INF:
-            rise = gap[block, k - step] - middle
-        if at < count - 1 and gap[block, k + step] < _INF:
-            rise = wp.max(rise, gap[block, k + step] - middle)
-        if rise == -_INF:
-            rise = steep
-        result -= wp.max(rise, _0)
-        m += 1
-    return result
-
-
-@wp.func
-def box_around(
-    pads: Pads, fx: wp.int32, fy: wp.int32, i0: wp.int32, i1: wp.int32, j0: wp.int32, j1: wp.int32, step_x: wp.float64, step_y: wp.float64
-) -> wp.vec4d:
-    """x from, to, y from, to [m] of nodes and one node's spacing around them."""
-    return wp.vec4d(
-        pads.lines[fx + i0][0] - step_x,
-        pads.lines[fx + i1][0] + step_x,
-        pads.lines[fy + j0][0] - step_y,
-        pads.lines[fy + j1][0] + step_y,
-    )
-
-
-@wp.func
-def is_convex(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.bool:
-    """True if one part alone is near and is convex: its gap to the resting gel, which is a cap, is convex over the line of sight."""
-    parts, convex = wp.int32(0), wp.int32(1)
-    for k in range(placed.count[block]):
-        if placed.part[block, k] >= 0:
-            parts += 1
-            convex = wp.where(shapes.kind[placed.part[block, k]] < _TORUS, convex, 0)
-    return parts == 1 and convex == 1
-
-
-@wp.func
-def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
-    """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
-    deepest = wp.max(_DEEPER * depth, depth + reach)
-    if depth > _0 and deepest < thickness:
-        k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
-        if k >= wp.float64(6.0):
-            deepest = depth * (_STEPS / k) * (_STEPS / k)
-    return wp.max(wp.min(deepest, thickness), wp.max(depth, _SHALLOWEST))
-
-
-@wp.func
 def measure_pair(
     pose: wp.mat44d, reach: wp.float64, shapes: Shapes, pads: Pads, work: Work, block: wp.int32, lane: wp.int32, lanes: wp.int32,
     pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
@@ -293,7 +110,7 @@ def measure_pair(
     bond, thickness, highest = -pads.thickness[pad], pads.thickness[pad], pads.highest[pad]
     bottom, width = bottom_of(placed, block), width_of(placed, block)
     # Nodes up to there are counted by the law.
-    deeper = (_HALF * _DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness)
+    deeper = (_HALF * DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness)
     clear = wp.max(reach, deeper)
     last = wp.int32(_LAST)
     while last < _FINEST and pads.pitch[last] > _HALF * width[0]:
@@ -433,7 +250,9 @@ def measure_pair(
                 q = low_node // nx
                 p = i0 + low_node - q * nx
                 q += j0
-                lowest_before = wp.min(lowest_before, low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0])
+                lowest_before = wp.min(
+                    lowest_before, low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0]
+                )
             if mode != _ZOOM:
                 # With half the spacing there are four times as many nodes: a grid with fewer than half of enough is left out.
                 expected = 4 * count
@@ -543,34 +362,6 @@ def measure_pair(
         else:
             place_of_gap(pads, pad, refined_x, refined_y, depth, row, rows)
         tabulate(work.bins, block, beyond_law, deepest, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
-
-
-@wp.func
-def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows):
-    """Place and normal where the gap is least, of a body too sharp to have nodes of its own there."""
-    fx, fy = pads.first_x[pad, _LAST], pads.first_y[pad, _LAST]
-    i = wp.int32(wp.round((x - pads.lines[fx][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])))
-    j = wp.int32(wp.round((y - pads.lines[fy][0]) / (pads.lines[fy + 1][0] - pads.lines[fy][0])))
-    p = pads.lines[fx + wp.clamp(i, 0, pads.nx[pad, _LAST] - 1)]
-    q = pads.lines[fy + wp.clamp(j, 0, pads.ny[pad, _LAST] - 1)]
-    rest = p[1] + p[2] * (x - p[0]) + q[1] + q[2] * (y - q[0])
-    rows.centre[row] = wp.vec3d(x, y, rest - depth)
-    rows.normal[row] = wp.normalize(wp.vec3d(-p[2], -q[2], wp.float64(1.0)))
-
-
-@wp.func
-def missing_row(rows: Rows, row: wp.int32, depth: wp.float64, clearance: wp.float64):
-    """A row without a law: of a body that is not over the gel but through it, or (NaN) of a pose that is not finite."""
-    rows.valid[row] = 1
-    rows.depth[row] = depth
-    rows.clearance[row] = clearance
-    rows.spread[row] = wp.vec3d(_NAN, _NAN, _NAN)
-    rows.deepest[row] = _NAN
-    rows.centre[row] = wp.vec3d(_NAN, _NAN, _NAN)
-    rows.normal[row] = wp.vec3d(_NAN, _NAN, _NAN)
-    for k in range(rows.force.shape[1]):
-        rows.force[row, k] = _NAN
-        rows.radius[row, k] = _NAN
 
 
 @wp.kernel
