@@ -1,4 +1,4 @@
-"""Poses and velocities of bodies, and of other gels, in the frames of pads; all environments at once."""
+"""Poses and velocities of bodies, and of other gels, in the frames of pads, in NumPy: oracle of ``motion_kernels``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from raytac.physics.rigid.contacts import PadContacts
 from raytac.robots.frames import body_poses, site_poses
-from raytac.world.pad_rows import cross
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 @dataclass(frozen=True)
@@ -82,3 +83,8 @@ def relative(world_from_pad: np.ndarray, world_from_body: np.ndarray) -> np.ndar
 def turned(vectors: np.ndarray, target_from_source: np.ndarray) -> np.ndarray:
     """Vectors (…, 3) of the target frame in the source's, by rotations (…, 3, 3)."""
     return (vectors[..., None, :] @ target_from_source)[..., 0, :]
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products (…, 3); NumPy's own takes several times as long for a few."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]

@@ -1,16 +1,4 @@
-"""Normal contact as an implicit spring: the force of one step, linear in the speed at its end, by which it stays stable at any step.
-
-A contact of depth δ that closes at the speed w at the end of a step Δt carries
-
-    f = F(δ) + C w,   C = c K
-
-with K the incremental stiffness of the load law at the deeper end of the step and c >= Δt/2. At rest that is F(δ) exactly. A step takes
-at least the work from the bodies that the gel stores (F is convex and K its greatest slope in the step), so that energy does not grow.
-c is the gel's relaxation time τ (Kelvin and Voigt) where the step resolves the motion, and goes to Δt where it does not: backward Euler.
-
-MuJoCo's constraint obeys R f = a* − a with a the acceleration that opens the contact, (v + Δt a) = −w: R = 1 / (C Δt),
-a* = F(δ) / (C Δt) − v / Δt (``PadRows.regularisation``, docs/worlds.md).
-"""
+"""Normal contact as an implicit spring in NumPy: oracle of ``spring_kernels``, which has the physics."""
 
 from __future__ import annotations
 
