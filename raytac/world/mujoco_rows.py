@@ -45,7 +45,7 @@ class MujocoRows:
             geoms: of the bodies that pads touch, then of the gels.
             hard: geoms with the law of ``hard_contacts``, (ngeom,), bool.
         """
-        num_envs, pads = contact.wrench.shape[:2]
+        num_envs, pads = contact.wrenches.shape
         state, one = checked_layouts()
         self._contact, self._blank = contact, _blank()
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
@@ -97,14 +97,16 @@ class MujocoRows:
 
         An environment whose memory for contacts is full is lost.
         """
-        count, models, datas, contact = len(envs), self._models, self._datas, self._contact
-        lost, blank = contact.view("lost", count), self._blank
-        rows = []
-        for i in np.flatnonzero((contact.view("contacts", count) > 0) & (lost == 0)).tolist():
-            model, data = models[envs[i]], datas[envs[i]]
-            for _ in range(int(contact.view("contacts", count)[i])):
+        count, blank, views = len(envs), self._blank, self._contact.views
+        assert views is not None
+        lost, rows = views.lost[:count].tolist(), []
+        for i, number in enumerate(views.contacts[:count].tolist()):
+            if not number or lost[i]:
+                continue
+            model, data = self._models[envs[i]], self._datas[envs[i]]
+            for _ in range(number):
                 if mujoco.mj_addContact(model, data, blank) != 0:
-                    lost[i] = 1
+                    views.lost[i] = 1
                     break
             else:
                 rows.append((model, data))

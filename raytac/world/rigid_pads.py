@@ -95,7 +95,8 @@ class RigidPads:
             fall=float(np.linalg.norm(option.gravity)),
             case_travel=_CASE_TRAVEL,
         )
-        self._shear = self._contact.shear
+        assert self._contact.views is not None  # they are on the CPU
+        self._shear, self._views = self._contact.shear, self._contact.views
         self._mujoco = MujocoRows(
             composed.model,
             self._contact,
@@ -133,7 +134,7 @@ class RigidPads:
         """
         scene, contact = self.composed, self._contact
         self._bind(datas)
-        contact.before[:] = np.nan
+        self._views.before[:] = np.nan
         for _ in range(round(scene.control_timestep / scene.timestep)):
             done = np.zeros(len(datas), int)
             while len(envs := np.flatnonzero(~failed & (done < contact.ticks))):
@@ -142,26 +143,25 @@ class RigidPads:
         for b in sound.tolist():
             mujoco.mj_kinematics(self._models[b], datas[b])  # so that poses are those of the end of the step
         if len(sound):
-            contact.rows(sound, np.zeros(len(sound), int))
-            self._mujoco.read_frames(len(sound))
+            self._read_frames(sound, 0)
             contact.move(len(sound))
             self._mark_pierced(sound)
-            failed[sound[contact.view("lost", len(sound)) != 0]] = True
+            failed[sound[self._views.lost[: len(sound)] != 0]] = True
 
     def _step(self, envs: np.ndarray, drive: Drive, done: np.ndarray, failed: np.ndarray) -> np.ndarray:
         """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
-        contact, count, each = self._contact, len(envs), envs.tolist()
+        each, views = envs.tolist(), self._views
         self._mujoco.first_half(each)
         self._insert(envs, done)
-        lost, lengths = contact.view("lost", count), contact.view("length", count)
+        lost, lengths = views.lost[: len(envs)], views.length[: len(envs)]
         if lost.any():
-            sound = np.flatnonzero(lost == 0)
+            sound = lost == 0
             each, lengths = envs[sound].tolist(), lengths[sound]
         if each:
             drive(np.array(each))
         self._mujoco.second_half(each, lengths.tolist(), self.composed.timestep)
         self._finish(envs, failed)
-        return contact.view("ticks", count)
+        return views.ticks[: len(envs)]
 
     def add(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
         """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``.
@@ -171,8 +171,8 @@ class RigidPads:
         envs = np.flatnonzero(~failed)
         self._bind(datas)
         if len(envs):
-            self._insert(envs, np.zeros(len(envs), int), whole=True)
-            failed[envs[self._contact.view("lost", len(envs)) != 0]] = True
+            self._insert(envs, 0, whole=True)
+            failed[envs[self._views.lost[: len(envs)] != 0]] = True
         return envs
 
     def finish(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> None:
@@ -184,34 +184,37 @@ class RigidPads:
     def _bind(self, datas: Sequence[mujoco.MjData]) -> None:
         self._mujoco.bind([self._models[b] for b in range(len(datas))], datas)
 
-    def _insert(self, envs: np.ndarray, done: np.ndarray, *, whole: bool = False) -> None:
+    def _read_frames(self, envs: np.ndarray, done: np.ndarray | int) -> None:
+        """Frames of environments that have done these ticks of the scene's step."""
+        self._views.envs[: len(envs)], self._views.done[: len(envs)] = envs, done
+        self._mujoco.read_frames(len(envs))
+
+    def _insert(self, envs: np.ndarray, done: np.ndarray | int, *, whole: bool = False) -> None:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1``; ``whole``: of a step that is not divided."""
-        contact, count = self._contact, len(envs)
-        contact.rows(envs, done)
-        self._mujoco.read_frames(count)
-        contact.begin(count, whole=whole)
+        self._read_frames(envs, done)
+        self._contact.begin(len(envs), whole=whole)
         self._mark_pierced(envs)
         self._mujoco.put(envs.tolist())
 
     def _mark_pierced(self, envs: np.ndarray) -> None:
         """Mark environments as lost in which a body is beyond a bonded face, or was on its path since the last step."""
-        contact, count = self._contact, len(envs)
-        suspects, poses = contact.suspects(count), contact.poses(count)
-        if suspects is not None:
-            pierced = np.zeros(len(contact.before), bool)
-            self._faces.mark(poses, envs, contact.before, suspects, pierced)
-            contact.lose(np.flatnonzero(pierced[envs]))
-        contact.before[envs] = poses
+        views, count = self._views, len(envs)
+        suspects, poses = views.suspect[:count], views.poses[:count]
+        if suspects.any():
+            pierced = np.zeros(len(views.before), bool)
+            self._faces.mark(poses, envs, views.before, suspects != 0, pierced)
+            views.lost[:count][pierced[envs]] = 1
+        views.before[envs] = poses
 
     def _finish(self, envs: np.ndarray, failed: np.ndarray) -> None:
         """Read forces, and let the gels shear by what bodies moved in the step."""
         self._mujoco.read_forces(len(envs))
         self._contact.end(len(envs))
-        failed[envs[self._contact.view("lost", len(envs)) != 0]] = True
+        failed[envs[self._views.lost[: len(envs)] != 0]] = True
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""
-        return self._contact.wrench[:, self._names.index(name)].copy()
+        return self._views.wrench[:, self._names.index(name)].copy()
 
     def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""

@@ -12,7 +12,8 @@ from raytac.physics.rigid.world_kernels import Shear
 
 
 class ShearState:
-    """Stretch of all contacts on the CPU: one row for each environment, pad and body. The arrays are views of the kernels'.
+    """Stretch of all contacts: one row for each environment, pad and body. The arrays are views of the
+    kernels'; on CUDA only ``struct`` is kept up to date.
 
     Attributes:
         stretch: displacement [m] along two tangents and rotation [rad] about the normal, of every element, (…, ELEMENTS, 3).
@@ -24,11 +25,11 @@ class ShearState:
         struct: the arrays for kernels.
     """
 
-    def __init__(self, num_envs: int, pads: int, bodies: int) -> None:
+    def __init__(self, num_envs: int, pads: int, bodies: int, *, device: str = "cpu") -> None:
         shape = num_envs, pads, bodies
         struct: Any = Shear()
         for name, (inner, dtype) in _ARRAYS.items():
-            setattr(struct, name, wp.zeros((*shape, *inner), dtype=dtype, device="cpu"))
+            setattr(struct, name, wp.zeros((*shape, *inner), dtype=dtype, device=device))
         self.struct = struct
         self.stretch: np.ndarray = struct.stretch.numpy()
         self.stiffness: np.ndarray = struct.stiffness.numpy()
