@@ -25,13 +25,13 @@ _PITCH = 0.8e-3
 class GelPairs:
     """Pairs of pads on different bodies."""
 
-    def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int) -> None:
+    def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int, *, device: str = "cpu") -> None:
         """``bodies`` (pads,): indices of the bodies that carry the pads."""
         self._gels = tuple(gels)
         parts = [(_gel_part(gel),) for gel in gels] if len(gels) > 1 else []
         self._parts = parts
         self.pairs: list[tuple[int, int, PadSearch]] = [
-            (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs))
+            (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs, device=device))
             for i in range(len(gels))
             for j in range(i + 1, len(gels))
             if bodies[i] != bodies[j]

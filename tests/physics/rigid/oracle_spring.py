@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +58,9 @@ def normal_spring(
     some = np.flatnonzero(reach > np.maximum(depth, 0.0) + 1e-7)
     if len(some):
         end = reach.copy()
-        end[some] = _end(law.of(some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some])
+        end[some] = _end(
+            law_of(law, some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some]
+        )
     force, stiffness = law.force(np.maximum(end, 0.0))
     secant = force / np.where(end > 0.0, end, 1.0)
     stiffness = np.maximum(stiffness, slope)
@@ -90,3 +93,12 @@ def _time(stiffness: np.ndarray, inverse_mass: np.ndarray, step: np.ndarray, rel
     """c [s]: the relaxation time, at least between Δt/2 of slow contacts and Δt of those whose own motion a step does not resolve."""
     squared = stiffness * inverse_mass * step * step
     return np.maximum(relaxation, step * (0.5 + 0.5 * squared / (1.0 + squared)))
+
+
+def law_of(law: LoadTables, rows: np.ndarray) -> LoadTables:
+    """The laws of some contacts, by their indices."""
+    some = copy(law)
+    for name, values in vars(law).items():
+        setattr(some, name, values[rows])
+    some._rows = np.arange(len(rows))
+    return some
