@@ -146,20 +146,19 @@ class RigidPads:
             self._read_frames(sound, 0)
             contact.move(len(sound))
             self._mark_pierced(sound)
-            failed[sound[self._views.lost[: len(sound)] != 0]] = True
+            self._mark_lost(sound, failed)
 
     def _step(self, envs: np.ndarray, drive: Drive, done: np.ndarray, failed: np.ndarray) -> np.ndarray:
         """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
-        each, views = envs.tolist(), self._views
-        self._mujoco.first_half(each)
+        views = self._views
+        self._mujoco.first_half(envs.tolist())
         self._insert(envs, done)
-        lost, lengths = views.lost[: len(envs)], views.length[: len(envs)]
-        if lost.any():
-            sound = lost == 0
-            each, lengths = envs[sound].tolist(), lengths[sound]
-        if each:
-            drive(np.array(each))
-        self._mujoco.second_half(each, lengths.tolist(), self.composed.timestep)
+        lost, lengths, sound = views.lost[: len(envs)], views.length[: len(envs)], envs
+        if np.count_nonzero(lost):
+            sound, lengths = envs[lost == 0], lengths[lost == 0]
+        if len(sound):
+            drive(sound)
+        self._mujoco.second_half(sound.tolist(), lengths.tolist(), self.composed.timestep)
         self._finish(envs, failed)
         return views.ticks[: len(envs)]
 
@@ -172,7 +171,7 @@ class RigidPads:
         self._bind(datas)
         if len(envs):
             self._insert(envs, 0, whole=True)
-            failed[envs[self._views.lost[: len(envs)] != 0]] = True
+            self._mark_lost(envs, failed)
         return envs
 
     def finish(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> None:
@@ -199,18 +198,22 @@ class RigidPads:
     def _mark_pierced(self, envs: np.ndarray) -> None:
         """Mark environments as lost in which a body is beyond a bonded face, or was on its path since the last step."""
         views, count = self._views, len(envs)
-        suspects, poses = views.suspect[:count], views.poses[:count]
-        if suspects.any():
-            pierced = np.zeros(len(views.before), bool)
-            self._faces.mark(poses, envs, views.before, suspects != 0, pierced)
-            views.lost[:count][pierced[envs]] = 1
-        views.before[envs] = poses
+        suspects = views.suspect[:count]
+        if np.count_nonzero(suspects):
+            pierced = self._faces.pierced_on_path(views.poses[:count], views.poses_before[:count], suspects != 0)
+            views.lost[:count][pierced.any(axis=(1, 2))] = 1
 
     def _finish(self, envs: np.ndarray, failed: np.ndarray) -> None:
         """Read forces, and let the gels shear by what bodies moved in the step."""
         self._mujoco.read_forces(len(envs))
         self._contact.end(len(envs))
-        failed[envs[self._views.lost[: len(envs)] != 0]] = True
+        self._mark_lost(envs, failed)
+
+    def _mark_lost(self, envs: np.ndarray, failed: np.ndarray) -> None:
+        """Mark environments that broke down in ``failed`` (B,)."""
+        lost = self._views.lost[: len(envs)]
+        if np.count_nonzero(lost):
+            failed[envs[lost != 0]] = True
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step of MuJoCo."""

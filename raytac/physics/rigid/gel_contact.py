@@ -12,7 +12,7 @@ import warp as wp
 from raytac.physics.rigid import world_kernels as world
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
-from raytac.physics.rigid.row_kernels import number_rows, read_rows, set_rows, sum_wrenches
+from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
 from raytac.physics.rigid.step_kernels import approach, choose_steps
@@ -55,7 +55,7 @@ class GelContact:
         frames: frames and velocities of n environments, which ``begin`` reads.
         motion, steps, slots: motion, environments and contacts of the step.
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
-        before: ``pad_from_body`` (B, pads, bodies) at the last step; NaN where unknown.
+        before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
         wrenches: on the pads (B, pads).
         acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
         shear: of the gels.
@@ -102,7 +102,7 @@ class GelContact:
         self.frames = self._struct(Frames(), (num_envs, pads + count), _FRAMES)
         self.motion = self._struct(world.Motion(), slots, _MOTION)
         self._struct(self.motion, all_pads, {"world_from_pad": wp.mat44d, "case_step": wp.float64})
-        self._struct(self.motion, bodies_of, {"suspect": wp.int32})
+        self._struct(self.motion, bodies_of, {"suspect": wp.int32, "before": wp.mat44d})
         self._struct(self.motion, (num_envs, pads, pads), {"near_gel": wp.int32})
         self.slots = self._struct(world.Slots(), slots, _SLOTS)
         self._struct(self.slots, (*slots, world.ROWS - 1), {"friction": wp.float64})
@@ -120,7 +120,6 @@ class GelContact:
         inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
         self._move = self._launch(move_bodies, (pads,), inputs)
         self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
-        self._number = self._launch(number_rows, (), [self.slots, self.steps])
         given, outputs = [self.force, self.velocity, self.motion], [self.shear.struct, self.acceleration, self.slots]
         self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
         self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
@@ -145,8 +144,6 @@ class GelContact:
         self._choose(count)
         for results in some:
             results.set_rows(count)
-        if some:
-            self._number(count)
 
     def move(self, count: int) -> None:
         """Motion of bodies alone, with what may have gone through a pad."""
@@ -169,7 +166,7 @@ class GelContact:
         places = [*search.poses.shape[1:], pad, body]
         shared = [self._numbers, self._gels, self._touched]
         to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
-        to_set = [search.rows, *places, self.motion, self.steps, *shared, self._fall, self.shear.struct, self.slots]
+        to_set = [search.rows, *places, self.motion, *shared, self._fall, self.steps, self.shear.struct, self.slots]
         return [*to_approach, self.steps, self.slots], to_set
 
     def _search(self, count: int) -> list[_Results]:
@@ -183,7 +180,7 @@ class GelContact:
     def _search_near(self, count: int, views: _Views) -> list[_Results]:
         """Searches of what is near; those that have results."""
         some = [self._bodies] if self.search.run(count) else []
-        if self._pairs and views.near_gel[:count].any():
+        if self._pairs and np.count_nonzero(views.near_gel[:count]):
             for (i, j, search), (*_, results, pose) in zip(self._pairs, self._others, strict=True):
                 if views.near_gel[:count, i, j].any():
                     pose(count)
@@ -221,6 +218,7 @@ class _Views:
         self.near_gel: np.ndarray = contact.motion.near_gel.numpy()
         self.poses: np.ndarray = contact.motion.pose.numpy()[:, :, :bodies]
         """``pad_from_body`` of bodies."""
+        self.poses_before: np.ndarray = contact.motion.before.numpy()
         self.before: np.ndarray = contact.before.numpy()
         self.wrench: np.ndarray = contact.wrenches.numpy()
         self.acceleration: np.ndarray = contact.acceleration.numpy()

@@ -125,9 +125,9 @@ def move_bodies(
 ):
     """Motion of everything relative to one pad in one environment; poses and reach of the search for bodies; empty slots.
 
-    ``before`` (B, pads, bodies): poses of the last step, NaN where unknown. ``timestep``: the scene's [s], of ``scene_ticks`` ticks.
-    ``fall``: acceleration [m/s²] that may close a gap on top of its speed. ``case_travel``: greatest travel of a body beside a case
-    in a step [m], less than the gap from which their contact is known.
+    ``before`` (B, pads, bodies): poses of the last step, NaN where unknown; it becomes the present ones. ``timestep``: the scene's [s],
+    of ``scene_ticks`` ticks. ``fall``: acceleration [m/s²] that may close a gap on top of its speed. ``case_travel``: greatest travel of a
+    body beside a case in a step [m], less than the gap from which their contact is known.
     """
     row, pad = wp.tid()
     pads, bodies, env = frames.place.shape[1] - touched.bodies, touched.bodies, steps.envs[row]
@@ -167,6 +167,8 @@ def move_bodies(
             suspect = wp.int32(0)
             if may_pierce(gels, touched, pad, body, pose) or went_far(gels, touched, pad, body, before[env, pad, body], pose):
                 suspect = wp.int32(1)
+            motion.before[row, pad, body] = before[env, pad, body]
+            before[env, pad, body] = pose
             motion.suspect[row, pad, body] = suspect
         else:
             other = body - bodies

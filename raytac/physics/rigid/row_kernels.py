@@ -81,12 +81,12 @@ def set_rows(
     first_pad: wp.int32,
     first_body: wp.int32,
     motion: Motion,
-    steps: Steps,
     vary: Differences,
     gels: Gels,
     touched: Touched,
     fall: wp.float64,
     # outputs
+    steps: Steps,
     shear: Shear,
     slots: Slots,
 ):
@@ -146,6 +146,7 @@ def set_rows(
 
     rotation = turn_of(motion.world_from_pad[i, pad])
     slots.held[i, pad, body] = 1
+    wp.atomic_add(steps.contacts, i, 1)
     slots.centre[i, pad, body] = centre
     slots.radius[i, pad, body] = radius
     slots.axes[i, pad, body] = axes
@@ -176,17 +177,6 @@ def set_rows(
         ratio = wp.max(friction, _LEAST) / wp.max(slots.friction[i, pad, body, k], _LEAST)
         slots.regularisation[i, pad, body, 1 + k] = ratio * ratio / (damping * step)
         k += 1
-
-
-@wp.kernel
-def number_rows(slots: Slots, steps: Steps):
-    """Number of the contacts that are held in each environment."""
-    i = wp.tid()
-    count = wp.int32(0)
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            count += slots.held[i, pad, body]
-    steps.contacts[i] = count
 
 
 @wp.kernel

@@ -88,6 +88,8 @@ class Motion:
     """Relative to the pad [rad/s]."""
     case_step: wp.array2d(dtype=wp.float64)
     """Longest step [s] in which no body's ball enters the case far, (n, pads)."""
+    before: wp.array3d(dtype=wp.mat44d)
+    """``pose`` of bodies at the last step, (n, pads, bodies)."""
     suspect: wp.array3d(dtype=wp.int32)
     """1 where a body may lie beyond the bonded face or have gone through it, (n, pads, bodies)."""
     near_gel: wp.array3d(dtype=wp.int32)
