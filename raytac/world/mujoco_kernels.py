@@ -74,7 +74,7 @@ class Memory:
 
 @wp.func
 def doubles(memory: Memory, env: wp.int32, member: wp.int32):
-    """What a pointer of a state's structure points to."""
+    """Array that a pointer in a state's structure points to."""
     many = wp.int32(_MANY)
     pointers = wp.array(ptr=memory.states[env], shape=(many,), dtype=wp.uint64)
     return wp.array(ptr=pointers[member], shape=(many,), dtype=wp.float64)

@@ -28,7 +28,7 @@ _SHORTEST = 1e-6
 
 @dataclass(frozen=True)
 class Bodies:
-    """What the pads of a model may touch, and what carries them."""
+    """Bodies that the pads of a model may touch, and bodies that carry the pads."""
 
     parts: Sequence[Sequence[Part]]
     """Of every body, body frame."""

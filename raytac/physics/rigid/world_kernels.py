@@ -1,4 +1,4 @@
-"""What the kernels of a world's pads share: gels, bodies, how environments differ, and one slot for each environment, pad and body.
+"""Arrays that the kernels of a world's pads share: gels, bodies, differences of environments, and slots of environment, pad and body.
 
 A slot's body is one of the ``bodies`` that pads touch, or another pad's gel: gel k is body ``bodies`` + k. The kernels work on n rows, the
 environments of this step, in the order of ``envs``; what lasts from step to step has one entry for each of all B environments.
@@ -44,7 +44,7 @@ class Gels:
 
 @wp.struct
 class Touched:
-    """What pads may touch: bodies, then the gels of the pads."""
+    """Bodies that pads may touch, then the gels of the pads."""
 
     bodies: wp.int32
     mass_centre: wp.array(dtype=wp.vec3d)
