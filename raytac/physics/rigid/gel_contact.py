@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -91,7 +91,7 @@ class GelContact:
         self.device = wp.get_device(device)
         pads, count = len(gels), len(bodies.parts)
         self.ticks = 2 ** max(int(np.ceil(np.log2(timestep / _SHORTEST))), 0)
-        self.search, self._pairs = PadSearch(gels, bodies.parts, num_envs=num_envs, device=device), tuple(pairs)
+        self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, device=device)
         self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
         self._numbers: Any = world.Differences()
         for name, values in numbers.items():
@@ -124,9 +124,15 @@ class GelContact:
         self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
         self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
         self._bodies = _Results(self, self.search, 0, 0)
-        self._others = [
-            (i, j, _Results(self, search, i, count + j), self._launch(pair_of_gels, (), self._to_pair(search, i, count + j)))
-            for i, j, search in self._pairs
+        self._pairs = [
+            _Pair(
+                i,
+                j,
+                search,
+                self._launch(pair_of_gels, (), self._to_pair(search, i, count + j)),
+                _Results(self, search, i, count + j),
+            )
+            for i, j, search in pairs
         ]
 
     def begin(self, count: int, *, whole: bool = False) -> None:
@@ -171,21 +177,25 @@ class GelContact:
 
     def _search(self, count: int) -> list[_Results]:
         """All searches, which does not need the host."""
-        self.search.launch()
-        for (_, _, search), (*_, pose) in zip(self._pairs, self._others, strict=True):
-            pose(count)
-            search.launch()
-        return [self._bodies, *(results for *_, results, _ in self._others)]
+        some = []
+        if 0 not in self.search.poses.shape:
+            self.search.launch()
+            some.append(self._bodies)
+        for pair in self._pairs:
+            pair.pose(count)
+            pair.search.launch()
+            some.append(pair.results)
+        return some
 
     def _search_near(self, count: int, views: _Views) -> list[_Results]:
         """Searches of what is near; those that have results."""
         some = [self._bodies] if self.search.run(count) else []
         if self._pairs and np.count_nonzero(views.near_gel[:count]):
-            for (i, j, search), (*_, results, pose) in zip(self._pairs, self._others, strict=True):
-                if views.near_gel[:count, i, j].any():
-                    pose(count)
-                    if search.run(count):
-                        some.append(results)
+            for pair in self._pairs:
+                if views.near_gel[:count, pair.first, pair.second].any():
+                    pair.pose(count)
+                    if pair.search.run(count):
+                        some.append(pair.results)
         return some
 
     def _to_pair(self, search: PadSearch, pad: int, body: int) -> list[Any]:
@@ -260,6 +270,17 @@ class _Results:
 
     def set_rows(self, count: int) -> None:
         self._set(count)
+
+
+class _Pair(NamedTuple):
+    """Two gels that may touch: the second is a body for the first."""
+
+    first: int
+    second: int
+    search: PadSearch
+    pose: Launch
+    """Gives the search its poses and reach."""
+    results: _Results
 
 
 def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:

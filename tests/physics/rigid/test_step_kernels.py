@@ -140,7 +140,7 @@ class Step:
         self.case_step = beside.min(axis=2)
         poses = contact.motion.pose.numpy()
         some = [contact.search.contacts(poses[:, :, :COUNT], envs, contact.search.reach.numpy().copy())]
-        ((i, j, search),) = contact._pairs
+        i, j, search, *_ = contact._pairs[0]
         near = search.contacts(poses[:, i : i + 1, COUNT + j : COUNT + j + 1], envs, search.reach.numpy().copy())
         some.append(replace(near, pad=near.pad + i, body=near.body + COUNT + j, clearance=near.clearance + GELS[j].thickness))
         rows = {name: np.concatenate([getattr(one, name) for one in some]) for name in PadContacts.__dataclass_fields__}
@@ -331,6 +331,18 @@ def test_a_batch_is_its_environments_alone_to_the_bit() -> None:
         alone = results(gel_contact(taken(state, np.array([b]))), 1)
         for name, values in alone.items():
             np.testing.assert_array_equal(values[0], whole[name][b], err_msg=name)
+
+
+def test_the_route_that_needs_no_host_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on CUDA: every search is launched, whatever is near."""
+    state = random_state(8)
+    one, contact = results(gel_contact(state), ENVS), gel_contact(state)
+    for search in (contact.search, contact._pairs[0].search):
+        search.reserve(ENVS * PADS * COUNT)
+    monkeypatch.setattr(contact, "_search_near", lambda count, views: contact._search(count))
+    other = results(contact, ENVS)
+    for name, values in one.items():
+        np.testing.assert_array_equal(other[name], values, err_msg=name)
 
 
 @pytest.mark.gpu
