@@ -48,6 +48,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "ipc",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",
+        "physics/rigid/test_step_kernels.py",
         "physics/test_soft.py",
         "physics/test_soft_batch.py",
         "physics/test_soft_forces.py",
@@ -56,6 +57,8 @@ PLACES: dict[str, tuple[str, ...]] = {
         "regression",
         "test_sensor_soft.py",
         "world/test_held.py",
+        "world/test_mujoco_rows.py",
+        "world/test_pad_shear.py",
         "world/test_soft_world.py",
     ),
     "script": (

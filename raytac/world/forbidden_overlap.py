@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import mujoco
 import numpy as np
@@ -104,21 +103,23 @@ class BondedFaces:
             result[rows, k, i] = self._faces[k].pierced(self._bodies[i], pad_from_body[rows, k, i], float(self._radius[i]))
         return result
 
-    def mark(self, pad_from_body: np.ndarray, envs: np.ndarray, before: np.ndarray, failed: np.ndarray) -> None:
-        """Mark environments ``envs`` (n,) in ``failed`` (B,) in which a body is beyond a face, or was on the path from ``before``.
+    def pierced_on_path(self, pad_from_body: np.ndarray, before: np.ndarray, suspects: np.ndarray) -> np.ndarray:
+        """True (n, pads, bodies) where bodies at poses (n, pads, bodies, 4, 4) are beyond a face, or were on the path from ``before``.
 
-        ``before`` (B, pads, bodies, 4, 4), NaN where unknown, becomes ``pad_from_body`` (n, pads, bodies, 4, 4).
+        ``before``: poses that they come from, NaN where unknown. ``suspects`` (n, pads, bodies): nothing else is looked at.
         """
-        pierced, was = self.pierced(pad_from_body), before[envs]
-        before[envs] = pad_from_body
-        for (k, face), (i, parts) in product(enumerate(self._faces), enumerate(self._bodies)):
-            radius, start, end = float(self._radius[i]), was[:, k, i], pad_from_body[:, k, i]
+        result = np.zeros(suspects.shape, bool)
+        for k, i in np.argwhere(suspects.any(axis=0)).tolist():
+            face, parts, radius = self._faces[k], self._bodies[i], float(self._radius[i])
+            rows = np.flatnonzero(suspects[:, k, i])
+            start, end = before[rows, k, i], pad_from_body[rows, k, i]
+            result[rows, k, i] = face.pierced(parts, end, radius)
             pieces = face.pieces(start @ self._frame[i], end @ self._frame[i], radius)
             for row in np.flatnonzero(pieces > 1).tolist():
                 path = face.poses_between(start[row], end[row], int(pieces[row]))
                 path = path[self._near(k, np.repeat(path[:, None], len(self._bodies), axis=1))[:, i]]
-                pierced[row, k, i] |= face.pierced(parts, path, radius).any()
-        failed[envs[pierced.any(axis=(1, 2))]] = True
+                result[rows[row], k, i] |= face.pierced(parts, path, radius).any()
+        return result
 
     def _near(self, pad: int, poses: np.ndarray) -> np.ndarray:
         return near_pad(self._gelpads[pad], self._radius, self._planes, poses)

@@ -8,12 +8,10 @@ half of the overlap.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from raytac.gel.surface import PadGrid, make_grid
-from raytac.physics.rigid.contacts import PadContacts
 from raytac.physics.rigid.search import PadSearch
 from raytac.se3 import inverse
 from raytac.shapes.part import Part, mesh_part
@@ -27,49 +25,23 @@ _PITCH = 0.8e-3
 class GelPairs:
     """Pairs of pads on different bodies."""
 
-    def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int) -> None:
+    def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int, *, device: str = "cpu") -> None:
         """``bodies`` (pads,): indices of the bodies that carry the pads."""
         self._gels = tuple(gels)
         parts = [(_gel_part(gel),) for gel in gels] if len(gels) > 1 else []
         self._parts = parts
-        self._pairs = [
-            (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs))
+        self.pairs: list[tuple[int, int, PadSearch]] = [
+            (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs, device=device))
             for i in range(len(gels))
             for j in range(i + 1, len(gels))
             if bodies[i] != bodies[j]
         ]
-        self._size = np.array([gel.thickness for gel in gels])
+        """Two pads, and the search for the second one's gel as a body that the first touches."""
         self._modulus = np.array([gel.youngs_modulus for gel in gels])
-
-    def contacts(self, pad_from_pad: np.ndarray, envs: np.ndarray, reach: np.ndarray, first: int) -> list[PadContacts]:
-        """Contacts of pairs at poses (n, pads, pads, 4, 4), or nearer than ``reach`` (n, pads, pads) [m].
-
-        Gel j is the body ``first`` + j.
-        """
-        result = []
-        for i, j, search in self._pairs:
-            near = search.contacts(pad_from_pad[:, i : i + 1, j : j + 1], envs, reach[:, i, j : j + 1])
-            if len(near):
-                pad, body = np.full(len(near), i), np.full(len(near), first + j)
-                # Both layers may be squeezed.
-                result.append(replace(near, pad=pad, body=body, clearance=near.clearance + self._size[j]))
-        return result
-
-    def thickness(self, contacts: PadContacts, first: int) -> np.ndarray:
-        """Thickness (n,) [m] of all gel of a contact."""
-        other = contacts.body - first
-        return self._size[contacts.pad] + np.where(other >= 0, self._size[np.maximum(other, 0)], 0.0)
-
-    def factor(self, contacts: PadContacts, first: int, stiffness: np.ndarray) -> np.ndarray:
-        """Factors (n,) of the modulus of the contacts' pads, by those of the environments (B, pads)."""
-        own, other = stiffness[contacts.env, contacts.pad], contacts.body - first
-        at = np.maximum(other, 0)
-        both = own * self._modulus[contacts.pad] / (stiffness[contacts.env, at] * self._modulus[at])
-        return own / np.where(other >= 0, 1.0 + both, 1.0)
 
     def press(self, pad: int, height: np.ndarray, grid: PadGrid, world_from_pad: np.ndarray, failed: np.ndarray) -> None:
         """Lower ``height`` (n, Ny, Nx) to where other gels press that of ``pad``: by its share of the overlap."""
-        for i, j, _ in self._pairs:
+        for i, j, _ in self.pairs:
             if pad not in (i, j):
                 continue
             other = j if pad == i else i

@@ -5,6 +5,8 @@ contact for a step and falls again, and what rests chatters. Here contacts are k
 asks for the speed at the end of a step by which a gap is just closed, v = −gap / Δt. A penetration is taken back by a tenth in a step, so
 that bodies do not bounce off it. Both hold for steps of any length.
 
+``write_references`` of ``mujoco_kernels`` sets it.
+
 MuJoCo's convex cone lifts what slides by μ |v_t| Δt (M. Anitescu, Math. Program. 105, 2006): by 0.2 mm at 0.1 m/s, μ = 0.2 and 10 ms.
 """
 
@@ -15,24 +17,8 @@ import numpy as np
 
 HARD_MARGIN = 3e-3
 """Margin of such geoms [m]: by how much bodies may near each other in a step and not overlap at its end."""
-_BACK = 0.1
-"""Share of a penetration that a step takes back."""
 
 
 def is_hard(model: mujoco.MjModel) -> np.ndarray:
     """True (ngeom,) for geoms with this law: those of bodies that a task scene names. No other geom has their margin and priority."""
     return (model.geom_margin == HARD_MARGIN) & (model.geom_priority == 1)
-
-
-def write_hard_reference(data: mujoco.MjData, hard: np.ndarray, count: int, step: float) -> None:
-    """Set the reference accelerations of the first ``count`` contacts, where a geom is ``hard``, after ``mj_referenceConstraint``."""
-    contact = data.contact
-    rows = contact.efc_address[:count]
-    some = hard[contact.geom[:count]].any(axis=1) & (rows >= 0) & (contact.dim[:count] >= 3)
-    rows, gap = rows[some], contact.dist[:count][some]
-    if not len(rows):
-        return
-    velocity = data.efc_vel[rows[:, None] + [0, 1, 2]]
-    wanted = np.where(gap > 0.0, gap, _BACK * gap) / step
-    data.efc_aref[rows] = -(velocity[:, 0] + wanted) / step
-    data.efc_aref[rows[:, None] + [1, 2]] = -velocity[:, 1:] / step

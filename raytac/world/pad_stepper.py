@@ -77,7 +77,6 @@ class PadStepper:
         self.failed = np.zeros(num_envs, bool)
         self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
         self._pads = RigidPads(self.composed, EnvironmentModels(self.composed, num_envs), [mujoco.MjData(model)] * num_envs)
-        self._before = self._pads.no_poses(num_envs)
         self._time = np.full(num_envs, -np.inf)
         self._put: Any = None
 
@@ -90,7 +89,6 @@ class PadStepper:
         self.failed[chosen], self._time[chosen], self._put = False, -np.inf, None
         self._pads.clear(chosen)
         self._frames.reset(chosen)
-        self._before[chosen] = np.nan
 
     def step(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.
@@ -111,7 +109,7 @@ class PadStepper:
         datas = self._states(model, data)
         if self._put is not None:
             raise InputError("add", value="again", rule="must be followed by mj_step2 and finish before it is called again")
-        self._put = self._pads.add(datas, self._before, self.failed)
+        self._put = self._pads.add(datas, self.failed)
 
     def finish(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """Read the pads' forces and let the gels shear, after ``mj_step2``.

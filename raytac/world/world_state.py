@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-_LARGEST_SPEED = 1e4
+LARGEST_SPEED = 1e4
 """Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
 
 Controller = Callable[[mujoco.MjData, float], None]
@@ -55,4 +55,4 @@ def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
     """True (n,) for states of MuJoCo that are invalid: a number is not finite, or a joint is far too fast."""
     speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
     # One number that is not finite makes the sum such.
-    return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < _LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))
+    return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))

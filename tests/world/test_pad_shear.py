@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import make_grid
-from raytac.physics.rigid.shear import ShearState
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.world import TactileWorld
+from tests.physics.rigid.sheared import Sheared
 
 G = 9.81
 ROW = np.zeros(1, int), np.zeros(1, int), np.zeros(1, int)
@@ -23,7 +23,7 @@ FULL = 1.5 * LIMIT / STIFFNESS
 
 def forces(displacements: np.ndarray) -> np.ndarray:
     """Tangential force along a path of displacements that starts at 0."""
-    state, result = ShearState(1, 1, 1), []
+    state, result = Sheared(1, 1, 1), []
     stiffness = np.array([[STIFFNESS, STIFFNESS * RADIUS**2]])
     limit, centre = np.array([[LIMIT, 0.4 * LIMIT * RADIUS]]), np.zeros((1, 3))
     for step in np.diff(displacements, prepend=0.0):
@@ -42,7 +42,7 @@ def test_force_against_displacement_and_the_annulus_that_slips_are_cattaneo_and_
     path = np.linspace(0.0, 1.3 * FULL, steps)
     np.testing.assert_allclose(forces(path), mindlin(path), atol=0.01 * LIMIT)
     for share in (0.2, 0.5, 0.8, 0.95):
-        state = ShearState(1, 1, 1)
+        state = Sheared(1, 1, 1)
         limit, centre = np.array([[LIMIT, 1.0]]), np.zeros((1, 3))
         for _ in range(steps):
             state.begin(ROW, np.array([[STIFFNESS, 1.0]]), centre)
@@ -66,7 +66,7 @@ def test_unloading_follows_masing_s_rule_and_a_loop_closes() -> None:
 
 def sheared(displacement: np.ndarray, over_gel: np.ndarray, radius: float, slack: float = 1e3) -> np.ndarray:
     """Mean stretch (n, 2) after every step of a contact that never slips, by displacements of the body and places of the centre (n, 2)."""
-    state, result = ShearState(1, 1, 1), []
+    state, result = Sheared(1, 1, 1), []
     limit = np.array([[slack, slack]])
     for step, place in zip(displacement, over_gel, strict=True):
         centre = np.array([[*place, 0.0]])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,16 +43,6 @@ class PadContacts:
     def __len__(self) -> int:
         return len(self.env)
 
-    @staticmethod
-    def joined(some: Sequence[PadContacts]) -> PadContacts:
-        """All rows, sorted."""
-        rows = {name: np.concatenate([getattr(one, name) for one in some]) for name in PadContacts.__dataclass_fields__}
-        return PadContacts(**rows).of(np.lexsort((rows["body"], rows["pad"], rows["env"])))
-
-    def of(self, rows: np.ndarray) -> PadContacts:
-        """The rows chosen by a mask or by indices."""
-        return PadContacts(**{name: values[rows] for name, values in vars(self).items()})
-
 
 class LoadTables:
     """Load laws of n contacts: the tables with the hard back of the gel (``hard_back``), once continuously differentiable.
@@ -74,14 +62,6 @@ class LoadTables:
         slope[:, -1] = np.clip(2.0 * rise[:, -1] - slope[:, -2], 0.0, 3.0 * rise[:, -1])
         self._force, self._slope, self._radius = force, slope, contacts.radius
         self._rows = np.arange(len(force))
-
-    def of(self, rows: np.ndarray) -> LoadTables:
-        """The laws of some contacts, by their indices."""
-        some = copy(self)
-        for name, values in vars(self).items():
-            setattr(some, name, values[rows])
-        some._rows = np.arange(len(rows))
-        return some
 
     def force(self, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Force [N] and incremental stiffness [N/m] at depths (n,) [m]; at depths <= 0 no force, and the stiffness of the first touch."""

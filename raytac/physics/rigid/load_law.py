@@ -49,7 +49,7 @@ def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
     return np.minimum(stiffening, 1.0 + 0.5 * np.pi * confined / reduced_modulus(gelpad) * ratio)
 
 
-_HARD_FROM, _HARD_RISE = 0.2, 20.0
+HARD_FROM, HARD_RISE = 0.2, 20.0
 """Share of the gel's thickness below which its back is felt, and how fast: a choice, no measurement. With 20 a press at a tenth of the
 thickness takes 21 times the force of the layer."""
 
@@ -66,8 +66,8 @@ def hard_back(depth: np.ndarray, limit: np.ndarray | float, thickness: np.ndarra
         thickness: of the gel [m].
     """
     left = np.maximum((np.asarray(limit) - depth) / thickness, 1e-6)
-    above = np.maximum(_HARD_FROM / left - 1.0, 0.0)
-    return 1.0 + _HARD_RISE * above**2, 2.0 * _HARD_RISE * above * _HARD_FROM / (left**2 * thickness)
+    above = np.maximum(HARD_FROM / left - 1.0, 0.0)
+    return 1.0 + HARD_RISE * above**2, 2.0 * HARD_RISE * above * HARD_FROM / (left**2 * thickness)
 
 
 def shear_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
@@ -75,17 +75,17 @@ def shear_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
 
     8Ga/(2 − ν) of a half-space (Mindlin) plus GA/h of a sheared layer.
     """
-    shear = _shear_modulus(gelpad)
+    shear = shear_modulus(gelpad)
     return 8.0 * shear * radius / (2.0 - gelpad.poisson_ratio) + shear * np.pi * radius**2 / gelpad.thickness
 
 
 def twist_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
     """Torque per angle [N m/rad]: 16Ga³/3 of a half-space (Reissner and Sagoci) plus GJ/h of a twisted layer."""
-    shear = _shear_modulus(gelpad)
+    shear = shear_modulus(gelpad)
     return 16.0 / 3.0 * shear * radius**3 + shear * 0.5 * np.pi * radius**4 / gelpad.thickness
 
 
-def _shear_modulus(gelpad: GelpadSpec) -> float:
+def shear_modulus(gelpad: GelpadSpec) -> float:
     return 0.5 * gelpad.youngs_modulus / (1.0 + gelpad.poisson_ratio)
 
 
@@ -144,7 +144,7 @@ class LoadLaw:
     @property
     def hard_from(self) -> float:
         """Depth [m] from which the gel's hard back is felt; 0 where there is less gel than that."""
-        return max(self.deepest - _HARD_FROM * self.thickness, 0.0)
+        return max(self.deepest - HARD_FROM * self.thickness, 0.0)
 
     def stiffest(self, force: float) -> float:
         """Greatest incremental stiffness [N/m] of the layer at any depth, and of the hard back up to ``force`` [N]."""

@@ -81,14 +81,23 @@ class PadSearch:
         if count > self.poses.shape[0]:
             self._allocate(count)
         self._fill(poses, reach)
+        return self._read(self.run(count), envs)
+
+    def run(self, count: int) -> int:
+        """Fill ``rows`` from ``poses`` and ``reach`` of the first ``count`` environments, with memory for as many as there are.
+
+        Returns their number, for which a device is waited for. More memory is another ``rows``.
+        """
+        pairs = count * self._shape[0] * self._shape[1]
+        if pairs == 0:
+            return 0
         self._find_near(count)
         rows = self._number_rows(pairs)
-        if rows == 0:
-            return self._read(0, envs)
         if rows > self._capacity:
             self.reserve(max(rows, 2 * self._capacity))
-        self._measure(pairs)
-        return self._read(rows, envs)
+        if rows:
+            self._measure(pairs)
+        return rows
 
     def launch(self) -> None:
         """Fill ``rows`` from ``poses`` and ``reach`` of all environments; nothing waits for the device.

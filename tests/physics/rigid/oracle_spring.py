@@ -1,19 +1,8 @@
-"""Normal contact as an implicit spring: the force of one step, linear in the speed at its end, by which it stays stable at any step.
-
-A contact of depth δ that closes at the speed w at the end of a step Δt carries
-
-    f = F(δ) + C w,   C = c K
-
-with K the incremental stiffness of the load law at the deeper end of the step and c >= Δt/2. At rest that is F(δ) exactly. A step takes
-at least the work from the bodies that the gel stores (F is convex and K its greatest slope in the step), so that energy does not grow.
-c is the gel's relaxation time τ (Kelvin and Voigt) where the step resolves the motion, and goes to Δt where it does not: backward Euler.
-
-MuJoCo's constraint obeys R f = a* − a with a the acceleration that opens the contact, (v + Δt a) = −w: R = 1 / (C Δt),
-a* = F(δ) / (C Δt) − v / Δt (``PadRows.regularisation``, docs/worlds.md).
-"""
+"""Normal contact as an implicit spring in NumPy: oracle of ``spring_kernels``, which has the physics."""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +58,9 @@ def normal_spring(
     some = np.flatnonzero(reach > np.maximum(depth, 0.0) + 1e-7)
     if len(some):
         end = reach.copy()
-        end[some] = _end(law.of(some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some])
+        end[some] = _end(
+            law_of(law, some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some]
+        )
     force, stiffness = law.force(np.maximum(end, 0.0))
     secant = force / np.where(end > 0.0, end, 1.0)
     stiffness = np.maximum(stiffness, slope)
@@ -102,3 +93,12 @@ def _time(stiffness: np.ndarray, inverse_mass: np.ndarray, step: np.ndarray, rel
     """c [s]: the relaxation time, at least between Δt/2 of slow contacts and Δt of those whose own motion a step does not resolve."""
     squared = stiffness * inverse_mass * step * step
     return np.maximum(relaxation, step * (0.5 + 0.5 * squared / (1.0 + squared)))
+
+
+def law_of(law: LoadTables, rows: np.ndarray) -> LoadTables:
+    """The laws of some contacts, by their indices."""
+    some = copy(law)
+    for name, values in vars(law).items():
+        setattr(some, name, values[rows])
+    some._rows = np.arange(len(rows))
+    return some

@@ -1,21 +1,59 @@
-"""Rows of the contacts of gels in one step: normal spring, shear, spin and tilt, with the friction that bounds them (see ``PadRows``)."""
+"""Rows of the contacts of gels in one step in NumPy: oracle of ``row_kernels``, which has the physics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
-from raytac.physics.rigid.implicit_spring import NormalSpring
 from raytac.physics.rigid.load_law import shear_stiffness, twist_stiffness
-from raytac.physics.rigid.shear import ShearState
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.pad_motion import PadMotion
-from raytac.world.pad_rows import ROWS, PadRows, cross, tangents
+from tests.physics.rigid.oracle_motion import PadMotion, cross
+from tests.physics.rigid.oracle_shear import ShearOracle
+from tests.physics.rigid.oracle_spring import NormalSpring
 
 _EDGE = 0.7
 """Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
+ROWS = 6
+"""Rows of a contact: normal, two tangents, spin, two of rolling."""
+_LEAST = 1e-6
+"""Least coefficient of friction, which MuJoCo wants positive."""
+
+
+@dataclass(frozen=True)
+class PadRows:
+    """Rows of n contacts of one step."""
+
+    position: np.ndarray
+    """Place, world frame [m], (n, 3)."""
+    frame: np.ndarray
+    """Rows normal from gel to body, and two tangents, world frame, (n, 9)."""
+    friction: np.ndarray
+    """MuJoCo's coefficients: two tangents, spin [m], rolling about both tangents [m], (n, 5)."""
+    force: np.ndarray
+    """f₀ [N, N m], (n, 6)."""
+    damping: np.ndarray
+    """G [N s/m, N m s] of normal and tangents, (n, 2)."""
+    step: np.ndarray
+    """Δt [s], (n,)."""
+
+    def regularisation(self) -> np.ndarray:
+        """R, (n, 6): those of spin and rolling follow from the cone's levers."""
+        friction = np.maximum(self.friction, _LEAST)
+        result = np.empty((len(self.step), ROWS))
+        result[:, 0] = 1.0 / (self.damping[:, 0] * self.step)
+        result[:, 1:] = (1.0 / (self.damping[:, 1] * self.step))[:, None] * (friction[:, :1] / friction) ** 2
+        return result
+
+
+def tangents(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit tangents (n, 3) of a gel: along the pad's x as nearly as can be, and that turned by 90° about the normal (n, 3)."""
+    first = -normal[:, :1] * normal
+    first[:, 0] += 1.0
+    first /= np.sqrt(np.vecdot(first, first))[:, None]
+    return first, cross(normal, first)
 
 
 def gel_rows(
@@ -26,7 +64,7 @@ def gel_rows(
     row: np.ndarray,
     step: np.ndarray,
     *,
-    shear: ShearState,
+    shear: ShearOracle,
     gels: Sequence[GelpadSpec],
     softer: np.ndarray,
     friction: np.ndarray,

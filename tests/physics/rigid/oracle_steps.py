@@ -1,4 +1,4 @@
-"""Length of an environment's steps: the scene's, halved until nothing moves too far in one near a pad."""
+"""Length of an environment's steps in NumPy: oracle of ``step_kernels``."""
 
 from __future__ import annotations
 

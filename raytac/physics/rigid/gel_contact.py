@@ -1,0 +1,350 @@
+"""Contact of all gels of a world in one step: the kernels from the bodies' motion to the rows, and from forces to the shear."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from raytac.physics.rigid import world_kernels as world
+from raytac.physics.rigid.load_law import shear_modulus
+from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
+from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
+from raytac.physics.rigid.search import PadSearch
+from raytac.physics.rigid.shear_state import ShearState
+from raytac.physics.rigid.step_kernels import approach, choose_steps
+from raytac.physics.rigid.warp_cache import start_warp
+from raytac.shapes.part import Part
+from raytac.shapes.primitives import bounds
+from raytac.shapes.underside import object_radius
+from raytac.specs.sensor import GelpadSpec
+
+_SHORTEST = 1e-6
+"""Steps are not shorter than this, or half of it [s]."""
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Bodies that the pads of a model may touch, and bodies that carry the pads."""
+
+    parts: Sequence[Sequence[Part]]
+    """Of every body, body frame."""
+    index: np.ndarray
+    """Of each body in the model, (bodies,)."""
+    carrier: np.ndarray
+    """Body of the model that carries each pad, (pads,)."""
+    mass_centre: np.ndarray
+    """In the frame of what is touched, (bodies + pads, 3)."""
+    case_centre: np.ndarray
+    """Of the case behind each gel, pad frame, (pads, 3)."""
+    case_half: np.ndarray
+
+
+class GelContact:
+    """Contacts of B environments with gels, on the CPU or on CUDA.
+
+    ``begin`` and ``end`` work on the first n rows of the arrays, the environments that ``rows`` names. Between both MuJoCo takes the step.
+    On CUDA nothing waits for the device, and the NumPy views are None.
+
+    Attributes:
+        ticks: parts of the scene's step, the length of the shortest one.
+        search: for contacts of bodies.
+        frames: frames and velocities of n environments, which ``begin`` reads.
+        motion, steps, slots: motion, environments and contacts of the step.
+        force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
+        before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
+        wrenches: on the pads (B, pads).
+        acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
+        shear: of the gels.
+        views: of what the host reads.
+    """
+
+    def __init__(
+        self,
+        gels: Sequence[GelpadSpec],
+        bodies: Bodies,
+        pairs: Sequence[tuple[int, int, PadSearch]],
+        numbers: Mapping[str, np.ndarray],
+        *,
+        num_envs: int,
+        timestep: float,
+        fall: float,
+        case_travel: float,
+        device: str = "cpu",
+    ) -> None:
+        """Make the arrays.
+
+        Args:
+            gels, bodies: of the world.
+            pairs: two gels that may touch, and the search for that.
+            numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step.
+            num_envs: B.
+            timestep: the scene's step [s].
+            fall: acceleration [m/s²] that may close a gap on top of its speed.
+            case_travel: greatest travel of a body beside a case in a step [m].
+            device: "cpu" or "cuda".
+        """
+        start_warp()
+        self.device = wp.get_device(device)
+        pads, count = len(gels), len(bodies.parts)
+        self.ticks = 2 ** max(int(np.ceil(np.log2(timestep / _SHORTEST))), 0)
+        self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, device=device)
+        self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
+        self._numbers: Any = world.Differences()
+        for name, values in numbers.items():
+            given = wp.array(values, dtype=wp.float64, device=self.device, copy=not self.device.is_cpu)
+            setattr(self._numbers, name, given)
+        self._numbers.carrier = _array(np.concatenate([bodies.index, bodies.carrier]), wp.int32, self.device)
+        all_pads, bodies_of, slots = (num_envs, pads), (num_envs, pads, count), (num_envs, pads, count + pads)
+        self.frames = self._struct(Frames(), (num_envs, pads + count), _FRAMES)
+        self.motion = self._struct(world.Motion(), slots, _MOTION)
+        self._struct(self.motion, all_pads, {"world_from_pad": wp.mat44d, "case_step": wp.float64})
+        self._struct(self.motion, bodies_of, {"suspect": wp.int32, "before": wp.mat44d})
+        self._struct(self.motion, (num_envs, pads, pads), {"near_gel": wp.int32})
+        self.slots = self._struct(world.Slots(), slots, _SLOTS)
+        self._struct(self.slots, (*slots, world.ROWS - 1), {"friction": wp.float64})
+        self._struct(self.slots, (*slots, world.ROWS), {"force": wp.float64, "regularisation": wp.float64})
+        self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
+        self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
+        self.acceleration = self._zeros(slots, wp.float64)
+        self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
+        self.before = self._zeros(bodies_of, wp.mat44d)
+        self.before.fill_(wp.mat44d(*[np.nan] * 16))
+        self.shear = ShearState(*slots, device=device)
+        self.views = _Views(self, count) if self.device.is_cpu else None
+        self._whole, self._clock, self._fall = False, [float(timestep), self.ticks], float(fall)
+        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._fall, float(case_travel)]
+        inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
+        self._move = self._launch(move_bodies, (pads,), inputs)
+        self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
+        given, outputs = [self.force, self.velocity, self.motion], [self.shear.struct, self.acceleration, self.slots]
+        self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
+        self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
+        self._bodies = _Results(self, self.search, 0, 0)
+        self._pairs = [
+            _Pair(
+                i,
+                j,
+                search,
+                self._launch(pair_of_gels, (), self._to_pair(search, i, count + j)),
+                _Results(self, search, i, count + j),
+            )
+            for i, j, search in pairs
+        ]
+
+    def begin(self, count: int, *, whole: bool = False) -> None:
+        """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
+
+        ``whole``: of the scene's step, which is not divided.
+        """
+        self.move(count)
+        some = self._search(count) if self.views is None else self._search_near(count, self.views)
+        for results in some:
+            results.approach(count)
+        if whole is not self._whole:
+            self._whole = whole
+            self._choose.set("whole", int(whole))
+        self._choose(count)
+        for results in some:
+            results.set_rows(count)
+
+    def move(self, count: int) -> None:
+        """Motion of bodies alone, with what may have gone through a pad."""
+        self._move(count)
+
+    def end(self, count: int) -> None:
+        """Let the gels shear, and add up the wrenches, by ``force`` and ``velocity``."""
+        self._read(count)
+        self._sum(count)
+
+    def clear(self, envs: np.ndarray) -> None:
+        """Forget what environments went through, on the CPU."""
+        assert self.views is not None
+        self.shear.clear(envs)
+        self.views.wrench[envs] = self.views.acceleration[envs] = 0.0
+        self.views.before[envs] = np.nan
+
+    def results_inputs(self, search: PadSearch, pad: int, body: int) -> tuple[list[Any], list[Any]]:
+        """Inputs of ``approach`` and of ``set_rows`` on the results of a search, whose pads and bodies begin with these."""
+        places = [*search.poses.shape[1:], pad, body]
+        shared = [self._numbers, self._gels, self._touched]
+        to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
+        to_set = [search.rows, *places, self.motion, *shared, self._fall, self.steps, self.shear.struct, self.slots]
+        return [*to_approach, self.steps, self.slots], to_set
+
+    def _search(self, count: int) -> list[_Results]:
+        """All searches, which does not need the host."""
+        some = []
+        if 0 not in self.search.poses.shape:
+            self.search.launch()
+            some.append(self._bodies)
+        for pair in self._pairs:
+            pair.pose(count)
+            pair.search.launch()
+            some.append(pair.results)
+        return some
+
+    def _search_near(self, count: int, views: _Views) -> list[_Results]:
+        """Searches of what is near; those that have results."""
+        some = [self._bodies] if self.search.run(count) else []
+        if self._pairs and np.count_nonzero(views.near_gel[:count]):
+            for pair in self._pairs:
+                if views.near_gel[:count, pair.first, pair.second].any():
+                    pair.pose(count)
+                    if pair.search.run(count):
+                        some.append(pair.results)
+        return some
+
+    def _to_pair(self, search: PadSearch, pad: int, body: int) -> list[Any]:
+        return [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
+
+    def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> Launch:
+        return Launch(kernel, rest, inputs, self.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def _struct(self, struct: Any, shape: tuple[int, ...], members: Mapping[str, Any]) -> Any:
+        """A structure with arrays of one shape as some of its members."""
+        for name, dtype in members.items():
+            setattr(struct, name, self._zeros(shape, dtype))
+        return struct
+
+
+class _Views:
+    """Arrays of the kernels on the CPU as NumPy sees them."""
+
+    def __init__(self, contact: GelContact, bodies: int) -> None:
+        self.envs: np.ndarray = contact.steps.envs.numpy()
+        self.done: np.ndarray = contact.steps.done.numpy()
+        self.ticks: np.ndarray = contact.steps.ticks.numpy()
+        self.length: np.ndarray = contact.steps.length.numpy()
+        self.lost: np.ndarray = contact.steps.lost.numpy()
+        self.contacts: np.ndarray = contact.steps.contacts.numpy()
+        self.suspect: np.ndarray = contact.motion.suspect.numpy()
+        self.near_gel: np.ndarray = contact.motion.near_gel.numpy()
+        self.poses: np.ndarray = contact.motion.pose.numpy()[:, :, :bodies]
+        """``pad_from_body`` of bodies."""
+        self.poses_before: np.ndarray = contact.motion.before.numpy()
+        self.before: np.ndarray = contact.before.numpy()
+        self.wrench: np.ndarray = contact.wrenches.numpy()
+        self.acceleration: np.ndarray = contact.acceleration.numpy()
+
+
+class Launch:
+    """Launch of a kernel for a number of environments, recorded: repeating it costs a tenth."""
+
+    def __init__(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any], device: Any = "cpu") -> None:
+        """``rest``: threads along the axes after that of environments."""
+        self._rest, self._count = rest, 1
+        self._launch: Any = wp.launch(kernel, dim=(1, *rest), inputs=list(inputs), device=device, record_cmd=True)
+
+    def __call__(self, count: int) -> None:
+        if count != self._count:
+            self._launch.set_dim((count, *self._rest))
+            self._count = count
+        self._launch.launch()
+
+    def set(self, name: str, value: Any) -> None:
+        """Give another value to a parameter."""
+        self._launch.set_param_by_name(name, value)
+
+
+class _Results:
+    """Launches on the results of one search, recorded again when the search has made more memory."""
+
+    def __init__(self, contact: GelContact, search: PadSearch, pad: int, body: int) -> None:
+        self._contact, self._search, self._at = contact, search, (pad, body)
+        self._rows: Any = None
+
+    def approach(self, count: int) -> None:
+        if self._rows is not self._search.rows:
+            self._rows = self._search.rows
+            to_approach, to_set = self._contact.results_inputs(self._search, *self._at)
+            dim, device = self._search.poses.shape[1:], self._contact.device
+            self._approach, self._set = Launch(approach, dim, to_approach, device), Launch(set_rows, dim, to_set, device)
+        self._approach(count)
+
+    def set_rows(self, count: int) -> None:
+        self._set(count)
+
+
+class _Pair(NamedTuple):
+    """Two gels that may touch: the second is a body for the first."""
+
+    first: int
+    second: int
+    search: PadSearch
+    pose: Launch
+    """Gives the search its poses and reach."""
+    results: _Results
+
+
+def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:
+    shear = np.array([shear_modulus(gel) for gel in gels])
+    thickness = np.array([gel.thickness for gel in gels])
+    softer = 2.0 - np.array([gel.poisson_ratio for gel in gels])
+    result: Any = world.Gels()
+    result.thickness = _array(thickness, wp.float64, device)
+    result.half = _array([np.multiply(0.5, gel.size) for gel in gels], wp.vec2d, device)
+    result.modulus = _array([gel.youngs_modulus for gel in gels], wp.float64, device)
+    result.shear = _array(np.stack([8.0 * shear / softer, np.pi * shear / thickness], axis=1), wp.vec2d, device)
+    result.twist = _array(np.stack([16.0 / 3.0 * shear, 0.5 * np.pi * shear / thickness], axis=1), wp.vec2d, device)
+    result.hysteresis = _array([gel.hysteresis for gel in gels], wp.float64, device)
+    result.relaxation = _array([gel.relaxation_time for gel in gels], wp.float64, device)
+    result.case_centre, result.case_half = (
+        _array(bodies.case_centre, wp.vec3d, device),
+        _array(bodies.case_half, wp.vec3d, device),
+    )
+    result.carrier = _array(bodies.carrier, wp.int32, device)
+    return result
+
+
+def _touched(bodies: Bodies, device: Any) -> Any:
+    boxes = [_box(part) for parts in bodies.parts for part in parts]
+    result: Any = world.Touched()
+    result.bodies = len(bodies.parts)
+    result.mass_centre = _array(bodies.mass_centre, wp.vec3d, device)
+    result.radius = _array([object_radius(parts) for parts in bodies.parts], wp.float64, device)
+    result.first_box = _array(np.cumsum([0, *map(len, bodies.parts)]), wp.int32, device)
+    result.box_turn = _array(np.reshape([turn for turn, _, _ in boxes], (-1, 3, 3)), wp.mat33d, device)
+    result.box_centre = _array(np.reshape([centre for _, centre, _ in boxes], (-1, 3)), wp.vec3d, device)
+    result.box_half = _array(np.reshape([half for _, _, half in boxes], (-1, 3)), wp.vec3d, device)
+    return result
+
+
+def _box(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes, centre and half edges of a box that holds a part, body frame; of a half-space its frame, and inf."""
+    turn, at = part.object_from_part[:3, :3], part.object_from_part[:3, 3]
+    if part.kind == "plane":
+        return turn, at, np.full(3, np.inf)
+    low, high = bounds(part.kind, part.size, np.eye(4)) if part.vertices is None else (
+        part.vertices.min(axis=0), part.vertices.max(axis=0)
+    )  # fmt: skip
+    return turn, turn @ (0.5 * (low + high)) + at, 0.5 * (high - low)
+
+
+def _array(values: Any, dtype: Any, device: Any) -> wp.array:
+    return wp.array(np.asarray(values), dtype=dtype, device=device)
+
+
+_FRAMES: dict[str, Any] = {"place": wp.vec3d, "turn": wp.mat33d, "velocity": wp.vec3d, "spin": wp.vec3d}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts"), wp.int32) | {"length": wp.float64}
+_MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d}
+_SLOTS: dict[str, Any] = {
+    "row": wp.int32,
+    "held": wp.int32,
+    "speed": wp.float64,
+    "longest": wp.float64,
+    "centre": wp.vec3d,
+    "radius": wp.float64,
+    "axes": wp.mat33d,
+    "turn": wp.vec2d,
+    "place": wp.vec3d,
+    "frame": wp.mat33d,
+    "wrench": wp.spatial_vectord,
+    "opposite": wp.spatial_vectord,
+}

@@ -1,0 +1,236 @@
+"""Rows of MuJoCo's constraint for contacts of gels: normal spring, shear, spin and tilt of one step, with the friction that bounds them.
+
+MuJoCo minimises over accelerations a of constraint rows ½ Σ (a − a*)² / R within an elliptic friction cone: a row that is not cut by the
+cone carries f = (a* − a) / R. With R = 1 / (G Δt) and a* = −v / Δt + f₀ / (G Δt) that is f = f₀ − G v₁, v₁ = v + Δt a the speed at the
+end of the step. So every row is a given force and a viscous one at the end of the step:
+
+| row | f₀ | G |
+|---|---|---|
+| normal | F(δ) | c K (``normal_spring``) |
+| tangents | −k s, the shear's | k c, c >= Δt |
+| spin | −k s, the shear's | as of the tangents on the lever of the cone |
+| rolling | 0 | N m Δt, m the metacentric height |
+
+The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian, so
+the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
+viscous row gives. Of a ball m is 0, and its row is the friction of rolling.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from raytac.physics.rigid.motion_kernels import place_of, turn_of
+from raytac.physics.rigid.search_kernels import Rows
+from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
+from raytac.physics.rigid.spring_kernels import normal_spring
+from raytac.physics.rigid.step_kernels import law_of
+from raytac.physics.rigid.table_kernels import force_at, radius_at
+from raytac.physics.rigid.world_kernels import (
+    ROWS,
+    Differences,
+    Gels,
+    Motion,
+    Shear,
+    Slots,
+    Steps,
+    Touched,
+    compliance_of,
+    friction_of,
+    softening,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+_EDGE = wp.constant(wp.float64(0.7))
+"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
+_LEAST = wp.constant(wp.float64(1e-6))
+"""Least coefficient of friction, which MuJoCo wants positive."""
+_LEVER = wp.constant(wp.float64(3.0 * 3.141592653589793 / 16.0))
+"""Lever of the torque of spin over the contact's radius: Hertz's contact that slips as a whole."""
+_ROLLING = wp.constant(wp.float64(3.0 / 16.0))
+"""Of the friction of rolling, over radius and hysteresis."""
+_ROWS = wp.constant(wp.int32(ROWS))
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
+_2 = wp.constant(wp.float64(2.0))
+_HALF = wp.constant(wp.float64(0.5))
+
+
+@wp.func
+def first_tangent(normal: wp.vec3d) -> wp.vec3d:
+    """Unit tangent of a gel along the pad's x as nearly as can be; the second is that turned by 90° about the normal."""
+    return wp.normalize(wp.vec3d(_1, _0, _0) - normal[0] * normal)
+
+
+@wp.func
+def wrench_of(force: wp.vec3d, torque: wp.vec3d) -> wp.spatial_vectord:
+    return wp.spatial_vectord(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+
+
+@wp.kernel
+def set_rows(
+    rows: Rows,
+    pads: wp.int32,
+    bodies: wp.int32,
+    first_pad: wp.int32,
+    first_body: wp.int32,
+    motion: Motion,
+    vary: Differences,
+    gels: Gels,
+    touched: Touched,
+    fall: wp.float64,
+    # outputs
+    steps: Steps,
+    shear: Shear,
+    slots: Slots,
+):
+    """Fill the slots of one search's results with the rows of the step; ``pads`` …: as of ``approach``."""
+    i, p, q = wp.tid()
+    pad, body = first_pad + p, first_body + q
+    row = slots.row[i, pad, body]
+    if row < 0 or steps.lost[i] != 0:
+        return
+    env, step = steps.envs[i], steps.length[i]
+    law = law_of(rows, row, vary, gels, touched, env, pad, body)
+    spring = normal_spring(
+        rows, law, rows.depth[row], slots.speed[i, pad, body], compliance_of(vary, gels, env, pad, body), step,
+        gels.relaxation[pad], fall,
+    )  # fmt: skip
+    if not spring.damping > _0:
+        return
+    centre, normal, spread = rows.centre[row], rows.normal[row], rows.spread[row]
+    deepest = wp.max(spring.deepest, _0)
+    radius, load = radius_at(rows, law, deepest), force_at(rows, law, deepest)[0]
+    factor, square = softening(vary, gels, touched, env, pad, body), radius * radius
+    stiffness = wp.vec2d(
+        wp.max((gels.shear[pad][0] * radius + gels.shear[pad][1] * square) * factor, wp.float64(1e-12)),
+        wp.max((gels.twist[pad][0] * radius + gels.twist[pad][1] * square) * square * factor, wp.float64(1e-12)),
+    )
+    friction, lever = friction_of(vary, touched, env, pad, body), _LEVER * wp.max(radius, _LEAST)
+    # As much at the end of a step as keeps both shear and spin stable, whatever its length.
+    time = wp.max(gels.relaxation[pad], step * wp.max(_1, stiffness[1] / (stiffness[0] * lever * lever)))
+    damping = stiffness[0] * time
+    pull = begin_shear(shear, env, pad, body, stiffness, centre)
+
+    # A body that turns about its centre of mass moves the centre of pressure by the spread of the overlap per radian, less the height of
+    # that centre over the gel: by nothing at all for a ball. Its principal tangents are those of the rows.
+    pose = motion.pose[i, pad, body]
+    height = wp.dot(turn_of(pose) * touched.mass_centre[body] + place_of(pose) - centre, normal)
+    angle = _HALF * wp.atan2(_2 * spread[1], spread[0] - spread[2])
+    mean, half = _HALF * (spread[0] + spread[2]), wp.length(wp.vec2d(_HALF * (spread[0] - spread[2]), spread[1]))
+    cos, sin = wp.cos(angle), wp.sin(angle)
+    first = first_tangent(normal)
+    second = wp.cross(normal, first)
+    one = cos * first + sin * second
+    axes = wp.matrix_from_rows(normal, one, wp.cross(normal, one))
+
+    # What MuJoCo's convex cone adds to the normal force of a contact that slips, at the speed at the start of the step. Beyond the cone,
+    # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+    spin = motion.spin[i, pad, body]
+    velocity = motion.velocity[i, pad, body] + wp.cross(spin, centre - place_of(pose))
+    lift = wp.float64(0.0)
+    if spring.force > _0:
+        tangential = wp.vec3d(
+            pull[0] + damping * wp.dot(velocity, first),
+            pull[1] + damping * wp.dot(velocity, second),
+            pull[2] / lever + damping * wp.dot(spin, normal) * lever,
+        )
+        excess = wp.max(wp.length(tangential) - friction * spring.force, _0)
+        lift = friction * spring.damping / damping * excess
+
+    rotation = turn_of(motion.world_from_pad[i, pad])
+    slots.held[i, pad, body] = 1
+    wp.atomic_add(steps.contacts, i, 1)
+    slots.centre[i, pad, body] = centre
+    slots.radius[i, pad, body] = radius
+    slots.axes[i, pad, body] = axes
+    slots.turn[i, pad, body] = wp.vec2d(cos, sin)
+    slots.place[i, pad, body] = rotation * centre + place_of(motion.world_from_pad[i, pad])
+    slots.frame[i, pad, body] = axes * wp.transpose(rotation)
+    slots.friction[i, pad, body, 0] = friction
+    slots.friction[i, pad, body, 1] = friction
+    slots.friction[i, pad, body, 2] = friction * lever
+    k = wp.int32(0)
+    while k < 2:  # a rotation about one tangent moves the centre along the other
+        metacentric = wp.max(mean + wp.where(k == 0, -half, half) - height, _0)
+        rolling = friction * wp.sqrt(load * step / damping * metacentric)
+        # The cone must not cut this row before the centre of pressure is near the edge.
+        rolling = wp.max(rolling, _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9)))
+        slots.friction[i, pad, body, 3 + k] = wp.max(rolling, _ROLLING * gels.hysteresis[pad] * radius)
+        k += 1
+    slots.force[i, pad, body, 0] = spring.force - lift
+    slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])
+    slots.force[i, pad, body, 2] = sin * pull[0] - cos * pull[1]
+    slots.force[i, pad, body, 3] = -pull[2]
+    slots.force[i, pad, body, 4] = _0
+    slots.force[i, pad, body, 5] = _0
+    # Those of spin and rolling follow from the cone's levers.
+    slots.regularisation[i, pad, body, 0] = _1 / (spring.damping * step)
+    k = wp.int32(0)
+    while k < _ROWS - 1:
+        ratio = wp.max(friction, _LEAST) / wp.max(slots.friction[i, pad, body, k], _LEAST)
+        slots.regularisation[i, pad, body, 1 + k] = ratio * ratio / (damping * step)
+        k += 1
+
+
+@wp.kernel
+def read_rows(
+    force: wp.array4d(dtype=wp.float64),
+    velocity: wp.array4d(dtype=wp.float64),
+    motion: Motion,
+    steps: Steps,
+    touched: Touched,
+    # outputs
+    shear: Shear,
+    acceleration: wp.array3d(dtype=wp.float64),
+    slots: Slots,
+):
+    """Let the gels shear by what bodies moved in the step; contacts that have ended are forgotten.
+
+    ``force`` [N, N m] and ``velocity`` [m/s, rad/s] of rows at the end of the step, each (n, pads, bodies + pads, ROWS). MuJoCo's force is
+    on the second body; the pad gets the opposite, and another gel the opposite of that, about its own origin.
+    """
+    i, pad, body = wp.tid()
+    env, step = steps.envs[i], steps.length[i]
+    slots.wrench[i, pad, body] = wp.spatial_vectord()
+    slots.opposite[i, pad, body] = wp.spatial_vectord()
+    if steps.lost[i] != 0:
+        return
+    if slots.held[i, pad, body] == 0:
+        if shear.stiffness[env, pad, body][0] > _0:
+            clear_shear(shear, env, pad, body)
+            acceleration[env, pad, body] = _0
+        return
+    turn, centre, axes = slots.turn[i, pad, body], slots.centre[i, pad, body], slots.axes[i, pad, body]
+    one, two = velocity[i, pad, body, 1] * step, velocity[i, pad, body, 2] * step
+    displacement = wp.vec3d(turn[0] * one - turn[1] * two, turn[1] * one + turn[0] * two, velocity[i, pad, body, 3] * step)
+    normal_load = force[i, pad, body, 0]
+    limit = wp.vec2d(normal_load * slots.friction[i, pad, body, 0], normal_load * slots.friction[i, pad, body, 2])
+    move_shear(shear, env, pad, body, displacement, limit, centre, slots.radius[i, pad, body])
+    acceleration[env, pad, body] = (-velocity[i, pad, body, 0] - slots.speed[i, pad, body]) / step
+    back = wp.transpose(axes)
+    push = -(back * wp.vec3d(normal_load, force[i, pad, body, 1], force[i, pad, body, 2]))
+    torque = -(back * wp.vec3d(force[i, pad, body, 3], force[i, pad, body, 4], force[i, pad, body, 5])) + wp.cross(centre, push)
+    slots.wrench[i, pad, body] = wrench_of(push, torque)
+    if body >= touched.bodies:
+        pose = motion.pose[i, pad, body]
+        to_gel = wp.transpose(turn_of(pose))
+        slots.opposite[i, pad, body] = wrench_of(-(to_gel * push), to_gel * (wp.cross(place_of(pose), push) - torque))
+
+
+@wp.kernel
+def sum_wrenches(slots: Slots, steps: Steps, touched: Touched, wrench: wp.array2d(dtype=wp.spatial_vectord)):
+    """Wrench on each pad, (B, pads), in the order of the slots; 0 in an environment that is lost."""
+    i, pad = wp.tid()
+    total = wp.spatial_vectord()
+    for body in range(slots.held.shape[2]):
+        total += slots.wrench[i, pad, body]
+    for other in range(slots.held.shape[1]):
+        total += slots.opposite[i, other, touched.bodies + pad]
+    wrench[steps.envs[i], pad] = total

@@ -1,0 +1,64 @@
+"""State of the shear of all contacts of a world (see ``shear``)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from raytac.physics.rigid.shear import ELEMENTS, ContactShear
+from raytac.physics.rigid.world_kernels import Shear
+
+
+class ShearState:
+    """Stretch of all contacts: one row for each environment, pad and body. The arrays are views of the
+    kernels'; on CUDA only ``struct`` is kept up to date.
+
+    Attributes:
+        stretch: displacement [m] along two tangents and rotation [rad] about the normal, of every element, (…, ELEMENTS, 3).
+        stiffness: shear and twist stiffness at the last step [N/m, N m/rad], (…, 2); 0 out of contact.
+        load: tangential force and torque at which the contact slips [N, N m], (…, 2).
+        centre: of the contact [m], (…, 3).
+        play: travel of the centre over the gel and over the body that does not count as rolling yet, along both tangents [m], (…, 2, 2).
+        moved: displacement of the body over the gel in the last step, along both tangents [m], (…, 2).
+        struct: the arrays for kernels.
+    """
+
+    def __init__(self, num_envs: int, pads: int, bodies: int, *, device: str = "cpu") -> None:
+        shape = num_envs, pads, bodies
+        struct: Any = Shear()
+        for name, (inner, dtype) in _ARRAYS.items():
+            setattr(struct, name, wp.zeros((*shape, *inner), dtype=dtype, device=device))
+        self.struct = struct
+        self.stretch: np.ndarray = struct.stretch.numpy()
+        self.stiffness: np.ndarray = struct.stiffness.numpy()
+        self.load: np.ndarray = struct.load.numpy()
+        self.centre: np.ndarray = struct.centre.numpy()
+        self.play: np.ndarray = struct.play.numpy()
+        self.moved: np.ndarray = struct.moved.numpy()
+
+    def clear(self, envs: np.ndarray) -> None:
+        """Forget all contacts of environments."""
+        for name in _ARRAYS:
+            getattr(self, name)[envs] = 0.0
+
+    def of(self, envs: np.ndarray, pad: int, body: np.ndarray) -> ContactShear:
+        """Shear of one contact of each environment; body −1 is none."""
+        rows = envs, np.full(len(envs), pad), np.maximum(body, 0)
+        touched = (body >= 0) & (self.load[rows][:, 0] > 0.0)
+        mean = np.where(touched[:, None], self.stretch[rows].mean(axis=1), 0.0)
+        force = np.linalg.norm(mean[:, :2], axis=1) * self.stiffness[rows][:, 0]
+        share = np.minimum(force / np.where(touched, self.load[rows][:, 0], 1.0), 1.0)
+        stuck = np.where(touched, np.cbrt(1.0 - share), 0.0)
+        return ContactShear(mean[:, :2], mean[:, 2], stuck, np.where(touched[:, None], self.centre[rows], 0.0))
+
+
+_ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
+    "stretch": ((ELEMENTS,), wp.vec3d),
+    "stiffness": ((), wp.vec2d),
+    "load": ((), wp.vec2d),
+    "centre": ((), wp.vec3d),
+    "play": ((2,), wp.vec2d),
+    "moved": ((), wp.vec2d),
+}

@@ -1,0 +1,294 @@
+"""Kernels on the memory of MuJoCo's states: frames and velocities, contacts of gels and their constraint rows, forces.
+
+One thread works on one environment's arena, in which contacts and rows lie one after the other.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
+from __future__ import annotations
+
+import warp as wp
+
+from raytac.physics.rigid.motion_kernels import Frames
+from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.world.world_state import LARGEST_SPEED
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+_ROWS = wp.constant(wp.int32(ROWS))
+_LEAST = wp.constant(wp.float64(1e-6))
+"""Least coefficient of friction, which MuJoCo wants positive."""
+_BACK = wp.constant(wp.float64(0.1))
+"""Share of a penetration that a step takes back."""
+_LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))
+_MANY = wp.constant(wp.int32(0x7FFFFFFF))
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
+
+
+@wp.struct
+class Memory:
+    """Addresses of B states, and where their members lie: offsets of pointers [8 byte] and of numbers [4 byte]."""
+
+    states: wp.array(dtype=wp.uint64)
+    nq: wp.int32
+    nv: wp.int32
+    sparse: wp.array(dtype=wp.int32)
+    """1 where MuJoCo keeps the Jacobian of constraints sparse."""
+    ncon: wp.int32
+    nefc: wp.int32
+    contact: wp.int32
+    qpos: wp.int32
+    qvel: wp.int32
+    xpos: wp.int32
+    xmat: wp.int32
+    site_xpos: wp.int32
+    site_xmat: wp.int32
+    subtree_com: wp.int32
+    cvel: wp.int32
+    efc_J_rownnz: wp.int32
+    efc_J_rowadr: wp.int32
+    efc_J_colind: wp.int32
+    efc_J: wp.int32
+    efc_D: wp.int32
+    efc_R: wp.int32
+    efc_vel: wp.int32
+    efc_aref: wp.int32
+    efc_force: wp.int32
+    # Of a contact: its size and its members, [8 byte] and [4 byte].
+    size: wp.int32
+    dist: wp.int32
+    pos: wp.int32
+    frame: wp.int32
+    friction: wp.int32
+    mu: wp.int32
+    dim: wp.int32
+    geom1: wp.int32
+    geom2: wp.int32
+    geom: wp.int32
+    efc_address: wp.int32
+
+
+@wp.func
+def doubles(memory: Memory, env: wp.int32, member: wp.int32):
+    """Array that a pointer in a state's structure points to."""
+    many = wp.int32(_MANY)
+    pointers = wp.array(ptr=memory.states[env], shape=(many,), dtype=wp.uint64)
+    return wp.array(ptr=pointers[member], shape=(many,), dtype=wp.float64)
+
+
+@wp.func
+def integers(memory: Memory, env: wp.int32, member: wp.int32):
+    many = wp.int32(_MANY)
+    pointers = wp.array(ptr=memory.states[env], shape=(many,), dtype=wp.uint64)
+    return wp.array(ptr=pointers[member], shape=(many,), dtype=wp.int32)
+
+
+@wp.func
+def vector(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.vec3d:
+    return wp.vec3d(values[3 * index], values[3 * index + 1], values[3 * index + 2])
+
+
+@wp.func
+def matrix(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.mat33d:
+    return wp.matrix_from_rows(vector(values, 3 * index), vector(values, 3 * index + 1), vector(values, 3 * index + 2))
+
+
+@wp.func
+def number(memory: Memory, env: wp.int32, member: wp.int32) -> wp.int32:
+    """A number of a state's structure."""
+    many = wp.int32(_MANY)
+    numbers = wp.array(ptr=memory.states[env], shape=(many,), dtype=wp.int32)
+    return numbers[member]
+
+
+@wp.kernel
+def read_frames(
+    memory: Memory,
+    steps: Steps,
+    sites: wp.array(dtype=wp.int32),
+    bodies: wp.array(dtype=wp.int32),
+    roots: wp.array(dtype=wp.int32),
+    # outputs
+    frames: Frames,
+):
+    """Frames of pads, at their sites, and of bodies. ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees."""
+    row, k = wp.tid()
+    env, body = steps.envs[row], bodies[k]
+    place, turn = wp.vec3d(), wp.mat33d()
+    if k < sites.shape[0]:
+        place = vector(doubles(memory, env, memory.site_xpos), sites[k])
+        turn = matrix(doubles(memory, env, memory.site_xmat), sites[k])
+    else:
+        place = vector(doubles(memory, env, memory.xpos), body)
+        turn = matrix(doubles(memory, env, memory.xmat), body)
+    twist = doubles(memory, env, memory.cvel)
+    # MuJoCo's velocities are about the centre of mass of the kinematic tree.
+    about = vector(doubles(memory, env, memory.subtree_com), roots[k])
+    spin = vector(twist, 2 * body)
+    frames.place[row, k] = place
+    frames.turn[row, k] = turn
+    frames.spin[row, k] = spin
+    frames.velocity[row, k] = vector(twist, 2 * body + 1) + wp.cross(spin, place - about)
+
+
+@wp.kernel
+def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32)):
+    """Fill the last contacts with those of the slots that are held. ``gels``, ``others``: geoms of the pads and of all that they touch."""
+    i = wp.tid()
+    env = steps.envs[i]
+    k = number(memory, env, memory.ncon) - steps.contacts[i]
+    if steps.lost[i] != 0 or steps.contacts[i] == 0:
+        return
+    contact = doubles(memory, env, memory.contact)
+    integer = integers(memory, env, memory.contact)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                first = k * memory.size
+                place, frame = slots.place[i, pad, body], slots.frame[i, pad, body]
+                m = wp.int32(0)
+                while m < 3:
+                    contact[first + memory.pos + m] = place[m]
+                    n = wp.int32(0)
+                    while n < 3:
+                        contact[first + memory.frame + 3 * m + n] = frame[m, n]
+                        n += 1
+                    m += 1
+                m = wp.int32(0)
+                while m < _ROWS - 1:
+                    contact[first + memory.friction + m] = wp.max(slots.friction[i, pad, body, m], _LEAST)
+                    m += 1
+                integer[2 * first + memory.geom1] = gels[pad]
+                integer[2 * first + memory.geom2] = others[body]
+                integer[2 * first + memory.geom] = gels[pad]
+                integer[2 * first + memory.geom + 1] = others[body]
+                k += 1
+
+
+@wp.kernel
+def write_regularisation(memory: Memory, steps: Steps, slots: Slots):
+    """Set R of the last rows, after ``mj_makeConstraint``."""
+    i = wp.tid()
+    count = steps.contacts[i]
+    if steps.lost[i] != 0 or count == 0:
+        return
+    env = steps.envs[i]
+    k = (number(memory, env, memory.ncon) - count) * memory.size
+    row = number(memory, env, memory.nefc) - _ROWS * count
+    contact = doubles(memory, env, memory.contact)
+    inverse = doubles(memory, env, memory.efc_R)
+    stiffness = doubles(memory, env, memory.efc_D)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    value = slots.regularisation[i, pad, body, m]
+                    inverse[row] = value
+                    stiffness[row] = _1 / value
+                    row += 1
+                    m += 1
+                # The solver's cone is that of the dual one with the rows scaled by √R.
+                ratio = slots.regularisation[i, pad, body, 1] / slots.regularisation[i, pad, body, 0]
+                contact[k + memory.mu] = wp.max(slots.friction[i, pad, body, 0], _LEAST) * wp.sqrt(ratio)
+                k += memory.size
+
+
+@wp.func
+def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
+    """Entry of a geom; 0 of −1, which is a flex."""
+    if geom < 0:
+        return 0
+    return geoms[geom]
+
+
+@wp.kernel
+def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32)):
+    """Set the reference accelerations after ``mj_referenceConstraint``: of the last rows, and of contacts of geoms that are ``hard``."""
+    i = wp.tid()
+    if steps.lost[i] != 0:
+        return
+    env, step = steps.envs[i], steps.length[i]
+    count = number(memory, env, memory.ncon) - steps.contacts[i]
+    velocity = doubles(memory, env, memory.efc_vel)
+    reference = doubles(memory, env, memory.efc_aref)
+    contact = doubles(memory, env, memory.contact)
+    integer = integers(memory, env, memory.contact)
+    for k in range(count):
+        at = 2 * k * memory.size
+        one, two, first = integer[at + memory.geom], integer[at + memory.geom + 1], integer[at + memory.efc_address]
+        if first >= 0 and integer[at + memory.dim] >= 3 and is_among(hard, one) + is_among(hard, two) > 0:
+            gap = contact[k * memory.size + memory.dist]
+            # A gap is closed by the step exactly, and a penetration is taken back slowly.
+            wanted = wp.where(gap > _0, gap, _BACK * gap) / step
+            reference[first] = -(velocity[first] + wanted) / step
+            reference[first + 1] = -velocity[first + 1] / step
+            reference[first + 2] = -velocity[first + 2] / step
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
+                    reference[row] = wanted - velocity[row] / step
+                    row += 1
+                    m += 1
+
+
+@wp.kernel
+def read_constraint(
+    memory: Memory,
+    slots: Slots,
+    # outputs
+    steps: Steps,
+    force: wp.array4d(dtype=wp.float64),
+    velocity: wp.array4d(dtype=wp.float64),
+):
+    """Forces of the gels' rows and their velocities at the end of the step, after ``mj_step2``.
+
+    An environment is lost if a number is not finite, or a joint is far too fast.
+    """
+    i = wp.tid()
+    if steps.lost[i] != 0:
+        return
+    env = steps.envs[i]
+    position = doubles(memory, env, memory.qpos)
+    speed = doubles(memory, env, memory.qvel)
+    sound, total = wp.bool(True), wp.float64(0.0)
+    for k in range(memory.nv):
+        if not wp.abs(speed[k]) < _LARGEST_SPEED:
+            sound = wp.bool(False)
+    for k in range(memory.nq):
+        total += position[k]
+    if not (sound and wp.isfinite(total)):
+        steps.lost[i] = 1
+        return
+    if steps.contacts[i] == 0:
+        return
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    carried = doubles(memory, env, memory.efc_force)
+    jacobian = doubles(memory, env, memory.efc_J)
+    length = integers(memory, env, memory.efc_J_rownnz)
+    start = integers(memory, env, memory.efc_J_rowadr)
+    column = integers(memory, env, memory.efc_J_colind)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    value = wp.float64(0.0)
+                    if memory.sparse[0] != 0:
+                        for k in range(start[row], start[row] + length[row]):
+                            value += jacobian[k] * speed[column[k]]
+                    else:
+                        for k in range(memory.nv):
+                            value += jacobian[row * memory.nv + k] * speed[k]
+                    force[i, pad, body, m] = carried[row]
+                    velocity[i, pad, body, m] = value
+                    row += 1
+                    m += 1

@@ -1,0 +1,161 @@
+"""Contacts of gels among MuJoCo's own: put there between ``mj_step1`` and ``mj_step2``, and read after it, for all environments at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from raytac.physics.rigid.gel_contact import GelContact, Launch
+from raytac.physics.rigid.world_kernels import ROWS
+from raytac.world.mujoco_kernels import (
+    Memory,
+    read_constraint,
+    read_frames,
+    write_contacts,
+    write_references,
+    write_regularisation,
+)
+from raytac.world.mujoco_memory import checked_layouts
+
+
+class MujocoRows:
+    """Kernels on the states of B environments, and MuJoCo's calls between them."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        contact: GelContact,
+        *,
+        sites: np.ndarray,
+        bodies: np.ndarray,
+        geoms: np.ndarray,
+        hard: np.ndarray,
+    ) -> None:
+        """Prepare the kernels; ``bind`` names the states.
+
+        Args:
+            model: any of the environments'.
+            contact: the gels' contacts.
+            sites: at the pads' frames, (pads,).
+            bodies: that carry the pads, then those that they touch.
+            geoms: of the bodies that pads touch, then of the gels.
+            hard: geoms with the law of ``hard_contacts``, (ngeom,), bool.
+        """
+        num_envs, pads = contact.wrenches.shape
+        state, one = checked_layouts()
+        self._contact, self._blank = contact, _blank()
+        self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
+        self._datas: list[mujoco.MjData] = []
+        self._models: list[mujoco.MjModel] = []
+        self._options: list[Any] = []
+        memory: Any = Memory()
+        memory.states = wp.array(self._address, dtype=wp.uint64, device="cpu", copy=False)
+        memory.sparse = wp.array(self._sparse, dtype=wp.int32, device="cpu", copy=False)
+        memory.nq, memory.nv, memory.size = model.nq, model.nv, one.size // 8
+        for name in _POINTERS:
+            setattr(memory, name, state.offset[name] // 8)
+        for name in ("ncon", "nefc"):
+            setattr(memory, name, state.offset[name] // 4)
+        for name in _DOUBLES:
+            setattr(memory, name, one.offset[name] // 8)
+        for name in _INTEGERS:
+            setattr(memory, name, one.offset[name] // 4)
+        steps, slots = contact.steps, contact.slots
+        indices = [_array(values) for values in (sites, bodies, model.body_rootid[bodies])]
+        gels, others = _array(geoms[len(geoms) - pads :]), _array(geoms)
+        self._read = Launch(read_frames, (len(bodies),), [memory, steps, *indices, contact.frames])
+        self._write = Launch(write_contacts, (), [memory, steps, slots, gels, others])
+        self._regularise = Launch(write_regularisation, (), [memory, steps, slots])
+        self._refer = Launch(write_references, (), [memory, steps, slots, _array(hard)])
+        self._forces = Launch(read_constraint, (), [memory, slots, steps, contact.force, contact.velocity])
+
+    def bind(self, models: Sequence[mujoco.MjModel], datas: Sequence[mujoco.MjData]) -> None:
+        """Name the states, and their models, that the next calls work on."""
+        if not _same(datas, self._datas):
+            self._datas = list(datas)
+            self._address[:] = [data._address for data in datas]
+        if not _same(models, self._models):
+            self._models = list(models)
+            self._options = [model.opt for model in models]
+        self._sparse[0] = mujoco.mj_isSparse(models[0])
+
+    def first_half(self, envs: Sequence[int]) -> None:
+        """``mj_step1``."""
+        for b in envs:
+            mujoco.mj_step1(self._models[b], self._datas[b])
+
+    def read_frames(self, count: int) -> None:
+        """Frames of pads and bodies of the environments of this step."""
+        self._read(count)
+
+    def put(self, envs: Sequence[int]) -> None:
+        """Put the contacts that ``GelContact.begin`` found after MuJoCo's own.
+
+        An environment whose memory for contacts is full is lost.
+        """
+        count, blank, views = len(envs), self._blank, self._contact.views
+        assert views is not None
+        lost, rows = views.lost[:count].tolist(), []
+        for i, number in enumerate(views.contacts[:count].tolist()):
+            if not number or lost[i]:
+                continue
+            model, data = self._models[envs[i]], self._datas[envs[i]]
+            for _ in range(number):
+                if mujoco.mj_addContact(model, data, blank) != 0:
+                    views.lost[i] = 1
+                    break
+            else:
+                rows.append((model, data))
+        if rows:
+            self._write(count)
+            for model, data in rows:
+                # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
+                mujoco.mj_makeConstraint(model, data)
+            self._regularise(count)
+            for model, data in rows:
+                mujoco.mj_island(model, data)
+                mujoco.mj_projectConstraint(model, data)
+                mujoco.mj_referenceConstraint(model, data)
+        self._refer(count)
+
+    def second_half(self, envs: Sequence[int], lengths: Sequence[float], timestep: float) -> None:
+        """``mj_step2`` of the length [s] of each environment's step; afterwards the models have ``timestep`` again."""
+        models, datas, options = self._models, self._datas, self._options
+        for b, length in zip(envs, lengths, strict=True):
+            options[b].timestep = length
+            mujoco.mj_step2(models[b], datas[b])
+            options[b].timestep = timestep
+
+    def read_forces(self, count: int) -> None:
+        """Forces and velocities of the rows at the end of the step; environments that broke down are lost."""
+        self._forces(count)
+
+
+def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+
+
+def _array(values: np.ndarray) -> wp.array:
+    return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device="cpu")
+
+
+def _blank() -> mujoco.MjContact:
+    """A contact without place; what MuJoCo computes from its parameters is written over."""
+    contact = mujoco.MjContact()
+    contact.dist, contact.includemargin, contact.dim, contact.exclude = -1e-6, 0.0, ROWS, 0
+    contact.solref[:], contact.solimp[:] = (0.02, 1.0), (0.9, 0.9, 1e-3, 0.5, 2.0)
+    contact.solreffriction[:] = 0.0
+    contact.flex[:] = contact.elem[:] = contact.vert[:] = -1
+    return contact
+
+
+_POINTERS = (
+    "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "efc_J_rownnz", "efc_J_rowadr",
+    "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+)  # fmt: skip
+_DOUBLES = ("dist", "pos", "frame", "friction", "mu")
+_INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

@@ -1,0 +1,386 @@
+"""Kernels of a step of rigid pads against NumPy, on random states; a batch is its environments alone; CPU and CUDA agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from raytac.physics.rigid.contacts import LoadTables, PadContacts
+from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.se3 import rotations
+from raytac.shapes.part import primitive
+from raytac.specs import load_sensor
+from raytac.world.forbidden_overlap import BondedFaces
+from raytac.world.gel_pairs import GelPairs
+from tests.physics.rigid.oracle_motion import PadMotion, cross, motion_of, turned
+from tests.physics.rigid.oracle_rows import gel_rows, row_axes
+from tests.physics.rigid.oracle_shear import ShearOracle
+from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
+from tests.physics.rigid.oracle_steps import StepChoice
+
+MINI = load_sensor("gelsight_mini").gelpad
+GELS = MINI, replace(MINI, youngs_modulus=2.0 * MINI.youngs_modulus, hysteresis=0.1, relaxation_time=3e-3)
+SHAPES = [
+    (primitive("sphere", (4e-3,)),),
+    (primitive("box", (4e-3, 3e-3, 2e-3)), primitive("sphere", (3e-3,))),
+    (primitive("plane", ()),),
+    (primitive("cylinder", (2e-3, 5e-3)),),
+]
+PADS, COUNT, ENVS = len(GELS), len(SHAPES), 60
+TIMESTEP, FALL, CASE_TRAVEL = 0.004, 9.81, 2.4e-3
+CASE_CENTRE, CASE_HALF = np.tile([0.0, 0.0, -0.02], (PADS, 1)), np.tile([0.016, 0.016, 0.0155], (PADS, 1))
+MASS_CENTRE = np.vstack([np.linspace(-1e-3, 1e-3, 3 * COUNT).reshape(COUNT, 3), np.zeros((PADS, 3))])
+CARRIER = np.array([1, 2])
+INDEX = np.array([3, 4, 5, 6])
+
+
+@dataclass
+class State:
+    """What the kernels are given: frames of pads and bodies, numbers of environments, and the shear of their contacts."""
+
+    frames: dict[str, np.ndarray]
+    numbers: dict[str, np.ndarray]
+    shear: dict[str, np.ndarray]
+    acceleration: np.ndarray
+    done: np.ndarray
+
+
+def random_state(seed: int, num_envs: int = ENVS) -> State:
+    """Bodies about the gels of two pads that face each other, in motion; half of the contacts have been there before."""
+    rng = np.random.default_rng(seed)
+    place, turn = np.zeros((num_envs, PADS + COUNT, 3)), np.zeros((num_envs, PADS + COUNT, 3, 3))
+    turn[:] = rotations(rng.normal(0.0, 0.1, (num_envs, PADS + COUNT, 3)).reshape(-1, 3)).reshape(turn.shape)
+    turn[:, 1] = turn[:, 0] @ np.diag([1.0, -1.0, -1.0]) @ turn[:, 1]
+    place[:, 1] = place[:, 0] + turn[:, 0] @ np.array([0.0, 0.0, 1.0]) * rng.choice([-0.5e-3, 1e-3, 0.03], (num_envs, 1))
+    place[:, PADS:] = rng.uniform(-6e-3, 6e-3, (num_envs, COUNT, 3))
+    place[:, PADS:, 2] = np.array([4e-3, 2e-3, 0.0, 5e-3]) + rng.uniform(-1e-3, 0.4e-3, (num_envs, COUNT))
+    # In half of the environments only a ball is near, which may be about to touch.
+    place[::2, PADS + 1 :, 2] += 0.1
+    place[::2, PADS, :2] *= 0.2
+    place[::2, PADS, 2] = 4e-3 + rng.uniform(-30e-6, 30e-6, len(place[::2]))
+    turn[:, PADS + 2] = np.diag([1.0, -1.0, -1.0]) @ turn[:, PADS + 2]  # the half-space looks down
+    frames = {
+        "place": place,
+        "turn": turn,
+        "velocity": rng.normal(0.0, 0.1, place.shape),
+        "spin": rng.normal(0.0, 2.0, place.shape),
+    }
+    friction = rng.uniform(0.1, 1.5, (num_envs, COUNT))
+    numbers = {
+        "inverse_weight": rng.uniform(0.0, 30.0, (num_envs, 7)),
+        "gel_stiffness": rng.uniform(0.5, 2.0, (num_envs, PADS)),
+        "gel_friction": rng.uniform(0.2, 1.5, (num_envs, PADS)),
+        "body_friction": np.where(rng.random(friction.shape) < 0.5, np.nan, friction),
+    }
+    numbers["inverse_weight"][:, [2, 6]] = 0.0  # the second pad and the last body do not move
+    slots, there = (num_envs, PADS, COUNT + PADS), rng.random((num_envs, PADS, COUNT + PADS, 1)) < 0.5
+    shear = {
+        "stretch": np.where(there[..., None], rng.normal(0.0, [1e-4, 1e-4, 0.02], (*slots, 8, 3)), 0.0),
+        "stiffness": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)) * [2e3, 0.05], 0.0),
+        "load": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)), 0.0),
+        "centre": np.where(there, rng.normal(0.0, 2e-3, (*slots, 3)), 0.0),
+        "play": np.where(there[..., None], rng.normal(0.0, 2e-4, (*slots, 2, 2)), 0.0),
+        "moved": np.where(there, rng.normal(0.0, 1e-4, (*slots, 2)), 0.0),
+    }
+    done = rng.choice([0, 1024, 3072, 3328], num_envs)
+    return State(frames, numbers, shear, np.where(there[..., 0], rng.normal(0.0, 50.0, slots), 0.0), done)
+
+
+def gel_contact(state: State, device: str = "cpu") -> GelContact:
+    num_envs = len(state.done)
+    bodies = Bodies(SHAPES, INDEX, CARRIER, MASS_CENTRE, CASE_CENTRE, CASE_HALF)
+    contact = GelContact(
+        GELS,
+        bodies,
+        GelPairs(GELS, CARRIER, num_envs, device=device).pairs,
+        state.numbers,
+        num_envs=num_envs,
+        timestep=TIMESTEP,
+        fall=FALL,
+        case_travel=CASE_TRAVEL,
+        device=device,
+    )
+    for name, values in state.frames.items():
+        getattr(contact.frames, name).assign(values)
+    for name, values in state.shear.items():
+        getattr(contact.shear.struct, name).assign(values)
+    contact.acceleration.assign(state.acceleration)
+    contact.steps.envs.assign(np.arange(num_envs, dtype=np.int32))
+    contact.steps.done.assign(state.done.astype(np.int32))
+    return contact
+
+
+def of_slots(contact: GelContact, name: str) -> np.ndarray:
+    return getattr(contact.slots, name).numpy()
+
+
+def chosen(contacts: PadContacts, rows: np.ndarray) -> PadContacts:
+    return PadContacts(**{name: values[rows] for name, values in vars(contacts).items()})
+
+
+class Step:
+    """A step in NumPy, with the contacts that the search of the kernels has measured."""
+
+    def __init__(self, state: State, contact: GelContact) -> None:
+        self.state, num_envs = state, len(state.done)
+        envs = np.arange(num_envs)
+        self.motion = motion_of(pads=PADS, **state.frames)
+        self.choice = choice = StepChoice(TIMESTEP)
+        self.left = left = TIMESTEP * (1.0 - state.done / choice.ticks)
+        radius = np.array([4e-3, np.sqrt(29.0) * 1e-3, np.inf, np.hypot(2e-3, 5e-3)])
+        speed = self.motion.greatest_speed(radius)
+        self.reach = speed.max(axis=2) * left[:, None] + FALL * left[:, None] ** 2
+        apart = np.abs(self.motion.pad_from_body[:, :, :COUNT, :3, 3] - CASE_CENTRE[:, None]) - CASE_HALF[:, None]
+        beside = choice.beside_case(np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - radius, speed)
+        beside[..., 2] = np.inf
+        self.case_step = beside.min(axis=2)
+        poses = contact.motion.pose.numpy()
+        some = [contact.search.contacts(poses[:, :, :COUNT], envs, contact.search.reach.numpy().copy())]
+        i, j, search, *_ = contact._pairs[0]
+        near = search.contacts(poses[:, i : i + 1, COUNT + j : COUNT + j + 1], envs, search.reach.numpy().copy())
+        some.append(replace(near, pad=near.pad + i, body=near.body + COUNT + j, clearance=near.clearance + GELS[j].thickness))
+        rows = {name: np.concatenate([getattr(one, name) for one in some]) for name in PadContacts.__dataclass_fields__}
+        contacts = chosen(PadContacts(**rows), np.lexsort((rows["body"], rows["pad"], rows["env"])))
+        self.lost = np.zeros(num_envs, bool)
+        self.lost[contacts.env[np.isnan(contacts.deepest)]] = True
+        carrier = np.concatenate([INDEX, CARRIER])
+        weight = state.numbers["inverse_weight"][contacts.env]
+        at = np.arange(len(contacts))
+        compliance = weight[at, CARRIER[contacts.pad]] + weight[at, carrier[contacts.body]]
+        movable = (compliance > 0.0) & ~np.isnan(contacts.deepest)
+        self.contacts, self.compliance = chosen(contacts, movable), compliance[movable]
+        self.speed = self.motion.closing(self.contacts, self.contacts.env)
+        self.longest, self.length = self._lengths()
+        self._spring()
+
+    def law(self, contacts: PadContacts) -> LoadTables:
+        return LoadTables(contacts, self.thickness(contacts), self.softer(contacts))
+
+    def thickness(self, contacts: PadContacts) -> np.ndarray:
+        size, other = np.array([gel.thickness for gel in GELS]), contacts.body - COUNT
+        return size[contacts.pad] + np.where(other >= 0, size[np.maximum(other, 0)], 0.0)
+
+    def softer(self, contacts: PadContacts) -> np.ndarray:
+        stiffness, modulus = self.state.numbers["gel_stiffness"], np.array([gel.youngs_modulus for gel in GELS])
+        own, other = stiffness[contacts.env, contacts.pad], contacts.body - COUNT
+        at = np.maximum(other, 0)
+        both = own * modulus[contacts.pad] / (stiffness[contacts.env, at] * modulus[at])
+        return own / np.where(other >= 0, 1.0 + both, 1.0)
+
+    def friction(self, contacts: PadContacts) -> np.ndarray:
+        own, gel = self.state.numbers["body_friction"], self.state.numbers["gel_friction"]
+        given = np.append(own, np.full_like(gel, np.nan), axis=1)[contacts.env, contacts.body]
+        return np.where(np.isnan(given), gel[contacts.env, contacts.pad], given)
+
+    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
+        contacts, thickness = self.contacts, self.thickness(self.contacts)
+        env = contacts.env
+        deeper = contacts.depth + np.minimum(np.maximum(self.speed, 0.0) * self.left[env], 0.025 * thickness)
+        rate = contact_rate(self.law(contacts).force(deeper)[1], self.compliance)
+        acceleration = self.state.acceleration[env, contacts.pad, contacts.body]
+        each = self.choice.longest(contacts.depth, self.speed, rate, acceleration, thickness)
+        longest = np.minimum(self.case_step.min(axis=1), TIMESTEP)
+        np.minimum.at(longest, env, each)
+        self.ticks = self.choice.rounded(longest, self.state.done)
+        return each, TIMESTEP * self.ticks / self.choice.ticks
+
+    def _spring(self) -> None:
+        contacts, step = self.contacts, self.length[self.contacts.env]
+        tau = np.array([gel.relaxation_time for gel in GELS])[contacts.pad]
+        spring = normal_spring(self.law(contacts), contacts.depth, self.speed, self.compliance, step, tau, FALL)
+        held = (spring.damping > 0.0) & ~self.lost[contacts.env]
+        self.held, self.closing = chosen(contacts, held), self.speed[held]
+        spring = type(spring)(spring.force[held], spring.damping[held], spring.deepest[held])
+        self.slot = self.held.env, self.held.pad, self.held.body
+        shape = self.state.acceleration.shape
+        self.shear = ShearOracle(*shape)
+        for name, values in self.state.shear.items():
+            getattr(self.shear, name)[:] = values
+        apart = np.ones(shape, bool)
+        apart[self.slot] = False
+        apart[self.lost] = False  # they stand still
+        self.shear.clear(*np.nonzero(apart))
+        law = self.law(self.held)
+        self.radius = law.radius(np.maximum(spring.deepest, 0.0))
+        self.rows, self.turn = gel_rows(
+            self.held,
+            law,
+            spring,
+            self.motion,
+            self.held.env,
+            self.length[self.held.env],
+            shear=self.shear,
+            gels=GELS,
+            softer=self.softer(self.held),
+            friction=self.friction(self.held),
+            mass_centre=MASS_CENTRE,
+        )
+
+    def end(self, force: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Wrenches (B, pads, 6) by forces and velocities of the rows held, (n, 6); the shear is moved."""
+        rows, turn, held, env = self.rows, self.turn, self.held, self.held.env
+        moved = np.empty((len(held), 3))
+        moved[:, :2] = (turn @ velocity[:, 1:3, None])[..., 0] * rows.step[:, None]
+        moved[:, 2] = velocity[:, 3] * rows.step
+        self.shear.move(self.slot, moved, force[:, :1] * rows.friction[:, [0, 2]], held.centre, self.radius)
+        axes = row_axes(held.normal, turn)
+        push = -(force[:, None, :3] @ axes)[:, 0]
+        torque = -(force[:, None, 3:] @ axes)[:, 0] + cross(held.centre, push)
+        wrench = np.zeros((len(self.lost), PADS, 6))
+        np.add.at(wrench, (env, held.pad), np.concatenate([push, torque], axis=1))
+        gel = np.flatnonzero(held.body >= COUNT)
+        pose = self.motion.pad_from_body[self.slot][gel]
+        opposite = cross(pose[:, :3, 3], push[gel]) - torque[gel]
+        parts = [turned(-push[gel], pose[:, :3, :3]), turned(opposite, pose[:, :3, :3])]
+        np.add.at(wrench, (env[gel], held.body[gel] - COUNT), np.concatenate(parts, axis=1))
+        return wrench
+
+
+def same(actual: np.ndarray, expected: np.ndarray, tolerance: float = 1e-12) -> None:
+    """Equal within a share of the expected values or, of what cancels, of their median."""
+    finite = np.isfinite(expected)
+    np.testing.assert_array_equal(np.isfinite(actual), finite)
+    usual = np.abs(expected[finite & (expected != 0.0)])
+    usual = float(np.median(usual)) if len(usual) else 0.0
+    np.testing.assert_allclose(actual[finite], expected[finite], rtol=tolerance, atol=tolerance * usual)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
+    state = random_state(seed)
+    contact = gel_contact(state)
+    contact.begin(ENVS)
+    slots = {name: of_slots(contact, name).copy() for name in ("row", "held", "speed", "longest", "centre", "radius")}
+    slots |= {name: of_slots(contact, name).copy() for name in ("place", "frame", "friction", "force", "regularisation")}
+    step = Step(state, contact)
+    motion: PadMotion = step.motion
+    assert contact.views is not None
+    for name, expected in (("pose", motion.pad_from_body), ("velocity", motion.velocity), ("spin", motion.spin)):
+        same(getattr(contact.motion, name).numpy(), expected)
+    same(contact.motion.case_step.numpy(), step.case_step)
+    same(contact.search.reach.numpy(), step.reach)
+    np.testing.assert_array_equal(contact.views.lost != 0, step.lost)
+    moving = step.contacts.env, step.contacts.pad, step.contacts.body
+    expected = np.zeros(slots["row"].shape, bool)
+    expected[moving] = True
+    np.testing.assert_array_equal(slots["row"] >= 0, expected)
+    same(slots["speed"][moving], step.speed)
+    same(slots["longest"][moving], step.longest)
+    np.testing.assert_array_equal(contact.views.ticks, step.ticks)
+    np.testing.assert_array_equal(contact.views.length, step.length)
+    expected = np.zeros(slots["row"].shape, bool)
+    expected[step.slot] = True
+    np.testing.assert_array_equal(slots["held"] != 0, expected)
+    np.testing.assert_array_equal(contact.views.contacts, np.bincount(step.held.env, minlength=ENVS) * ~step.lost)
+    assert len(step.held) > ENVS and (step.held.body >= COUNT).any() and (step.held.depth < 0.0).any()
+    rows = step.rows
+    same(slots["centre"][step.slot], step.held.centre)
+    same(slots["radius"][step.slot], step.radius)
+    same(slots["place"][step.slot], rows.position)
+    same(slots["frame"][step.slot].reshape(-1, 9), rows.frame, 1e-10)  # principal axes of a spread that is nearly round
+    same(slots["friction"][step.slot], rows.friction, 1e-10)
+    for k in range(6):
+        same(slots["force"][step.slot][:, k], rows.force[:, k], 1e-10)
+        same(slots["regularisation"][step.slot][:, k], rows.regularisation()[:, k], 1e-10)
+
+    rng = np.random.default_rng(seed)
+    force, velocity = np.zeros((2, *expected.shape, 6))
+    force[step.slot] = np.abs(rng.normal(0.0, 1.0, (len(step.held), 6)))
+    velocity[step.slot] = rng.normal(0.0, 0.1, (len(step.held), 6))
+    contact.force.assign(force)
+    contact.velocity.assign(velocity)
+    contact.end(ENVS)
+    wrench = step.end(force[step.slot], velocity[step.slot])
+    same(contact.views.wrench[~step.lost], wrench[~step.lost], 1e-10)
+    for name, values in vars(step.shear).items():
+        same(getattr(contact.shear, name)[~step.lost], values[~step.lost], 1e-10)
+    acceleration = np.zeros(expected.shape)
+    acceleration[step.slot] = (-velocity[step.slot][:, 0] - step.closing) / rows.step
+    same(contact.views.acceleration[~step.lost], acceleration[~step.lost])
+
+
+def taken(state: State, envs: np.ndarray) -> State:
+    def of(values: Any) -> Any:
+        return {name: one[envs] for name, one in values.items()} if isinstance(values, dict) else values[envs]
+
+    return State(**{name: of(values) for name, values in vars(state).items()})
+
+
+def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
+    """Everything that a step leaves, with forces that depend on the slot alone."""
+    contact.begin(num_envs)
+    shape = contact.force.shape
+    values = np.cos(np.arange(np.prod(shape[1:]))).reshape(shape[1:])
+    contact.force.assign(np.broadcast_to(1.0 + values, shape))
+    contact.velocity.assign(np.broadcast_to(0.1 * values, shape))
+    contact.end(num_envs)
+    held = of_slots(contact, "held").astype(bool)
+    result = {name: of_slots(contact, name) * held[..., None] for name in ("place", "friction", "force", "regularisation")}
+    result |= {name: getattr(contact.shear.struct, name).numpy() for name in ("stretch", "stiffness", "load", "play")}
+    return result | {"wrench": contact.wrenches.numpy(), "length": contact.steps.length.numpy(), "held": held}
+
+
+def test_a_batch_is_its_environments_alone_to_the_bit() -> None:
+    state = random_state(7, 12)
+    whole = results(gel_contact(state), 12)
+    for b in (0, 5, 11):
+        alone = results(gel_contact(taken(state, np.array([b]))), 1)
+        for name, values in alone.items():
+            np.testing.assert_array_equal(values[0], whole[name][b], err_msg=name)
+
+
+def test_the_route_that_needs_no_host_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on CUDA: every search is launched, whatever is near."""
+    state = random_state(8)
+    one, contact = results(gel_contact(state), ENVS), gel_contact(state)
+    for search in (contact.search, contact._pairs[0].search):
+        search.reserve(ENVS * PADS * COUNT)
+    monkeypatch.setattr(contact, "_search_near", lambda count, views: contact._search(count))
+    other = results(contact, ENVS)
+    for name, values in one.items():
+        np.testing.assert_array_equal(other[name], values, err_msg=name)
+
+
+@pytest.mark.gpu
+def test_cuda_gives_what_the_cpu_gives() -> None:
+    wp.init()
+    state = random_state(8)
+    one, other = results(gel_contact(state), ENVS), results(gel_contact(state, "cuda"), ENVS)
+    np.testing.assert_array_equal(one["held"], other["held"])
+    for name, values in one.items():
+        if name != "held":
+            same(other[name], values, 1e-6)
+
+
+def test_what_a_bonded_face_refuses_is_suspected() -> None:
+    """No body beyond a face, or that went through one since the last step, escapes; what lies off the pads is not looked at."""
+    state = random_state(3, 60)
+    rng = np.random.default_rng(3)
+    state.frames["place"][:, 1] = [0.0, 0.0, 0.5]
+    state.frames["place"][:, PADS:] = rng.uniform([-0.02, -0.02, -0.02], [0.02, 0.02, 0.01], (60, COUNT, 3))
+    contact, faces = gel_contact(state), BondedFaces(GELS, SHAPES)
+    views = contact.views
+    assert views is not None
+    contact.move(60)
+    poses = views.poses.copy()
+    pierced = faces.pierced(poses)
+    assert pierced.sum() > 20 and not (pierced & (views.suspect == 0)).any()
+    assert (views.suspect[:, 0] == 0).mean() > 0.1 and (views.suspect[:, 1, [0, 1, 3]] == 0).all()
+    # From above the gel to below the case: neither end is beyond the face.
+    state = taken(state, np.arange(3))
+    state.frames["place"][:, PADS:] = [0.0, 0.0, -0.1]
+    contact = gel_contact(state)
+    views = contact.views
+    assert views is not None
+    above = np.tile(np.eye(4), (3, PADS, COUNT, 1, 1))
+    above[..., 2, 3] = 0.05
+    views.before[:] = above
+    contact.move(3)
+    some = views.suspect != 0
+    np.testing.assert_array_equal(views.poses_before, above)
+    np.testing.assert_array_equal(views.before, views.poses)
+    assert some[:, 0].all() and faces.pierced_on_path(views.poses, above, some)[:, 0].all()
