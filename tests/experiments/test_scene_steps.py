@@ -21,8 +21,8 @@ def test_every_shipped_scene_with_rigid_pads_is_measured() -> None:
 def test_a_pad_that_stands_or_slides_keeps_its_contact_and_the_body_its_place(name: str) -> None:
     played = play(name, "pressed", 4, 0)
     assert played.lost == 0.0 and played.failed == 0
-    assert played.sink_mm is not None and played.sink_mm < 0.1
-    assert played.tilt_deg is None or played.tilt_deg < 0.2
+    assert played.sink_mm is not None and played.sink_mm < 0.2
+    assert played.tilt_deg is None or played.tilt_deg < 0.3  # 0.2 mm under an edge of 40 mm
 
 
 @pytest.mark.slow
@@ -39,7 +39,7 @@ def test_what_is_measured_is_written_and_a_shorter_step_sinks_less(tmp_path) -> 
     args = scene_steps.Args(out=tmp_path / "run", scenes=("push_cube",), steps_ms=(10.0, 2.0), episodes=2, device="cpu")
     scene_steps.main(args)
     found = read_metrics(tmp_path / "run" / "metrics.json")
-    assert found["scene_steps.push_cube.shipped_ms"] == 5.0
+    assert found["scene_steps.push_cube.shipped_ms"] == 10.0
     for how in ("scripted", "pressed"):
         sink = [float(found[f"scene_steps.push_cube.{step}ms.{how}.sink_mm"]) for step in (10, 2)]
         assert sink[1] < 0.3 * sink[0] and sink[0] > 0.01
