@@ -36,7 +36,7 @@ from raytac.errors import BackendError, InputError
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Servo, servo_step
 from raytac.robots.states import StateReader
-from raytac.se3 import check_pose, pose_error, quaternion
+from raytac.se3 import check_pose, pose_error
 
 _STRIDE = 0.1
 """Duration [s] of each step of ``reach``: at 2 rad/s, a fifth of a radian."""
@@ -180,7 +180,10 @@ class DifferentialIk:
             raise InputError("qpos", value=np.asarray(qpos).tolist(), rule=f"must be {model.nq} finite numbers, the model's qpos")
         target = check_pose("world_from_target", world_from_target)
         self._configuration.update(np.array(qpos, float))
-        self._frame.set_target(mink.SE3(np.concatenate([quaternion(target[:3, :3]), target[:3, 3]])))
+        aim = np.empty(7)
+        mujoco.mju_mat2Quat(aim[:4], target[:3, :3].ravel())
+        aim[4:] = target[:3, 3]
+        self._frame.set_target(mink.SE3(aim))
         posture = np.array(qpos, float)
         posture[self.arm.qpos] = self.posture
         self._posture_task.set_target(posture)
