@@ -96,7 +96,10 @@ class ActionControl:
             self._gap[chosen] = self.world.composed.ctrl[opening]
 
     def controller(self, actions: np.ndarray) -> BatchController:
-        """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1]."""
+        """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1].
+
+        It has no targets of its own: one that was asked for before follows the same from now on.
+        """
         dt, now = self.world.composed.control_timestep, self.state()
         if self.action == "pose":
             before = self._target.copy()
@@ -112,8 +115,8 @@ class ActionControl:
             step = self.motion.step[self.motion.axes.index("grip")]
             low, high = self.motion.opening
             self._gap = np.clip(self._gap + step * actions[:, -1], low, high)
-        start = np.array([data.time for data in self.world.data])
-        return _Follow(self._springs, joints, speed, start, self._gap[:, None])
+        self._springs.aim(joints, speed, np.array([data.time for data in self.world.data]), self._gap[:, None])
+        return _Follow(self._springs)
 
     def _move_pose(self, actions: np.ndarray, tool: np.ndarray) -> None:
         motion, i = self.motion, self._axes
@@ -151,15 +154,6 @@ class _Follow(BatchController):
     """Springs towards moving joint targets, and the opening of a gripper."""
 
     springs: JointSprings
-    joints: np.ndarray
-    """Targets (B, n) at ``start``."""
-    speed: np.ndarray
-    """Speed of the targets (B, n)."""
-    start: np.ndarray
-    """Time of the step's start (B,) [s]."""
-    gap: np.ndarray
-    """Opening (B, 1) [m]."""
 
     def drive(self, datas: Sequence[Any], envs: Sequence[int] | np.ndarray) -> None:
-        self.springs.aim(self.joints, self.speed, self.start, self.gap)
         self.springs.drive(envs)

@@ -24,6 +24,7 @@ from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
+from raytac.world.world_state import WorldState
 
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s] in observations."""
@@ -216,7 +217,7 @@ class TaskBatch:
         self._tool[envs], self._body[envs] = now.tool[envs], state.world_from_body[self.task.body][envs]
         self._speed[envs], self._body_speed[envs] = 0.0, 0.0
         self._turn = self._errors((self._tool, self.start_tool))[0, :, 3:]
-        return self._observe(np.isin(np.arange(self.num_envs), envs))
+        return self._observe(np.isin(np.arange(self.num_envs), envs), state)
 
     def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> StepResult:
         """One control step of every environment.
@@ -258,7 +259,7 @@ class TaskBatch:
             last_action=last,
         )
         judged = time.perf_counter()
-        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
+        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen, state)
         failed = self.world.failed  # includes failures that only the pad's surface shows
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
@@ -281,8 +282,11 @@ class TaskBatch:
             specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
         return specs
 
-    def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading."""
+    def _observe(self, which: np.ndarray, state: WorldState) -> dict[str, np.ndarray]:
+        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading.
+
+        ``state``: present state of the world.
+        """
         tool, body, goal = self._tool, self._body, self._goal
         position = tool[:, :3, 3]
         moved, gap = (position - self.start_tool[:3, 3]) / _LENGTH, self._opening / _LENGTH
@@ -295,10 +299,9 @@ class TaskBatch:
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
         needs_frames = any(observer.settings.needs_frames for observer in self.observers.values())
         frames = self.world.observe(envs=rows) if needs_frames and which.any() else {}
-        state = self.world.state() if self.observers and not needs_frames else None
         for name, observer in self.observers.items():
             sensor = self.world.sensors[name] if observer.settings.difference else None
-            if state is not None:
+            if not needs_frames:
                 values = observer.observe_wrench(state.wrench[name], state.failed, which)
             else:
                 values = observer.observe(frames[name], sensor, rows) if frames else observer.last()
