@@ -264,8 +264,11 @@ class TaskBatch:
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
         result = self.task.evaluate(task_state)
-        terms = {name: np.where(failed, 0.0, np.asarray(term, float)) for name, term in result.terms.items()}
-        reward = np.sum(list(terms.values()), axis=0)
+        nothing = np.zeros(self.num_envs)
+        terms = {name: nothing + term for name, term in result.terms.items()}
+        if failed.any():
+            terms = {name: np.where(failed, 0.0, term) for name, term in terms.items()}
+        reward = sum(terms.values(), nothing)
         terminated = result.terminated & ~failed
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
         self.time_s["reward"] += time.perf_counter() - judged
@@ -318,7 +321,7 @@ class TaskBatch:
         if not self._begun.all():
             env = int(np.flatnonzero(~self._begun)[0])
             raise InputError("environment", value=env, rule="must be reset before it is stepped")
-        return np.clip(values, -1.0, 1.0)
+        return np.minimum(np.maximum(values, -1.0), 1.0)
 
 
 def _sensor_seed(seed: int, sensor: int) -> int:
