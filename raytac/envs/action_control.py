@@ -14,11 +14,13 @@ import numpy as np
 
 from raytac.envs.task_rules import Motion
 from raytac.errors import InputError
-from raytac.robots.frames import site_poses
 from raytac.robots.ik import PoseServo
 from raytac.robots.impedance import JointImpedance
+from raytac.robots.joint_springs import JointSprings
 from raytac.robots.panda import MAX_VELOCITY
-from raytac.se3 import pose_error, rotations
+from raytac.robots.pose_errors import PoseErrors
+from raytac.robots.states import StateReader, numbers
+from raytac.se3 import rotations
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import BatchController
 
@@ -42,10 +44,16 @@ class ActionControl:
                 "scene", value=None if world.scene is None else world.scene.name, rule="needs an arm with torque motors"
             )
         self.world, self.arm, self.motion, self.action = world, world.arm, motion, action
-        self._posture = world.composed.start[self.arm.qpos].copy()
-        self._law = JointImpedance(self.arm, frequency=motion.frequency)
+        composed, data = world.composed, world.data
+        self._posture = composed.start[self.arm.qpos].copy()
+        opening = composed.opening
+        self._springs = JointImpedance(self.arm, frequency=motion.frequency).springs(data, () if opening is None else (opening,))
         self._servo = PoseServo(self.arm, max_velocity=np.array(MAX_VELOCITY), posture=self._posture)
         self._has_grip = "grip" in motion.axes
+        fingers = np.arange(world.model.nq)[composed.fingers] if self._has_grip else np.zeros(0, int)
+        arm = self.arm.numbers()
+        known = {"tool": arm["site"], "joints": arm["joints"], "speed": arm["speed"], "fingers": numbers("qpos", fingers)}
+        self._reader = StateReader(data, known)
         self.size = len(motion.axes) if action == "pose" else len(self.arm) + self._has_grip
         self.opening_range = motion.opening if self._has_grip else ()
         count = world.num_envs
@@ -53,7 +61,17 @@ class ActionControl:
         self._turn = np.zeros((count, 3))
         self._joints = np.repeat(self._posture[None], count, axis=0)
         self._gap = np.zeros(count)
-        self._start = self.tool()[0].copy()
+        self._errors = PoseErrors(count)
+        moved = {"xyz".index(axis): k for k, axis in enumerate(motion.axes) if axis in "xyz"}
+        self._axes, self._moves = list(moved), list(moved.values())
+        self._step, self._low, self._high = (
+            np.array(values)[index]
+            for values, index in ((motion.step, self._moves), (motion.low, self._axes), (motion.high, self._axes))
+        )
+        self._turns = [
+            ("xyz".index(axis[1]), k, motion.step[k]) for k, axis in enumerate(motion.axes) if axis not in ("x", "y", "z", "grip")
+        ]
+        self._start = self.state().tool[0].copy()
         self.reset(range(count))
 
     @property
@@ -61,41 +79,35 @@ class ActionControl:
         """Target poses (B, 4, 4) of the tool; with ``action="joints"`` they stay where the episode began."""
         return self._target.copy()
 
-    def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool by the arm's joints: where its pad would be if it were mounted without error."""
-        return site_poses(self.world.data, self.arm.site)
-
-    def joint_speed(self) -> np.ndarray:
-        """Joint speeds (B, n) [rad/s]."""
-        return np.array([data.qvel for data in self.world.data])[:, self.arm.dof]
-
-    def opening(self) -> np.ndarray:
-        """Gap between both pads by the fingers' joints [m], (B, 1); (B, 0) without a gripper."""
-        if not self._has_grip:
-            return np.zeros((self.world.num_envs, 0))
-        fingers = self.world.composed.fingers
-        return np.array([data.qpos[fingers].sum() for data in self.world.data])[:, None]
+    def state(self) -> ToolState:
+        """Present state of tool, joints and fingers."""
+        now = self._reader.values()
+        fingers = now["fingers"]
+        opening = fingers.sum(axis=1, keepdims=True) if self._has_grip else fingers
+        return ToolState(now["tool"], now["joints"], now["speed"], opening)
 
     def reset(self, envs: Sequence[int] | range) -> None:
         """Set the targets of environments to their present poses."""
         chosen = list(envs)
-        self._target[chosen], self._turn[chosen] = self.tool()[chosen], 0.0
+        self._target[chosen], self._turn[chosen] = self.state().tool[chosen], 0.0
         self._joints[chosen] = self._posture
         opening = self.world.composed.opening
         if opening is not None:
             self._gap[chosen] = self.world.composed.ctrl[opening]
 
     def controller(self, actions: np.ndarray) -> BatchController:
-        """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1]."""
-        dt = self.world.composed.control_timestep
+        """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1].
+
+        It has no targets of its own: one that was asked for before follows the same from now on.
+        """
+        dt, now = self.world.composed.control_timestep, self.state()
         if self.action == "pose":
             before = self._target.copy()
-            self._move_pose(actions)
-            joints, speed = self._servo.targets(self.world.data, before, pose_error(self._target, before) / dt, dt)
+            self._move_pose(actions, now.tool[:, :3, 3])
+            joints, speed = self._servo.targets(self.world.data, before, self._errors((self._target, before))[0] / dt, dt)
         else:
-            present = np.array([data.qpos for data in self.world.data])[:, self.arm.qpos]
             target = self._joints + self.motion.joint_step * actions[:, : len(self.arm)]
-            target = np.clip(target, present - self.motion.joint_leash, present + self.motion.joint_leash)
+            target = np.clip(target, now.joints - self.motion.joint_leash, now.joints + self.motion.joint_leash)
             target = np.clip(target, self.arm.range[:, 0], self.arm.range[:, 1])
             joints, speed = self._joints, (target - self._joints) / dt
             self._joints = target
@@ -103,20 +115,20 @@ class ActionControl:
             step = self.motion.step[self.motion.axes.index("grip")]
             low, high = self.motion.opening
             self._gap = np.clip(self._gap + step * actions[:, -1], low, high)
-        start = np.array([data.time for data in self.world.data])
-        return _Springs(self._law, joints, speed, start, self.world.composed.opening, self._gap)
+        self._springs.aim(joints, speed, np.array([data.time for data in self.world.data]), self._gap[:, None])
+        return _Follow(self._springs)
 
-    def _move_pose(self, actions: np.ndarray) -> None:
-        motion, tool = self.motion, self.tool()[:, :3, 3]
-        position, turn = self._target[:, :3, 3], self._turn
-        for k, (axis, step) in enumerate(zip(motion.axes, motion.step, strict=True)):
-            if axis in "xyz":
-                i = "xyz".index(axis)
-                position[:, i] += step * actions[:, k]
-                position[:, i] = np.clip(position[:, i], tool[:, i] - motion.leash, tool[:, i] + motion.leash)
-                position[:, i] = np.clip(position[:, i], motion.low[i], motion.high[i])
-            elif axis != "grip":
-                turn[:, "xyz".index(axis[1])] += step * actions[:, k]
+    def _move_pose(self, actions: np.ndarray, tool: np.ndarray) -> None:
+        motion, i = self.motion, self._axes
+        tool, position = tool[:, i], self._target[:, i, 3] + self._step * actions[:, self._moves]
+        for low, high in ((tool - motion.leash, tool + motion.leash), (self._low, self._high)):
+            position = np.minimum(np.maximum(position, low), high)
+        self._target[:, i, 3] = position
+        if not self._turns:
+            return
+        turn = self._turn
+        for axis, k, step in self._turns:
+            turn[:, axis] += step * actions[:, k]
         length = np.linalg.norm(turn, axis=1)
         turn *= np.minimum(1.0, motion.turn / np.maximum(length, 1e-9))[:, None]
         turned = length > 0.0
@@ -124,27 +136,24 @@ class ActionControl:
 
 
 @dataclass(frozen=True)
-class _Springs(BatchController):
+class ToolState:
+    """Arm of B environments by its joints."""
+
+    tool: np.ndarray
+    """Poses (B, 4, 4) of the tool: where its pad would be if it were mounted without error."""
+    joints: np.ndarray
+    """Positions (B, n) [rad]."""
+    speed: np.ndarray
+    """Joint speeds (B, n) [rad/s]."""
+    opening: np.ndarray
+    """Gap between both pads by the fingers' joints [m], (B, 1); (B, 0) without a gripper."""
+
+
+@dataclass(frozen=True)
+class _Follow(BatchController):
     """Springs towards moving joint targets, and the opening of a gripper."""
 
-    law: JointImpedance
-    joints: np.ndarray
-    """Targets (B, n) at ``start``."""
-    speed: np.ndarray
-    """Speed of the targets (B, n)."""
-    start: np.ndarray
-    """Time of the step's start (B,) [s]."""
-    opening: int | None
-    """Actuator of the opening; None without a gripper."""
-    gap: np.ndarray
-    """Opening (B,) [m]."""
+    springs: JointSprings
 
     def drive(self, datas: Sequence[Any], envs: Sequence[int] | np.ndarray) -> None:
-        some, arm = [datas[b] for b in envs], self.law.arm
-        elapsed = np.array([data.time for data in some]) - self.start[envs]
-        speed = self.speed[envs]
-        torque = self.law.torques(some, self.joints[envs] + elapsed[:, None] * speed, speed).torque
-        for b, data, row in zip(envs, some, torque, strict=True):
-            arm.drive(data, row)
-            if self.opening is not None:
-                data.ctrl[self.opening] = self.gap[b]
+        self.springs.drive(envs)

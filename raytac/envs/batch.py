@@ -18,11 +18,13 @@ from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import checked_physics, scene_physics
-from raytac.se3 import inverse, pose_error, rotations
+from raytac.robots.pose_errors import PoseErrors
+from raytac.se3 import inverse, rotations
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
+from raytac.world.world_state import WorldState
 
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s] in observations."""
@@ -129,12 +131,14 @@ class TaskBatch:
         self.control = ActionControl(self.world, task.motion, action)
         self.body_seen = task.body_seen if body_seen is None else body_seen
         self.arrays = self._arrays()
-        state = self.world.state()
-        self._tool = self.control.tool()
+        state, now = self.world.state(), self.control.state()
+        self._tool, self._opening = now.tool, now.opening
         self.start_tool, self.start_body = self._tool[0].copy(), state.world_from_body[task.body][0].copy()
         self._start_pads = {name: poses[0].copy() for name, poses in state.world_from_pad.items()}
         self._body = state.world_from_body[task.body]
         self._speed, self._body_speed = np.zeros((num_envs, 3)), np.zeros((num_envs, 6))
+        self._errors = PoseErrors(num_envs, 2)
+        self._turn = np.zeros((num_envs, 3))  # of the tool from the start
         self._goal = np.zeros((num_envs, 3))
         self._steps = np.zeros(num_envs, int)
         self._action = np.zeros((num_envs, self.control.size))
@@ -208,9 +212,12 @@ class TaskBatch:
         self.control.reset(envs)
         for observer in self.observers.values():
             observer.reset(envs)
-        self._tool[envs], self._body[envs] = self.control.tool()[envs], state.world_from_body[self.task.body][envs]
+        now = self.control.state()
+        self._opening = now.opening
+        self._tool[envs], self._body[envs] = now.tool[envs], state.world_from_body[self.task.body][envs]
         self._speed[envs], self._body_speed[envs] = 0.0, 0.0
-        return self._observe(np.isin(np.arange(self.num_envs), envs))
+        self._turn = self._errors((self._tool, self.start_tool))[0, :, 3:]
+        return self._observe(np.isin(np.arange(self.num_envs), envs), state)
 
     def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> StepResult:
         """One control step of every environment.
@@ -228,12 +235,15 @@ class TaskBatch:
         done = time.perf_counter()
         self.time_s["physics"] += done - start
         failed = state.failed
-        sound = ~failed[:, None]
-        tool, body = self.control.tool(), state.world_from_body[self.task.body]
+        now, body, wrench = self.control.state(), state.world_from_body[self.task.body], state.wrench
+        tool, joint_speed, self._opening = now.tool, now.speed, now.opening
+        if failed.any():
+            # An environment that failed keeps its last poses.
+            tool[failed], body[failed], joint_speed[failed] = self._tool[failed], self._body[failed], 0.0
+            wrench = {name: np.nan_to_num(values) for name, values in wrench.items()}
         dt = self.control_timestep
-        # An environment that failed keeps its last poses.
-        tool, body = np.where(sound[..., None], tool, self._tool), np.where(sound[..., None], body, self._body)
-        self._speed, self._body_speed = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, pose_error(body, self._body) / dt
+        moved, turned = self._errors((body, self._body), (tool, self.start_tool))
+        self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
         self._tool, self._body = tool, body
         last, self._action = self._action, actions
         self._steps += 1
@@ -243,19 +253,22 @@ class TaskBatch:
             body=self._body,
             body_speed=self._body_speed,
             goal=self._goal,
-            wrench={name: np.nan_to_num(wrench) for name, wrench in state.wrench.items()},
-            joint_speed=np.where(sound, self.control.joint_speed(), 0.0),
+            wrench=wrench,
+            joint_speed=joint_speed,
             action=actions,
             last_action=last,
         )
         judged = time.perf_counter()
-        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen)
+        observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen, state)
         failed = self.world.failed  # includes failures that only the pad's surface shows
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
         result = self.task.evaluate(task_state)
-        terms = {name: np.where(failed, 0.0, np.asarray(term, float)) for name, term in result.terms.items()}
-        reward = np.sum(list(terms.values()), axis=0)
+        nothing = np.zeros(self.num_envs)
+        terms = {name: nothing + term for name, term in result.terms.items()}
+        if failed.any():
+            terms = {name: np.where(failed, 0.0, term) for name, term in terms.items()}
+        reward = sum(terms.values(), nothing)
         terminated = result.terminated & ~failed
         truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
         self.time_s["reward"] += time.perf_counter() - judged
@@ -272,12 +285,15 @@ class TaskBatch:
             specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
         return specs
 
-    def _observe(self, which: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading."""
+    def _observe(self, which: np.ndarray, state: WorldState) -> dict[str, np.ndarray]:
+        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading.
+
+        ``state``: present state of the world.
+        """
         tool, body, goal = self._tool, self._body, self._goal
-        position, turn = tool[:, :3, 3], pose_error(tool, self.start_tool)[:, 3:]
-        moved, gap = (position - self.start_tool[:3, 3]) / _LENGTH, self.control.opening() / _LENGTH
-        parts = [moved, turn, self._speed / _SPEED, gap, self._action]
+        position = tool[:, :3, 3]
+        moved, gap = (position - self.start_tool[:3, 3]) / _LENGTH, self._opening / _LENGTH
+        parts = [moved, self._turn, self._speed / _SPEED, gap, self._action]
         result = {"state": np.concatenate(parts, axis=1), "goal": (goal - position) / _LENGTH}
         if self.body_seen:
             axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)
@@ -286,10 +302,9 @@ class TaskBatch:
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
         needs_frames = any(observer.settings.needs_frames for observer in self.observers.values())
         frames = self.world.observe(envs=rows) if needs_frames and which.any() else {}
-        state = self.world.state() if self.observers and not needs_frames else None
         for name, observer in self.observers.items():
             sensor = self.world.sensors[name] if observer.settings.difference else None
-            if state is not None:
+            if not needs_frames:
                 values = observer.observe_wrench(state.wrench[name], state.failed, which)
             else:
                 values = observer.observe(frames[name], sensor, rows) if frames else observer.last()
@@ -306,7 +321,7 @@ class TaskBatch:
         if not self._begun.all():
             env = int(np.flatnonzero(~self._begun)[0])
             raise InputError("environment", value=env, rule="must be reset before it is stepped")
-        return np.clip(values, -1.0, 1.0)
+        return np.minimum(np.maximum(values, -1.0), 1.0)
 
 
 def _sensor_seed(seed: int, sensor: int) -> int:

@@ -206,9 +206,8 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
             actions = actions.copy()
             actions[late] = 0.0
         out = self.batch.step(actions, np.isin(np.arange(self.num_envs), late) if len(late) else None)
-        observation, terms = out.observation, {name: term.copy() for name, term in out.terms.items()}
-        reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
-        success, failed = out.success.copy(), out.failed.copy()
+        observation, terms, reward = out.observation, out.terms, out.reward
+        terminated, truncated, success, failed = out.terminated, out.truncated, out.success, out.failed
         if len(late):
             observation = self._reset(late)
             for values in (reward, terminated, truncated, success, failed, *terms.values()):
@@ -357,7 +356,8 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
     """Entries with the masks that Gymnasium's vectors put beside them: the environments that have the entry."""
     result: dict[str, Any] = {}
+    everywhere = np.ones(num_envs, bool)
     for name, value in values.items():
         result[name] = _infos(num_envs, value) if isinstance(value, dict) else value
-        result[f"_{name}"] = np.ones(num_envs, bool)
+        result[f"_{name}"] = everywhere.copy()
     return result

@@ -9,6 +9,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.robots.frames import world_from_site
+from raytac.robots.states import Numbers, numbers, site_pose
 
 
 class Arm:
@@ -22,6 +23,7 @@ class Arm:
         range: limits (n, 2) of the joints [rad or m]; ±inf where MuJoCo has none.
         motors: indices (n,) of the actuators that apply a torque to these joints, or None if some joint has none; ``ctrl`` is then
             the torque [N·m] or force [N].
+        slides: True (n,) for slides.
         torque_limit: least and greatest output (n, 2) of these actuators; None if ``motors`` is None.
     """
 
@@ -37,7 +39,7 @@ class Arm:
         if not joints or len(set(joints)) != len(joints):
             raise InputError("joints", value=tuple(joints), rule="must name one joint or more, none twice")
         ids = np.array([_index(model, mujoco.mjtObj.mjOBJ_JOINT, "joints", name) for name in joints])
-        self.joints = tuple(joints)
+        self.joints, self._ids = tuple(joints), ids
         for name, kind in zip(joints, model.jnt_type[ids], strict=True):
             if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
                 raise InputError("joints", value=name, rule="must be a hinge or a slide")
@@ -49,6 +51,7 @@ class Arm:
                 )
         self.qpos, self.dof = model.jnt_qposadr[ids].copy(), model.jnt_dofadr[ids].copy()
         self.range = np.where(model.jnt_limited[ids, None] == 1, model.jnt_range[ids], (-np.inf, np.inf))
+        self.slides = model.jnt_type[ids] == int(mujoco.mjtJoint.mjJNT_SLIDE)
         self.motors = _motors(model, ids)
         self.torque_limit = None if self.motors is None else _limits(model, self.motors)
 
@@ -71,12 +74,32 @@ class Arm:
         mujoco.mj_fullM(self.model, data, full)
         return full[np.ix_(self.dof, self.dof)]
 
-    def inertial(self, data: mujoco.MjData, acceleration: np.ndarray) -> np.ndarray:
-        """M q̈ (n,) [N·m] for ``acceleration`` (n,) [rad/s²]; cheaper than the matrix."""
-        full, torque = np.zeros(self.model.nv), np.zeros(self.model.nv)
-        full[self.dof] = acceleration
-        mujoco.mj_mulM(self.model, data, torque, full)
-        return torque[self.dof]
+    def numbers(self) -> dict[str, Numbers]:
+        """Numbers of this arm in a state, for a ``StateReader``.
+
+        ``joints``, ``speed``, ``bias`` (n,), ``mass`` (n, n), ``anchor``, ``axis`` (n, 3) of the joints, world axes, and ``site`` (4, 4).
+        """
+        vectors = 3 * self._ids[:, None] + np.arange(3)
+        return {
+            "joints": numbers("qpos", self.qpos),
+            "speed": numbers("qvel", self.dof),
+            "bias": numbers("qfrc_bias", self.dof),
+            "mass": numbers("M", self._mass_index()),
+            "anchor": numbers("xanchor", vectors),
+            "axis": numbers("xaxis", vectors),
+            "site": site_pose(self.site),
+        }
+
+    def _mass_index(self) -> np.ndarray:
+        """Index (n, n) into ``data.M``, MuJoCo's lower triangle of the inertia by rows; −1 for joints on different branches."""
+        model, index = self.model, np.full((len(self), len(self)), -1)
+        for i, row in enumerate(self.dof):
+            start = int(model.M_rowadr[row])
+            columns = model.M_colind[start : start + int(model.M_rownnz[row])].tolist()
+            for k, column in enumerate(self.dof.tolist()):
+                if column in columns:
+                    index[i, k] = index[k, i] = start + columns.index(column)
+        return index
 
     def bias(self, data: mujoco.MjData) -> np.ndarray:
         """C(q, q̇) q̇ + g(q) (n,) [N·m]: at rest, the torques that balance gravity."""
@@ -87,11 +110,15 @@ class Arm:
 
         Raises ``InputError`` if a joint has no torque motor or a torque is not finite.
         """
-        if self.motors is None:
-            raise InputError("joints", value=self.joints, rule="must all have a torque motor (<motor joint=…>) to be driven")
+        self.check_motors()
         if np.shape(torque) != (len(self),) or not np.isfinite(torque).all():
             raise InputError("torque", value=np.asarray(torque).tolist(), rule=f"must be {len(self)} finite numbers")
         data.ctrl[self.motors] = torque
+
+    def check_motors(self) -> None:
+        """Raise ``InputError`` if a joint has no torque motor."""
+        if self.motors is None:
+            raise InputError("joints", value=self.joints, rule="must all have a torque motor (<motor joint=…>) to be driven")
 
 
 def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, argument: str, name: str) -> int:

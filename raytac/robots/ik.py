@@ -30,11 +30,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import warp as wp
 
 from raytac.errors import BackendError, InputError
 from raytac.robots.arm import Arm
-from raytac.robots.frames import site_poses
-from raytac.se3 import check_pose, pose_error, quaternion
+from raytac.robots.arm_kernels import Servo, servo_step
+from raytac.robots.states import StateReader
+from raytac.se3 import check_pose, pose_error
 
 _STRIDE = 0.1
 """Duration [s] of each step of ``reach``: at 2 rad/s, a fifth of a radian."""
@@ -178,7 +180,10 @@ class DifferentialIk:
             raise InputError("qpos", value=np.asarray(qpos).tolist(), rule=f"must be {model.nq} finite numbers, the model's qpos")
         target = check_pose("world_from_target", world_from_target)
         self._configuration.update(np.array(qpos, float))
-        self._frame.set_target(mink.SE3(np.concatenate([quaternion(target[:3, :3]), target[:3, 3]])))
+        aim = np.empty(7)
+        mujoco.mju_mat2Quat(aim[:4], target[:3, :3].ravel())
+        aim[4:] = target[:3, 3]
+        self._frame.set_target(mink.SE3(aim))
         posture = np.array(qpos, float)
         posture[self.arm.qpos] = self.posture
         self._posture_task.set_target(posture)
@@ -228,8 +233,10 @@ class PoseServo:
         for name, value in (("posture_gain", posture_gain), ("damping", damping)):
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(name, value=value, rule="must be 0 or more, and finite")
-        self.arm, self._speed = arm, np.broadcast_to(speed, (n,)).copy()
+        self.arm = arm
+        self._speed = np.broadcast_to(speed, (n,)).copy()
         self._posture, self._gain, self._damping = posture, posture_gain, damping
+        self._latest: _ServoBatch | None = None
 
     def targets(
         self, datas: Sequence[mujoco.MjData], world_from_target: np.ndarray, twist: np.ndarray, duration: float
@@ -237,27 +244,66 @@ class PoseServo:
         """Joint positions and velocities, each (B, n), with which the sites follow moving targets.
 
         Args:
-            datas: states, kinematics up to date (``mj_kinematics`` and ``mj_comPos``, or any step).
+            datas: states, kinematics up to date (``mj_kinematics``, or any step).
             world_from_target: present targets (B, 4, 4).
             twist: their velocity and angular velocity (B, 6) [m/s, rad/s], world axes.
             duration: time [s] in which the present error is removed.
 
         Positions are targets at the present time, within the joints' ranges; add velocities times the time since.
         """
-        arm = self.arm
-        q = np.stack([data.qpos[arm.qpos] for data in datas])
-        jacobian = np.stack([arm.jacobian(data) for data in datas])
-        error = pose_error(world_from_target, site_poses(datas, arm.site))
-        transposed = np.swapaxes(jacobian, -1, -2)
-        gram = jacobian @ transposed + self._damping**2 * np.eye(6)
-        posture_step = np.zeros_like(q) if self._posture is None else self._gain * (self._posture - q)
-        # The motion of the site by the step towards the posture is subtracted.
-        error = error - (jacobian @ posture_step[..., None])[..., 0]
-        solved = transposed @ np.linalg.solve(gram, np.stack([error, twist], axis=-1))
-        step, velocity = solved[..., 0] + posture_step, solved[..., 1]
-        step_excess = np.maximum((np.abs(step) / (self._speed * duration)).max(axis=-1, keepdims=True), 1.0)
-        velocity_excess = np.maximum((np.abs(velocity) / self._speed).max(axis=-1, keepdims=True), 1.0)
-        return np.clip(q + step / step_excess, arm.range[:, 0], arm.range[:, 1]), velocity / velocity_excess
+        # Where their numbers lie is looked up once for states that are asked about again and again.
+        if self._latest is None or not self._latest.reader.reads(datas):
+            self._latest = _ServoBatch(self.arm, datas, self._speed, self._posture, self._gain, self._damping)
+        return self._latest.targets(world_from_target, twist, duration)
+
+
+class _ServoBatch:
+    """Arrays of ``PoseServo`` for B states, and its kernel."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        datas: Sequence[mujoco.MjData],
+        fastest: np.ndarray,
+        posture: np.ndarray | None,
+        gain: float,
+        damping: float,
+    ) -> None:
+        count, n = len(datas), len(arm)
+        names = "joints", "anchor", "axis", "site"
+        self.reader = StateReader(datas, {name: one for name, one in arm.numbers().items() if name in names})
+        servo = Servo()
+        servo.joints, servo.anchor, servo.axis, servo.site = (self.reader.arrays[name] for name in names)
+        servo.slides = wp.array(arm.slides, dtype=wp.int32, device="cpu")
+        servo.range, servo.fastest = _numbers(arm.range), _numbers(fastest)
+        servo.posture = _numbers(np.zeros(n) if posture is None else posture)
+        servo.gain, servo.damping = 0.0 if posture is None else gain, damping
+        work = {
+            "target": (4, 4),
+            "twist": (6,),
+            "jacobian": (n, 6),
+            "gram": (6, 6),
+            "side": (2, 6),
+            "step": (n,),
+            "velocity": (n,),
+        }
+        for name, size in work.items():
+            setattr(servo, name, _numbers(np.zeros((count, *size))))
+        servo.duration = _numbers(np.zeros(1))
+        self._target, self._twist, self._duration = servo.target.numpy(), servo.twist.numpy(), servo.duration.numpy()
+        self._results = servo.step.numpy(), servo.velocity.numpy()
+        self._step: Any = wp.launch(servo_step, dim=count, inputs=[servo], device="cpu", record_cmd=True)
+
+    def targets(self, world_from_target: np.ndarray, twist: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+        self._target[:], self._twist[:], self._duration[:] = world_from_target, twist, duration
+        self.reader.read()
+        self._step.launch()
+        step, velocity = self._results
+        return step.copy(), velocity.copy()
+
+
+def _numbers(values: np.ndarray) -> Any:
+    return wp.array(values, dtype=wp.float64, device="cpu")
 
 
 def _mink() -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.robots.arm import Arm
+from raytac.robots.joint_springs import JointSprings
 from raytac.se3 import check_pose, pose_error
 
 _SINGULAR = 1e-3
@@ -132,6 +133,11 @@ class JointImpedance:
             if not (math.isfinite(value) and value >= 0.0):
                 raise InputError(name, value=value, rule="must be 0 or more, and finite")
         self.arm, self._frequency, self._ratio = arm, frequency, damping_ratio
+        self._latest: JointSprings | None = None
+
+    def springs(self, datas: Sequence[mujoco.MjData], others: Sequence[int] = ()) -> JointSprings:
+        """The same springs for states that are driven in every step; ``others``: actuators that are commanded beside the motors."""
+        return JointSprings(self.arm, datas, frequency=self._frequency, damping_ratio=self._ratio, others=others)
 
     def torque(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
         """Torques towards positions ``joints`` (n,) [rad] that move with ``velocity`` (n,) [rad/s]; None: 0.
@@ -144,19 +150,17 @@ class JointImpedance:
 
     def torques(self, datas: Sequence[mujoco.MjData], joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
         """Torques for B states, each array (B, n)."""
-        arm = self.arm
-        q, speed = (
-            np.array(values)[:, index]
-            for values, index in (([d.qpos for d in datas], arm.qpos), ([d.qvel for d in datas], arm.dof))
-        )
-        velocity = np.zeros_like(q) if velocity is None else velocity
+        shape = len(datas), len(self.arm)
+        velocity = np.zeros(shape) if velocity is None else velocity
         for name, value in (("joints", joints), ("velocity", velocity)):
-            if np.shape(value) != q.shape or not np.isfinite(value).all():
-                rule = f"must be {len(arm)} finite numbers, of every state"
+            if np.shape(value) != shape or not np.isfinite(value).all():
+                rule = f"must be {len(self.arm)} finite numbers, of every state"
                 raise InputError(name, value=np.asarray(value).tolist(), rule=rule)
-        acceleration = self._frequency**2 * (joints - q) + 2.0 * self._ratio * self._frequency * (velocity - speed)
-        inertial = np.array([arm.inertial(data, row) for data, row in zip(datas, acceleration, strict=True)])
-        return _joint_torque(arm, inertial + np.array([data.qfrc_bias for data in datas])[:, arm.dof])
+        # Where their numbers lie is looked up once for states that are asked about again and again.
+        if self._latest is None or not self._latest.is_for(datas):
+            self._latest = self.springs(datas)
+        self._latest.aim(joints, velocity, np.array([data.time for data in datas]))
+        return _joint_torque(self.arm, self._latest.torque().copy())
 
 
 def _joint_torque(arm: Arm, torque: np.ndarray) -> JointTorque:

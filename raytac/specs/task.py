@@ -205,7 +205,7 @@ class TaskScene:
     pad: str | None = None
     """One of ``raytac.specs.press.PADS``; None leaves it to the user."""
     timestep: float = 0.002
-    """Of MuJoCo [s]."""
+    """Of MuJoCo [s]; beside soft pads it is at most half of ``soft_timestep``."""
     soft_timestep: float = 0.01
     """Of the soft pads [s], a whole multiple of ``timestep``."""
     control_timestep: float = 0.01

@@ -158,9 +158,9 @@ class SoftPads:
         Raises:
             InputError: the only environment moves too fast; it has failed then, until it is reset.
         """
-        scene = self._scene
-        interval, since, reports = round(scene.soft_timestep / scene.timestep), 0, []
-        steps = round(scene.control_timestep / scene.timestep)
+        scene, timestep = self._scene, self.composed.timestep
+        interval, since, reports = round(scene.soft_timestep / timestep), 0, []
+        steps = round(scene.control_timestep / timestep)
         for step in range(1, steps + 1):
             for b, data in enumerate(datas):
                 if not failed[b]:
@@ -172,10 +172,10 @@ class SoftPads:
                 self._coupling is not None
                 and since < interval
                 and step < steps
-                and not self.soft.is_small(cases, driven, since * scene.timestep)
+                and not self.soft.is_small(cases, driven, since * timestep)
             )
             if since == interval or step == steps or early:
-                reports.append(self._follow(datas, failed, cases, driven, since * scene.timestep))
+                reports.append(self._follow(datas, failed, cases, driven, since * timestep))
                 since = 0
         whole = reduce(SceneReport.then, reports)
         failed |= ~whole.last_converged

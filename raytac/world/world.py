@@ -18,8 +18,8 @@ from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
-from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.impedance import JointImpedance
+from raytac.robots.states import Numbers, StateReader, body_pose, site_pose
 from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
 from raytac.specs.task import COUPLINGS, TaskScene
@@ -160,7 +160,13 @@ class TactileWorld:
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
-        self._law = None if self.arm is None or self.arm.motors is None else JointImpedance(self.arm)
+        self._reader = StateReader(self.data, self._numbers())
+        self._law, self._holding = None, None
+        if self.scene is not None and self.arm is not None and self.arm.motors is not None:
+            self._law = JointImpedance(self.arm)
+            others = np.setdiff1d(np.arange(self.model.nu), self.arm.motors)
+            self._holding = self._law.springs(self.data, others.tolist())
+            self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
         self._failed = np.zeros(num_envs, bool)
         self._start_over(range(num_envs))
         if self.physics.is_simulated:
@@ -318,16 +324,21 @@ class TactileWorld:
 
     def state(self) -> WorldState:
         """Present state of all environments."""
-        arm, lost = self.arm, self._failed
-        pads = {m.name: site_poses(self.data, int(self.model.site(m.site).id)) for m in self.composed.sensors}
-        bodies = {name: body_poses(self.data, body.index) for name, body in self.composed.bodies.items()}
-        joints = None if arm is None else np.array([d.qpos for d in self.data])[:, arm.qpos]
-        for values in (*pads.values(), *bodies.values(), *(() if joints is None else (joints,))):
-            values[lost] = np.nan
-        wrench = {name: np.where(lost[:, None], np.nan, self._pads.wrench(name)) for name in self.sensor_names}
-        return WorldState(
-            np.array([d.time for d in self.data]), joints, pads, bodies, wrench, lost.copy(), dict(self._pads.report)
-        )
+        now, lost = self._reader.values(), self._failed
+        wrench = {name: self._pads.wrench(name) for name in self.sensor_names}
+        if lost.any():
+            for values in (*now.values(), *wrench.values()):
+                values[lost] = np.nan
+        pads = {name: now[f"pad {name}"] for name in self.sensor_names}
+        bodies = {name: now[f"body {name}"] for name in self.composed.bodies}
+        time = np.array([d.time for d in self.data])
+        return WorldState(time, now.get("joints"), pads, bodies, wrench, lost.copy(), dict(self._pads.report))
+
+    def _numbers(self) -> dict[str, Numbers]:
+        """Numbers that ``state`` reads of every environment."""
+        read = {f"pad {m.name}": site_pose(int(self.model.site(m.site).id)) for m in self.composed.sensors}
+        read |= {f"body {name}": body_pose(body.index) for name, body in self.composed.bodies.items()}
+        return read if self.arm is None else read | {"joints": self.arm.numbers()["joints"]}
 
     def observe(
         self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
@@ -377,6 +388,8 @@ class TactileWorld:
                     self.data[b].ctrl[:] = rows[b]
 
             return write
+        if self._holding is not None and control == self.hold:
+            return self._holding.drive
         each = [control] * self.num_envs if callable(control) else list(control)
         if len(each) != self.num_envs:
             raise InputError("control", value=len(each), rule=f"must be one controller, or one for each of {self.num_envs}")

@@ -44,7 +44,7 @@ def test_bodies_and_mounts_are_drawn_at_every_reset_of_an_environment() -> None:
     assert (np.abs(first[:, :6] - 1.0) <= [0.3, 0.2, 0.2, 0.2, 0.2, 0.2]).all() and np.abs(first[:, 6:9]).max() <= 1e-3
     assert 0.0 < np.abs(first[:, 9:]).max() <= 0.0201
     np.testing.assert_allclose(first[:, 1], first[:, 2])
-    assert np.abs(batch.control.tool() - batch.start_tool).max() < 1e-9, "the arm knows nothing of it"
+    assert np.abs(batch.control.state().tool - batch.start_tool).max() < 1e-9, "the arm knows nothing of it"
     batch.reset([1], streams[1:2])
     second = drawn()
     assert (second[[0, 2, 3]] == first[[0, 2, 3]]).all() and (second[1] != first[1]).all()

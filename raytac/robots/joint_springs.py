@@ -1,0 +1,78 @@
+"""Springs in the joints of one arm in B states: aimed once a control step, driven in every step of MuJoCo by three kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from raytac.errors import InputError
+from raytac.robots.arm import Arm
+from raytac.robots.arm_kernels import Springs, joint_springs
+from raytac.robots.states import ControlWriter, StateReader
+
+_READ = ("joints", "speed", "bias", "mass")
+
+
+class JointSprings:
+    """The law of ``JointImpedance`` for the states that it is made for."""
+
+    def __init__(
+        self, arm: Arm, datas: Sequence[mujoco.MjData], *, frequency: float, damping_ratio: float, others: Sequence[int] = ()
+    ) -> None:
+        """Springs of ``frequency`` [rad/s] and ``damping_ratio`` that hold no target yet.
+
+        ``others``: actuators that are commanded beside the arm's motors.
+        """
+        self.arm, self._datas = arm, tuple(datas)
+        count, n = len(self._datas), len(arm)
+        self._reader = StateReader(self._datas, {name: one for name, one in arm.numbers().items() if name in _READ})
+        self._writer = None if arm.motors is None else ControlWriter(self._datas, [*arm.motors.tolist(), *others])
+        springs = Springs()
+        springs.joints, springs.speed, springs.bias, springs.mass = (self._reader.arrays[name] for name in _READ)
+        springs.target, springs.target_speed = (wp.zeros((count, n), dtype=wp.float64, device="cpu") for _ in range(2))
+        springs.elapsed = wp.zeros(count, dtype=wp.float64, device="cpu")
+        springs.stiffness, springs.damping = frequency**2, 2.0 * damping_ratio * frequency
+        if self._writer is None:
+            springs.torque = wp.zeros((count, n), dtype=wp.float64, device="cpu")
+        else:
+            springs.torque = self._writer.controls
+        self._target, self._speed = springs.target.numpy(), springs.target_speed.numpy()
+        self._elapsed, controls = springs.elapsed.numpy(), springs.torque.numpy()
+        self._torque, self._others = controls[:, :n], controls[:, n:]
+        self._start = np.zeros(count)
+        self._law: Any = wp.launch(joint_springs, dim=(count, n), inputs=[springs], device="cpu", record_cmd=True)
+
+    def is_for(self, datas: Sequence[mujoco.MjData]) -> bool:
+        """True if it was made for these states."""
+        return self._reader.reads(datas)
+
+    def aim(self, joints: np.ndarray, speed: np.ndarray, start: np.ndarray, others: np.ndarray | float = 0.0) -> None:
+        """Set targets ``joints`` (B, n) at the times ``start`` (B,) [s], which move with ``speed`` (B, n).
+
+        ``others`` (B, k): controls of the other actuators.
+        """
+        self._target[:], self._speed[:], self._start[:], self._others[:] = joints, speed, start, others
+
+    def torque(self) -> np.ndarray:
+        """Torques (B, n) [N·m] for the present states; the array is overwritten by the next call."""
+        np.subtract([data.time for data in self._datas], self._start, out=self._elapsed)
+        self._reader.read()
+        self._law.launch()
+        return self._torque
+
+    def drive(self, envs: Sequence[int] | np.ndarray) -> None:
+        """Command the motors of environments, and the other actuators.
+
+        Raises ``InputError`` if a joint has no torque motor or a control is not finite; nothing is written then.
+        """
+        if self._writer is None:
+            self.arm.check_motors()
+            return
+        self.torque()
+        wrong = self._writer.write(envs)
+        if wrong is not None:
+            raise InputError("torque", value=wrong.tolist(), rule=f"must be {wrong.size} finite numbers")

@@ -1,0 +1,35 @@
+"""Differences of many poses by one kernel: dozens of them take NumPy as long as a step of MuJoCo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from raytac.physics.rigid.warp_cache import start_warp
+from raytac.robots.arm_kernels import pose_errors
+
+
+class PoseErrors:
+    """``se3.pose_error`` of ``pairs`` times B poses, B fixed."""
+
+    def __init__(self, count: int, pairs: int = 1) -> None:
+        """Arrays of ``count`` B poses, ``pairs`` times."""
+        start_warp()
+        size = count * pairs
+        a, b = (wp.zeros((size, 4, 4), dtype=wp.float64, device="cpu") for _ in range(2))
+        error = wp.zeros((size, 6), dtype=wp.float64, device="cpu")
+        self._a, self._b = (array.numpy().reshape(pairs, count, 4, 4) for array in (a, b))
+        self._error = error.numpy().reshape(pairs, count, 6)
+        self._launch: Any = wp.launch(pose_errors, dim=size, inputs=[a, b], outputs=[error], device="cpu", record_cmd=True)
+
+    def __call__(self, *pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Displacements (pairs, B, 6) from the second pose of each pair to the first, world axes.
+
+        Poses (B, 4, 4), or (4, 4) of one for all.
+        """
+        for k, (a, b) in enumerate(pairs):
+            self._a[k], self._b[k] = a, b
+        self._launch.launch()
+        return self._error.copy()

@@ -1,0 +1,170 @@
+"""Numbers of many states of MuJoCo at once: read into arrays over environments, and written back, by one kernel each.
+
+MuJoCo keeps every state in memory of its own, and a call from Python for each number of each state takes longer than its own step. The
+arrays that are named here stay where they are as long as the state lives, so that their places are looked up once.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from raytac.errors import InputError
+from raytac.physics.rigid.warp_cache import start_warp
+from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
+
+_CONSTANT = -1
+"""Member of an entry that is its index itself, as a number."""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Some numbers of a state, in the shape that an array of them has."""
+
+    name: tuple[str, ...]
+    """Member of ``MjData`` of every entry; "" for a constant."""
+    index: tuple[int, ...]
+    """Its index in that member as a flat array, or the constant itself."""
+    shape: tuple[int, ...]
+
+
+def numbers(name: str, index: np.ndarray) -> Numbers:
+    """Entries ``index`` (…) of a member of ``MjData``, as a flat array; 0 where an index is negative."""
+    flat = np.asarray(index, int).ravel().tolist()
+    return Numbers(tuple(name if i >= 0 else "" for i in flat), tuple(max(i, 0) for i in flat), np.shape(index))
+
+
+def site_pose(site: int) -> Numbers:
+    """Pose (4, 4) of a site by its index."""
+    return _pose("site_xmat", "site_xpos", site)
+
+
+def body_pose(body: int) -> Numbers:
+    """Pose (4, 4) of a body by its index."""
+    return _pose("xmat", "xpos", body)
+
+
+def _pose(turn: str, place: str, i: int) -> Numbers:
+    name, index = [""] * 16, [0] * 15 + [1]
+    for row in range(3):
+        for column in range(3):
+            name[4 * row + column], index[4 * row + column] = turn, 9 * i + 3 * row + column
+        name[4 * row + 3], index[4 * row + 3] = place, 3 * i + row
+    return Numbers(tuple(name), tuple(index), (4, 4))
+
+
+class StateReader:
+    """Numbers of B states, read together.
+
+    Attributes:
+        arrays: Warp arrays (B, …) of float64 by name; they are overwritten by the next ``read``.
+    """
+
+    def __init__(self, datas: Sequence[mujoco.MjData], members: Mapping[str, Numbers]) -> None:
+        """Look up where ``members`` of ``datas`` lie; nothing is read yet.
+
+        Raises ``InputError`` for what is no array of float64 of fixed size, or for an index beyond it.
+        """
+        start_warp()
+        self._datas = tuple(datas)
+        for one in members.values():
+            _check(self._datas, one)
+        count = len(self._datas)
+        names = sorted({name for one in members.values() for name in one.name if name})
+        member, index, start, stride = [], [], [], []
+        size = 0
+        self._parts: dict[str, tuple[slice, tuple[int, ...]]] = {}
+        for key, one in members.items():
+            width = len(one.index)
+            member += [names.index(name) if name else _CONSTANT for name in one.name]
+            index += one.index
+            start += range(size, size + width)
+            stride += [width] * width
+            self._parts[key] = slice(size, size + count * width), (count, *one.shape)
+            size += count * width
+        self._flat = wp.zeros(size, dtype=wp.float64, device="cpu")
+        self._values = self._flat.numpy()
+        self.arrays: dict[str, Any] = {
+            key: wp.array(ptr=self._flat.ptr + part.start * 8, shape=shape, dtype=wp.float64, device="cpu")
+            for key, (part, shape) in self._parts.items()
+        }
+        places = np.array([[_place(getattr(data, name)) for name in names] for data in self._datas], np.uint64)
+        entries = Entries()
+        entries.places, entries.values = wp.array(places, dtype=wp.uint64, device="cpu"), self._flat
+        for name, column in (("member", member), ("index", index), ("start", start), ("stride", stride)):
+            setattr(entries, name, wp.array(column, dtype=wp.int32, device="cpu"))
+        self._read: Any = wp.launch(read_numbers, dim=count, inputs=[entries], device="cpu", record_cmd=True)
+
+    def reads(self, datas: Sequence[mujoco.MjData]) -> bool:
+        """True if it reads these states."""
+        return len(datas) == len(self._datas) and all(map(operator.is_, datas, self._datas))
+
+    def read(self) -> None:
+        """Read all numbers into ``arrays``."""
+        self._read.launch()
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Read all numbers; new NumPy arrays (B, …) by name."""
+        self._read.launch()
+        copied = self._values.copy()
+        return {key: copied[part].reshape(shape) for key, (part, shape) in self._parts.items()}
+
+
+class ControlWriter:
+    """Writes some controls of B states together.
+
+    Attributes:
+        controls: Warp array (B, n), the next controls.
+    """
+
+    def __init__(self, datas: Sequence[mujoco.MjData], actuators: Sequence[int] | np.ndarray) -> None:
+        """Look up the controls of ``actuators`` (n,) in ``datas``."""
+        start_warp()
+        self._datas = tuple(datas)
+        count = len(self._datas)
+        self.controls = wp.zeros((count, len(actuators)), dtype=wp.float64, device="cpu")
+        self._values = self.controls.numpy()
+        self._chosen = wp.zeros(count, dtype=wp.int32, device="cpu")
+        self._mask = self._chosen.numpy()
+        places = wp.array([_place(data.ctrl) for data in self._datas], dtype=wp.uint64, device="cpu")
+        inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
+        self._write: Any = wp.launch(write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu", record_cmd=True)
+
+    def writes(self, datas: Sequence[mujoco.MjData]) -> bool:
+        """True if it writes to these states."""
+        return len(datas) == len(self._datas) and all(map(operator.is_, datas, self._datas))
+
+    def write(self, envs: Sequence[int] | np.ndarray) -> np.ndarray | None:
+        """Write the controls of environments; returns those of the first one in which they are not finite, and writes nothing then."""
+        chosen = self._values if len(envs) == len(self._datas) else self._values[envs]
+        # One number that is not finite makes the sum such.
+        if not np.isfinite(chosen.sum()):
+            return next(row for row in chosen if not np.isfinite(row).all())
+        self._mask[:] = 0
+        self._mask[envs] = 1
+        self._write.launch()
+        return None
+
+
+def _check(datas: Sequence[mujoco.MjData], entries: Numbers) -> None:
+    last: dict[str, int] = {}
+    for name, index in zip(entries.name, entries.index, strict=True):
+        if name:
+            last[name] = max(index, last.get(name, 0))
+    for name, index in last.items():
+        for data in datas:
+            values = getattr(data, name)
+            known = isinstance(values, np.ndarray) and values.dtype == float and not name.startswith(("efc_", "contact"))
+            if not known or index >= values.size:
+                raise InputError("numbers", value=(name, index), rule="must be of float64 members of fixed size, and within them")
+
+
+def _place(values: np.ndarray) -> int:
+    """Address of an array."""
+    return int(values.__array_interface__["data"][0])
