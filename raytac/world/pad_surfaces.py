@@ -26,7 +26,7 @@ class _Shown:
 
     grid: PadGrid
     surround: ElasticSurround
-    under: Undersides
+    undersides: Undersides
 
 
 class PadSurfaces:
@@ -72,12 +72,12 @@ class PadSurfaces:
         """
         if name not in self._shown or self._shown[name].grid is not grid:
             num_envs = len(self._pressed[name])
-            under = Undersides(grid, self._gelpads[name].thickness, self._bodies, num_envs=num_envs)
-            self._shown[name] = _Shown(grid, ElasticSurround(grid), under)
+            undersides = Undersides(grid, self._gelpads[name].thickness, self._bodies, num_envs=num_envs)
+            self._shown[name] = _Shown(grid, ElasticSurround(grid), undersides)
         shown, count, gelpad = self._shown[name], len(pad_from_body), self._gelpads[name]
-        found = shown.under.of(pad_from_body, ~failed)
-        height, depth = found.height, found.depth
-        for row, i in np.argwhere(found.behind).tolist():
+        under = shown.undersides.of(pad_from_body, ~failed)
+        height, depth = under.height, under.depth
+        for row, i in np.argwhere(under.behind).tolist():
             if self._faces[name].pierced(self._bodies[i], pad_from_body[row : row + 1, i], float(self._radius[i]))[0]:
                 height[row], depth[row, i] = np.nan, -np.inf
         poses, pressed = np.full((count, 4, 4), np.nan), np.full(count, -1)

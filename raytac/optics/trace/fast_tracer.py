@@ -47,6 +47,10 @@ class FastTracer(Tracer):
         """True if shadows are cast."""
         return casts_shadows(self.sensor, self.config.shadows)
 
+    @property
+    def _crops(self) -> bool:
+        return self.config.flat_field is None  # which is taken of the whole image
+
     def _build(self, grid: PadGrid) -> FastArrays:
         mi, bounce = self.mi, None
         lamps = [Lamp.from_spec(mi, led) for led in self.sensor.lights.leds]
@@ -56,10 +60,10 @@ class FastTracer(Tracer):
             bounce = BounceField.build(mi, self.layout, case)
         self._arrays = FastArrays(lamps, bounce, [])
         self._set_flat_field(grid)
-        return replace(self._arrays, scale=self.response.device_scale(mi))
+        return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
-        width, height = self.camera.resolution
+        width, height = self.camera.size
         layout, channels = CoatLayout.from_grid(grid), 3 * len(self.layer_names)
         # A pixel's levels before and after they are interleaved, and in bytes; a channel each.
         pixel = 27 * ("rgb" in self.outputs) + 4 * channels * ("layers" in self.outputs)

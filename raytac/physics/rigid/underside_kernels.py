@@ -203,11 +203,11 @@ def join_rows(
             most, any_ = wp.max(most, depth[env, row, body]), wp.max(any_, behind[env, row, body])
         deepest[env, body] = most
         beyond[env, body] = any_
-    found = wp.vec4i(2147483647, 0, rows, 0)
+    span = wp.vec4i(2147483647, 0, rows, 0)
     for row in range(rows):
         line = written[env, row]
         if line[1] > line[0]:
-            found = wp.vec4i(wp.min(found[0], line[0]), wp.max(found[1], line[1]), wp.min(found[2], row), row + 1)
-    if found[1] == 0:
-        found = wp.vec4i(0, 0, 0, 0)
-    window[env] = found
+            span = wp.vec4i(wp.min(span[0], line[0]), wp.max(span[1], line[1]), wp.min(span[2], row), row + 1)
+    if span[1] == 0:
+        span = wp.vec4i(0, 0, 0, 0)
+    window[env] = span
