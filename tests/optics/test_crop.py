@@ -14,6 +14,8 @@ from raytac.optics import Mlp, Phong, RayTraced, Taxim
 from raytac.optics.base import OpticsImages
 from raytac.optics.crop import Cropped, CutMode
 from raytac.optics.image.base import grown
+from raytac.optics.trace import interreflection
+from raytac.optics.trace.interreflection import BounceField
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini
 from tests.optics.test_mlp import network
 from tests.optics.test_taxim_mode import make_table
@@ -124,3 +126,27 @@ def test_cropped_is_what_it_crops() -> None:
     cropped = Cropped(config, CROPS["inside"])
     assert (cropped.label, cropped.outputs) == (config.label, config.outputs)
     assert (cropped.sampled, cropped.unbiased) == (config.sampled, config.unbiased)
+
+
+def test_indirect_light_is_that_of_all_patches_and_channels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is gathered where the camera sees the coat, for the colours that its LEDs have."""
+    shown, options = pressed(), {"resolution": RESOLUTION, "outputs": ("rgb", "layers"), "device": "cpu"}
+    config = Cropped(RayTraced(), CROPS["inside"])
+    seen = config.build(SPEC, **options)
+    some = seen.render(shown)
+    bounce = seen._arrays.bounce  # type: ignore[attr-defined]
+    assert bounce.view[2] * bounce.view[3] < 0.8 * bounce.patches.nx * bounce.patches.ny
+
+    def everything(cls: type, mi: Any, layout: Any, case: Any, camera: Any, thickness: float, lit: Any) -> Any:
+        return build(mi, layout, case, camera, thickness, range(9))
+
+    build = BounceField.build
+    monkeypatch.setattr(interreflection, "patches_in_view", lambda g, *_: (0, 0, g.nx, g.ny))
+    monkeypatch.setattr(BounceField, "build", classmethod(everything))
+    every = config.build(SPEC, **options).render(shown)
+    assert some.rgb is not None and some.layers is not None and every.layers is not None
+    np.testing.assert_array_equal(some.rgb, every.rgb)
+    for name, layer in every.layers.items():
+        np.testing.assert_allclose(some.layers[name], layer, rtol=1e-5, atol=1e-9)
+    direct = Cropped(RayTraced(bounce=False), CROPS["inside"]).build(SPEC, **options).render(shown)
+    assert (direct.rgb != some.rgb).mean() > 0.5

@@ -57,7 +57,13 @@ class FastTracer(Tracer):
         if self._lit and self.config.bounce:
             scene = SensorScene(mi, self.sensor, grid)
             case = CaseLight.fit(scene, self._scene_lamps, self.groups, self.seed)
-            bounce = BounceField.build(mi, self.layout, case)
+            powers = [
+                (3 * group + c, led.power[c])
+                for led, group in zip(self.sensor.lights.leds, self.groups, strict=True)
+                for c in range(3)
+            ]
+            lit = sorted({channel for channel, power in powers if power > 0.0})
+            bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, lit)
         self._arrays = FastArrays(lamps, bounce, [])
         self._set_flat_field(grid)
         return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
@@ -115,7 +121,7 @@ class FastTracer(Tracer):
             for c in range(3):
                 out[3 * group + c] += lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
         if grids is not None and inputs.own.bounce is not None:
-            for k, e in enumerate(inputs.own.bounce.irradiance(mi, grids, seen)):
+            for k, e in inputs.own.bounce.irradiance(mi, grids, seen):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
 
