@@ -57,23 +57,25 @@ class FastTracer(Tracer):
         if self._lit and self.config.bounce:
             scene = SensorScene(mi, self.sensor, grid)
             case = CaseLight.fit(scene, self._scene_lamps, self.groups, self.seed)
-            powers = [
-                (3 * group + c, led.power[c])
-                for led, group in zip(self.sensor.lights.leds, self.groups, strict=True)
-                for c in range(3)
-            ]
-            lit = sorted({channel for channel, power in powers if power > 0.0})
-            bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, lit)
+            bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         self._arrays = FastArrays(lamps, bounce, [])
         self._set_flat_field(grid)
         return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
+
+    @property
+    def _lit_channels(self) -> list[int]:
+        """Channels of all layers that an LED gives light to."""
+        leds = zip(self.sensor.lights.leds, self.groups, strict=True)
+        return sorted({3 * group + c for led, group in leds for c in range(3) if led.power[c] > 0.0})
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
         width, height = self.camera.size
         layout, channels = CoatLayout.from_grid(grid), 3 * len(self.layer_names)
         # A pixel's levels before and after they are interleaved, and in bytes; a channel each.
         pixel = 27 * ("rgb" in self.outputs) + 4 * channels * ("layers" in self.outputs)
-        indirect = BounceField.memory_per_env(layout, channels) if self.config.bounce else 0
+        indirect = 0
+        if self.config.bounce:
+            indirect = BounceField.memory_per_env(layout, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 

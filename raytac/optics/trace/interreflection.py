@@ -149,10 +149,11 @@ class BounceField:
         return cls(g, patches_in_view(g, camera, thickness), tuple(lit), [mi.Float(on_nodes[k].ravel()) for k in lit])
 
     @staticmethod
-    def memory_per_env(layout: CoatLayout, channels: int) -> int:
-        """Bytes that the grid takes while it is filled: packed results of each channel, patches, their light by layer, heights."""
+    def memory_per_env(layout: CoatLayout, camera: Pinhole, thickness: float, lit: Sequence[int]) -> int:
+        """Bytes that the grid takes while it is filled: packed results of each lit channel, patches, their light, heights."""
         g = patches_of(layout)
-        return g.nx * g.ny * (16 * channels + 16 + 16 * (channels // 3) + 4)
+        _, _, columns, rows = patches_in_view(g, camera, thickness)
+        return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
         """Packed (e, v_x, v_y, v_z) of the patches in view of the coat ``field``, an array a lit channel.
