@@ -86,8 +86,10 @@ class Undersides:
         self.height.fill_(float("inf"))
         for recorded, shape in zip(self._launches, ((self._bodies,), (self._grid.shape[0],), ()), strict=True):
             if 0 not in shape:
-                recorded.set_dim((count, *shape))
+                if count != self._launched:
+                    recorded.set_dim((count, *shape))
                 recorded.launch()
+        self._launched = count
 
     def _allocate(self, num_envs: int) -> None:
         (ny, nx), bodies = self._grid.shape, self._bodies
@@ -111,6 +113,7 @@ class Undersides:
             (join_rows, (num_envs,), [written, depth, behind, self.window, self.deepest, self.beyond]),
         )
         # Launches are recorded, so that repeating them costs a fifth.
+        self._launched = num_envs
         self._launches: list[Any] = [
             wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True) for kernel, dim, inputs in kernels
         ]
