@@ -27,6 +27,27 @@ def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.n
     return out
 
 
+def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """a @ b, float32, one of both a stack of B matrices, in pieces small enough to stay on the calling thread.
+
+    Each matrix of the stack is multiplied by itself, so that it does not matter which others there are.
+    """
+    rows, inner, columns = a.shape[-2], a.shape[-1], b.shape[-1]
+    if rows * inner * columns <= _ONE_THREAD:
+        return np.matmul(a, b, out=out)
+    if out is None:
+        out = np.empty((len(a if a.ndim == 3 else b), rows, columns), np.float32)
+    if rows >= columns:
+        step = max(_ONE_THREAD // (inner * columns), 1)
+        for start in range(0, rows, step):
+            np.matmul(a[..., start : start + step, :], b, out=out[:, start : start + step])
+    else:
+        step = max(_ONE_THREAD // (inner * rows), 1)
+        for start in range(0, columns, step):
+            np.matmul(a, b[..., start : start + step], out=out[..., start : start + step])
+    return out
+
+
 def sandwich(rows: np.ndarray, core: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """rows @ core @ columns, float32."""
     return product(product(rows, core.astype(np.float32)), columns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -26,6 +27,12 @@ _ROUNDING = 1e-5
 """Excess of w over u in contact, as a share of the deepest overlap: above the pyramid's rounding in float32, far below any shape."""
 _REACH = 4.8
 """Standard deviations of all Gaussians together beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
+
+_TOGETHER = 16384
+"""Most nodes of a grid on which environments are smoothed together, over the whole pad: on larger ones what lies around a contact costs
+more than one call for each environment."""
+_STACK = 1 << 17
+"""Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 
 Piece = tuple[slice, slice]
 """Rows and columns, with plain starts and stops."""
@@ -83,21 +90,85 @@ class ElasticSurround:
         height = np.empty((batch, *self.grid.shape), np.float32)
         contact = np.zeros(height.shape, bool)
         centre = np.full((batch, 2), np.nan)
-        for b in range(batch):  # one by one: an environment's result must not depend on its neighbours
-            overlap = np.subtract(self.grid.rest, object_height[b]).astype(np.float32)
-            deepest = overlap.max()
-            if np.isnan(deepest):
-                height[b] = np.nan
-                continue
-            height[b] = self._rest
-            if deepest > 0.0:
-                touched = _touched(overlap)
-                window = around(touched, self._reach, self.grid.pitch, (slice(0, overlap.shape[0]), slice(0, overlap.shape[1])))
-                overlap = overlap[touched]
-                displacement, contact[b][touched] = self._displacement(overlap, deepest, touched, window)
-                height[b][window] -= displacement
-                centre[b] = self._centroid(overlap, contact[b][touched], touched)
+        if self.grid.rest.size <= _TOGETHER:
+            count = max(_STACK // self.grid.rest.size, 1)
+            for start in range(0, batch, count):
+                some = slice(start, start + count)
+                self._press_together(object_height[some], height[some], contact[some], centre[some])
+        else:
+            for b in range(batch):
+                centre[b] = self._press(object_height[b], height[b], contact[b])
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
+
+    def _press_together(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray, centre: np.ndarray) -> None:
+        """Write the surfaces under objects, whose undersides are ``under``: height, contact and its centre.
+
+        Environments are smoothed in one call; an environment's result does not depend on its neighbours.
+        """
+        overlap, field, pressed, spare = (own[: len(under)] for own in self._memory)
+        np.subtract(self.grid.rest, under, out=overlap, casting="same_kind")
+        deepest = overlap.max(axis=(1, 2))
+        height[:] = self._rest
+        height[np.isnan(deepest)] = np.nan
+        rows = np.flatnonzero(deepest > 0.0)
+        if not len(rows):
+            return
+        if len(rows) < len(overlap):
+            np.take(overlap, rows, axis=0, out=field[: len(rows)])
+            overlap, field, pressed, spare = (own[: len(rows)] for own in (field, overlap, pressed, spare))
+        deepest = deepest[rows, None, None]
+        np.maximum(overlap, np.float32(0.0), out=pressed)
+        field[:] = pressed
+        full = None if self.contact_rule == "unilateral" else overlap > np.float32(self.contact_scale) * deepest
+        for blur in self._pyramid:
+            blur.of_stack(field, spare)
+            if full is None:
+                np.maximum(field, pressed, out=field)
+            else:
+                np.copyto(field, pressed, where=full)
+        if full is None:
+            np.add(pressed, _slack(deepest), out=spare)
+            full = (overlap > 0.0) & (field <= spare)
+        contact[rows] = full
+        np.multiply(pressed, full, out=spare)
+        centre[rows] = self._centroids(spare)
+        if self._final is not None:
+            self._final.of_stack(field, spare)
+        height[rows] = np.subtract(self._rest, field, out=spare)
+
+    @cached_property
+    def _memory(self) -> tuple[np.ndarray, ...]:
+        """Arrays for ``_press_together``, since new ones would take longer to get than to fill."""
+        shape = max(_STACK // self.grid.rest.size, 1), *self.grid.shape
+        return tuple(np.empty(shape, np.float32) for _ in range(4))
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        """As ``overlap`` of ``_centroids``, in float64."""
+        return np.empty(self._memory[0].shape)
+
+    def _centroids(self, overlap: np.ndarray) -> np.ndarray:
+        """Overlap-weighted centres (x, y) [m], (n, 2), of contacts (n, Ny, Nx), 0 outside."""
+        weights = self._weights[: len(overlap)]
+        weights[:] = overlap
+        lines = np.stack([np.ones_like(self.grid.y), self.grid.y])
+        sums = lines @ weights  # of every column: the overlap and its moment along y
+        moments = np.stack([(sums[:, 0] * self.grid.x).sum(axis=1), sums[:, 1].sum(axis=1)], axis=1)
+        return moments / sums[:, 0].sum(axis=1)[:, None]
+
+    def _press(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
+        """Write the surface of one environment, as ``_press_together``, and return the contact's centre."""
+        overlap = np.subtract(self.grid.rest, under).astype(np.float32)
+        deepest = overlap.max()
+        height[:] = np.nan if np.isnan(deepest) else self._rest
+        if not deepest > 0.0:
+            return np.nan, np.nan
+        touched = _touched(overlap)
+        window = around(touched, self._reach, self.grid.pitch, (slice(0, overlap.shape[0]), slice(0, overlap.shape[1])))
+        overlap = overlap[touched]
+        displacement, contact[touched] = self._displacement(overlap, deepest, touched, window)
+        height[window] -= displacement
+        return self._centroid(overlap, contact[touched], touched)
 
     def _displacement(self, overlap: np.ndarray, deepest: float, touched: Piece, window: Piece) -> tuple[np.ndarray, np.ndarray]:
         """w [m] on the window, and the contact on ``touched``, for the ``overlap`` there."""
@@ -108,10 +179,7 @@ class ElasticSurround:
             w = field.smooth()
             w = np.maximum(w, pressed) if self.contact_rule == "unilateral" else np.where(full, pressed, w)
             field.impose(w)
-        # Where the overlap is constant the Gaussians keep it up to rounding, which must not decide the contact: hence the slack. The
-        # deepest node is always in contact, since no Gaussian exceeds the maximum.
-        slack = np.float32(max(_ROUNDING * float(deepest), float(np.finfo(np.float32).tiny)))
-        contact = (overlap > 0.0) & (w <= pressed + slack) if self.contact_rule == "unilateral" else full
+        contact = (overlap > 0.0) & (w <= pressed + _slack(np.float32(deepest))) if self.contact_rule == "unilateral" else full
         return field.over(window), contact
 
     def _field(self, pressed: np.ndarray, touched: Piece, window: Piece) -> WholeField | LocalField:
@@ -127,6 +195,15 @@ class ElasticSurround:
         total = weight.sum()
         x, y = self.grid.x[window[1]], self.grid.y[window[0]]
         return float(weight.sum(axis=0) @ x / total), float(weight.sum(axis=1) @ y / total)
+
+
+def _slack(deepest: np.ndarray | np.float32) -> np.ndarray:
+    """Excess of w over u that still is contact [m].
+
+    Where the overlap is constant the Gaussians keep it up to rounding, which must not decide the contact. The deepest node is always in
+    contact, since no Gaussian exceeds the maximum.
+    """
+    return np.maximum(np.float32(_ROUNDING) * deepest, np.finfo(np.float32).tiny)
 
 
 def _touched(overlap: np.ndarray) -> Piece:

@@ -69,6 +69,8 @@ class FotsModel:
     ) -> np.ndarray:
         """Displacement along x, y [m], shape (B, M, 2), of markers at ``rest`` (B, M, 3)."""
         assert samples is not None and contacts is not None
+        if samples.box[0] == samples.box[1]:  # no pad is touched
+            return np.zeros((*rest.shape[:2], 2), np.float32)
         return self._kernel.displacement(rest, samples.depth, samples.boxes, contacts.table, self.motion)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +45,34 @@ class MarkerFrame:
     def pixel(self) -> np.ndarray:
         """Detected positions in the image [px], shape (B, M, 2)."""
         return self.rest_px + self.displacement_px
+
+
+class _LazyFrame(MarkerFrame):
+    """Markers whose place in space and in the image is computed when it is first asked for: a learner often sees neither."""
+
+    def __init__(
+        self,
+        displacement: np.ndarray,
+        rest: np.ndarray,
+        rest_px: np.ndarray,
+        visible: np.ndarray,
+        position: Callable[[], np.ndarray],
+        displacement_px: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        """``displacement_px``: from positions."""
+        known = {"displacement": displacement, "rest": rest, "rest_px": rest_px, "visible": visible}
+        self.__dict__.update(known, _position=position, _displacement_px=displacement_px)
+
+    @cached_property
+    def position(self) -> np.ndarray:  # type: ignore[override]
+        return self._position()  # type: ignore[attr-defined]
+
+    @cached_property
+    def displacement_px(self) -> np.ndarray:  # type: ignore[override]
+        return self._displacement_px(self.position)  # type: ignore[attr-defined]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MarkerFrame, tuple(getattr(self, field.name) for field in fields(MarkerFrame))
 
 
 class MarkerTracker:
@@ -158,27 +188,43 @@ class MarkerTracker:
         )
         rest = self._rest if envs is None else self._rest[envs]
         moved = self.model.displacement(rest, surface, samples, contacts)
-        if moved.shape[-1] == 3:
-            position = rest + moved
-        else:
-            position = np.empty(rest.shape)
-            xy = np.add(rest[..., :2], moved, out=position[..., :2])
-            # Differences of heights come first, so that the displacement of a marker at rest is exactly zero.
-            at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
-            np.subtract(height_at(surface, xy), at_rest, out=position[..., 2])
-            position[..., 2] += rest[..., 2]
-        return self._frame(rest, position, failed, envs)
+        at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
+        position = np.empty(rest.shape)
+        np.add(rest[..., : moved.shape[-1]], moved, out=position[..., : moved.shape[-1]])
 
-    def _frame(self, rest: np.ndarray, position: np.ndarray, failed: np.ndarray, envs: Sequence[int] | None) -> MarkerFrame:
+        def in_space() -> np.ndarray:
+            if moved.shape[-1] == 2:
+                # Differences of heights come first, so that the displacement of a marker at rest is exactly zero.
+                np.subtract(height_at(surface, position[..., :2]), at_rest, out=position[..., 2])
+                position[..., 2] += rest[..., 2]
+            return position
+
+        return self._frame(rest, position[..., :2] - rest[..., :2], in_space, failed, envs)
+
+    def _frame(
+        self,
+        rest: np.ndarray,
+        displacement: np.ndarray,
+        position: Callable[[], np.ndarray],
+        failed: np.ndarray,
+        envs: Sequence[int] | None,
+    ) -> MarkerFrame:
         pixel, all_visible = (values if envs is None else values[envs] for values in (self._pixel, self._all))
-        displacement = position[..., :2] - rest[..., :2]
-        displacement_px = self.pattern.camera.project(position)
-        displacement_px -= pixel
-        noise = self._perturber.noise(self.pattern.count, envs)
+        camera, noise = self.pattern.camera, self._perturber.noise(self.pattern.count, envs)
         if noise is not None:
-            displacement_px += noise
-            displacement += noise * np.asarray(self.sensor.camera.pitch_at(self.pattern.camera.resolution))
+            displacement += noise * np.asarray(self.sensor.camera.pitch_at(camera.resolution))
         visible = self._perturber.visible(self.pattern.count, envs)
-        for lost in ([] if visible is None else [~visible]) + ([failed] if failed.any() else []):
-            displacement[lost] = displacement_px[lost] = np.nan
-        return MarkerFrame(displacement, displacement_px, rest, pixel, position, all_visible if visible is None else visible)
+        lost = ([] if visible is None else [~visible]) + ([failed] if failed.any() else [])
+
+        def in_image(position: np.ndarray) -> np.ndarray:
+            displacement_px = camera.project(position)
+            displacement_px -= pixel
+            if noise is not None:
+                displacement_px += noise
+            for some in lost:
+                displacement_px[some] = np.nan
+            return displacement_px
+
+        for some in lost:
+            displacement[some] = np.nan
+        return _LazyFrame(displacement, rest, pixel, all_visible if visible is None else visible, position, in_image)

@@ -19,6 +19,9 @@ from raytac.markers.registry import markers_config
 from raytac.observe.randomization import CameraDrift, Randomization, randomised_sensor
 from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.observe.spaces import ArraySpec, array_specs
+from raytac.optics.base import BuiltOptics
+from raytac.optics.crop import Cropped
+from raytac.optics.registry import chosen_optics
 from raytac.sensor import TactileSensor
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import sensor_spec
@@ -103,12 +106,17 @@ class TactileObserver:
         return replace(config, perturbation=drawn)
 
     def sensor_options(self) -> dict[str, Any]:
-        """Keyword arguments of a ``TactileSensor`` with the outputs observed, without the sensor and the physics."""
-        settings = self.settings
+        """Keyword arguments of a ``TactileSensor`` with the outputs observed, without the sensor and the physics.
+
+        Of images only the crop that is observed is rendered.
+        """
+        settings, optics = self.settings, chosen_optics(self.settings.optics)
+        if self.layout.crop is not None and not isinstance(optics, BuiltOptics):
+            optics = Cropped(optics, self.layout.crop)
         return {
             "outputs": settings.outputs,
             "markers": self.markers,
-            "optics": settings.optics,
+            "optics": optics,
             "resolution": self.layout.rendered,
             "num_envs": self.num_envs,
             "seed": self.seed,
@@ -245,12 +253,13 @@ class TactileObserver:
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
         layout, (width, height) = self.layout, self.layout.observed
-        if images.shape[1:3] != layout.rendered[::-1]:
-            shape, expected = images.shape[2:0:-1], "x".join(str(n) for n in layout.rendered)
-            raise InputError("frame.rgb", value=shape, rule=f"must be {expected}, as in sensor_options")
-        k = layout.downscale
-        x, y = layout.crop_x * k, layout.crop_y * k
-        images = images[:, y : y + height * k, x : x + width * k]
+        k, size = layout.downscale, images.shape[2:0:-1]
+        if size == layout.rendered:
+            x, y = layout.crop_x * k, layout.crop_y * k
+            images = images[:, y : y + height * k, x : x + width * k]
+        elif layout.crop is None or size != layout.crop[2:]:
+            expected = "x".join(str(n) for n in layout.rendered)
+            raise InputError("frame.rgb", value=size, rule=f"must be {expected}, or a crop as in sensor_options")
         if k > 1:
             blocks = images.reshape(len(images), height, k, width, k, 3)
             images = (blocks.sum(axis=(2, 4), dtype=np.uint32) + k * k // 2) // (k * k)

@@ -132,6 +132,13 @@ class Layout:
     """Pixels of the observed size that are removed at the top."""
     downscale: int
 
+    @property
+    def crop(self) -> tuple[int, int, int, int] | None:
+        """(left, top, width, height) of the piece of the rendered image that is observed [px]; None is all of it."""
+        k, (width, height) = self.downscale, self.observed
+        piece = k * self.crop_x, k * self.crop_y, k * width, k * height
+        return None if piece[2:] == self.rendered else piece
+
 
 def image_layout(sensor: SensorSpec, settings: ObservationSettings) -> Layout:
     """Sizes of rendered and observed image. Raises ``InputError`` if they are too large."""

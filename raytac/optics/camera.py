@@ -28,6 +28,28 @@ class Pinhole:
     resolution: tuple[int, int]
     slab: Slab | None = None
     """Gel and plate that bend its rays, in metres; None where light goes straight."""
+    crop: tuple[int, int, int, int] | None = None
+    """Piece of the image that is rendered, (left, top, width, height) [px]; None is all of it."""
+
+    @property
+    def piece(self) -> tuple[int, int, int, int]:
+        """``crop``, or the whole image."""
+        return self.crop or (0, 0, *self.resolution)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of what is rendered [px]."""
+        return self.piece[2:]
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """The rendered piece of an image (H, W, …)."""
+        left, top, width, height = self.piece
+        return image[top : top + height, left : left + width]
+
+    def pixel(self, index: Any) -> tuple[Any, Any]:
+        """Column and row in the whole image of pixels of the rendered piece, numbered row by row."""
+        left, top, width, _ = self.piece
+        return index % width + left, index // width + top
 
     @classmethod
     def from_spec(cls, spec: CameraSpec, resolution: tuple[int, int] | None = None, slab: Slab | None = None) -> Pinhole:

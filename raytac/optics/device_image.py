@@ -47,11 +47,14 @@ class DeviceImage:
         if "rgb" not in mode.outputs:
             raise InputError("outputs", value=mode.outputs, rule="must hold 'rgb'")
         self._mode, self._cut, self.mi = mode, cut, mode.mi
+        left, top, wide, high = mode.camera.piece if hasattr(mode.camera, "piece") else (0, 0, *mode.camera.resolution)
+        self._first = cut.x * cut.downscale - left, cut.y * cut.downscale - top
+        self._rendered = wide, high
         (width, height), (right, bottom) = cut.size, mode.camera.resolution
         if (cut.x + width) * cut.downscale > right or (cut.y + height) * cut.downscale > bottom:
             raise InputError("cut", value=cut, rule=f"must lie within the rendered {right}x{bottom}")
         self._nodes = grid.rest.size
-        self._is_whole = (width, height) == (right, bottom)
+        self._is_whole = (width, height) == self._rendered
         self._frozen: dict[int, Any] = {}
         mode.prepare(grid)
         image = mode.render_device(*self.upload(GelSurface.at_rest(grid))).rgb
@@ -97,12 +100,12 @@ class DeviceImage:
 
     def _kept(self, image: Any, envs: int, rest: Any) -> Any:
         """Cut, mean and difference of images (B·H·W·3, UInt8)."""
-        mi, cut, (width, height), k = self.mi, self._cut, self._cut.size, self._cut.downscale
-        columns, rows = self._mode.camera.resolution
+        mi, (width, height), k = self.mi, self._cut.size, self._cut.downscale
+        (columns, rows), (left, top) = self._rendered, self._first
         i = dr.arange(mi.UInt32, envs * width * height * 3)
         channel, pixel = i % 3, i // 3
         column, row, env = pixel % width, (pixel // width) % height, pixel // (width * height)
-        first = ((env * rows + (row + cut.y) * k) * columns + (column + cut.x) * k) * 3 + channel
+        first = ((env * rows + row * k + top) * columns + column * k + left) * 3 + channel
         total = mi.UInt32(k * k // 2)
         for dy in range(k):
             for dx in range(k):

@@ -101,6 +101,21 @@ class DeviceMode(ABC):
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
         """Last part of the constructor: what a mode needs beyond that, and checks of its configuration."""
 
+    def crop(self, piece: tuple[int, int, int, int]) -> bool:
+        """Render only a piece of the image from now on, (left, top, width, height) [px]; False if all of it would be computed anyway.
+
+        What is rendered equals the same piece of the whole image. Called before the first frame.
+        """
+        if not self._crops:
+            return False
+        self.camera = replace(self.camera, crop=piece)
+        return True
+
+    @property
+    def _crops(self) -> bool:
+        """True if a piece of the image takes less than all of it."""
+        return False
+
     @abstractmethod
     def _build(self, grid: PadGrid) -> Any:
         """Device arrays that a frame reads besides the surface; called once, for the first grid."""
@@ -138,7 +153,7 @@ class DeviceMode(ABC):
 
     def memory_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment of a batch on ``grid`` takes [byte]."""
-        width, height = self.camera.resolution
+        width, height = self.camera.size
         seen = 0
         if {"normals", "depth"} & set(self.outputs):
             seen = 8 * grid.rest.size + CoatField.memory_per_env(CoatLayout.from_grid(grid)) + 24 * width * height
@@ -146,7 +161,7 @@ class DeviceMode(ABC):
 
     def largest_batch(self, grid: PadGrid) -> int:
         """Largest number of environments that one call may render on ``grid``; a path tracer's images are made one by one."""
-        width, height = self.camera.resolution
+        width, height = self.camera.size
         longest = max(4 * grid.rest.size, self._longest_row * width * height)
         return min(self._memory // max(self.memory_per_env(grid), 1), _LONGEST_ARRAY // longest)
 
@@ -250,13 +265,13 @@ class DeviceMode(ABC):
 
     def _shape(self, envs: int) -> tuple[int, int, int]:
         """(B, H, W)."""
-        width, height = self.camera.resolution
+        width, height = self.camera.size
         return envs, height, width
 
     def _check_image(self, name: str, image: object) -> None:
         """Raise InputError unless ``image`` is an 8-bit image at this resolution."""
         kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-        wanted = (*self._shape(1)[1:], 3)
+        wanted = (*self.camera.resolution[::-1], 3)
         if kind != f"uint8 {wanted}":
             raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {wanted}")
 

@@ -266,11 +266,11 @@ class PixelSample:
 
 def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[float, float] = (0.5, 0.5)) -> PixelSample:
     """Trace one ray through every pixel of ``envs`` images, at ``jitter`` inside the pixel."""
-    width, height = camera.resolution
+    width, height = camera.size
     i = dr.arange(mi.UInt32, envs * width * height)
     env = i // (width * height)
-    pixel = i - env * (width * height)
-    u, v = mi.Float(pixel % width) + jitter[0], mi.Float(pixel // width) + jitter[1]
+    column, row = camera.pixel(i - env * (width * height))
+    u, v = mi.Float(column) + jitter[0], mi.Float(row) + jitter[1]
     origin, (tx, ty) = camera.ray(u, v)
     p = field.camera_hit(env, origin, tx, ty)
     n = field.normal(env, p.x, p.y)
@@ -283,7 +283,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
 
 def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
     """Contact, and as ``outputs`` say normals with positions, and depth, of the seen points ``p`` and normals ``n`` on the device."""
-    width, height = camera.resolution
+    width, height = camera.size
     shape, grid = (surface.batch, height, width), surface.grid
     points = np.array(p).T.reshape(*shape, 3)
     ix = np.clip(np.rint((points[..., 0] - grid.x[0]) / grid.pitch[0]).astype(int), 0, len(grid.x) - 1)

@@ -60,9 +60,10 @@ class Response:
         dr.eval(out)
         return mi.UInt8(dr.ravel(mi.Color3f(*out)))
 
-    def device_scale(self, mi: Any) -> list[Any]:
-        """``scale`` as three device arrays of H·W."""
-        return [mi.Float(np.ascontiguousarray(self.scale[..., c]).ravel()) for c in range(3)]
+    def device_scale(self, mi: Any, camera: Pinhole | None = None) -> list[Any]:
+        """``scale``, of the piece that a camera renders, as three device arrays."""
+        scale = self.scale if camera is None else camera.cut(self.scale)
+        return [mi.Float(np.ascontiguousarray(scale[..., c]).ravel()) for c in range(3)]
 
     def encode_numpy(self, linear: np.ndarray) -> np.ndarray:
         """8-bit image (…, H, W, 3) of linear radiance of that shape."""

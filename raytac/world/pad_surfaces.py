@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,11 +13,20 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.shear import ContactShear
+from raytac.physics.rigid.underside import Undersides
 from raytac.shapes.part import Part
-from raytac.shapes.underside import object_height, object_radius
+from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import GelpadSpec
 from raytac.world.forbidden_overlap import BondedFace
-from raytac.world.near_pads import half_spaces, near_pad
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Grid, elastic surround and search of one sensor."""
+
+    grid: PadGrid
+    surround: ElasticSurround
+    undersides: Undersides
 
 
 class PadSurfaces:
@@ -27,10 +37,9 @@ class PadSurfaces:
         self._gelpads, self._bodies = dict(gelpads), tuple(bodies)
         self._faces = {name: BondedFace(gelpad) for name, gelpad in gelpads.items()}
         self._radius = np.array([object_radius(parts) for parts in bodies])
-        self._planes = half_spaces(bodies)
         self._pressed = {name: np.full(num_envs, -1) for name in gelpads}
         """−1: none."""
-        self._shown: dict[str, tuple[PadGrid, ElasticSurround, float]] = {}
+        self._shown: dict[str, _Shown] = {}
 
     def reset(self, envs: Sequence[int] | np.ndarray) -> None:
         """Forget what environments showed."""
@@ -61,31 +70,22 @@ class PadSurfaces:
             press: lowers heights (n, Ny, Nx) to what else presses, in place; None is nothing.
             shear: shear of the gel under the bodies (n,) that it shows deepest; None is not known.
         """
-        if name not in self._shown or self._shown[name][0] is not grid:
-            self._shown[name] = grid, ElasticSurround(grid), float(grid.rest.max())
-        count, gelpad, face = len(pad_from_body), self._gelpads[name], self._faces[name]
-        height = np.full((count, *grid.shape), np.inf)
-        poses = np.full((count, 4, 4), np.nan)
-        deepest, pressed = np.zeros(count), np.full(count, -1)
-        highest = self._shown[name][2]
-        near = near_pad(gelpad, self._radius, self._planes, pad_from_body) & ~failed[:, None]
-        for i in np.flatnonzero(near.any(axis=0)).tolist():
-            rows_near = np.flatnonzero(near[:, i])
-            under = object_height(self._bodies[i], pad_from_body[rows_near, i], grid.x, grid.y, below=highest)
-            behind = under < -gelpad.thickness
-            if behind.any():
-                deep = np.flatnonzero(behind.any(axis=(1, 2)))
-                deep = deep[face.pierced(self._bodies[i], pad_from_body[rows_near[deep], i], float(self._radius[i]))]
-                under[behind] = np.inf
-                under[deep] = np.nan
-            depth = (grid.rest - under).max(axis=(1, 2))
-            deeper = depth > deepest[rows_near]
-            at = rows_near[deeper]
-            deepest[at], pressed[at], poses[at] = depth[deeper], i, pad_from_body[at, i]
-            if len(rows_near) == count:
-                height = np.minimum(height, under, out=under)
-            else:
-                height[rows_near] = np.minimum(height[rows_near], under)
+        if name not in self._shown or self._shown[name].grid is not grid:
+            num_envs = len(self._pressed[name])
+            undersides = Undersides(grid, self._gelpads[name].thickness, self._bodies, num_envs=num_envs)
+            self._shown[name] = _Shown(grid, ElasticSurround(grid), undersides)
+        shown, count, gelpad = self._shown[name], len(pad_from_body), self._gelpads[name]
+        under = shown.undersides.of(pad_from_body, ~failed)
+        height, depth = under.height, under.depth
+        for row, i in np.argwhere(under.behind).tolist():
+            if self._faces[name].pierced(self._bodies[i], pad_from_body[row : row + 1, i], float(self._radius[i]))[0]:
+                height[row], depth[row, i] = np.nan, -np.inf
+        poses, pressed = np.full((count, 4, 4), np.nan), np.full(count, -1)
+        if self._bodies:
+            deepest = depth.argmax(axis=1)
+            at = np.flatnonzero(depth[np.arange(count), deepest] > 0.0)
+            pressed[at] = deepest[at]
+            poses[at] = pad_from_body[at, pressed[at]]
         if press is not None:
             press(height)
         height[failed] = np.nan
@@ -93,7 +93,7 @@ class PadSurfaces:
         before = self._pressed[name][rows]
         poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
         self._pressed[name][rows] = np.where(failed, before, pressed)
-        surface = without_pierced(self._shown[name][1].surface(height, poses), gelpad)
+        surface = without_pierced(shown.surround.surface(height, poses), gelpad)
         failed = np.isnan(surface.height[:, 0, 0])
         wrench = np.where(failed[:, None], np.nan, wrench)
         sheared = None if shear is None else ContactShear.where(failed, shear(pressed))

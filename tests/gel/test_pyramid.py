@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
+from raytac.gel import pyramid
 from raytac.gel.gaussian import GaussianBlur, gaussian_matrix
 from raytac.gel.pyramid import CONTACT_SCALE, ComposedGaussians, ElasticSurround, LocalField, WholeField
 from raytac.gel.surface import GelSurface, make_grid, rest_height
@@ -203,8 +204,28 @@ def test_finer_grid_converges_to_one_surface() -> None:
     assert np.sqrt(np.mean(second**2)) < 3e-4 * 0.6e-3 and second.max() < 0.02 * 0.6e-3
 
 
-def test_batch_equals_single_bit_for_bit_and_nan_stays_alone() -> None:
-    grid = make_grid(PAD, 0.15e-3)
+def test_environments_pressed_together_are_as_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the whole pad in one call, on a coarse grid, or around each contact, on a fine one: the same to rounding."""
+    grid = make_grid(PAD, 0.3e-3)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :2, 3] = [(0.0, 0.0), (6e-3, 4e-3), (-3e-3, 1e-3), (0.0, 0.0), (8e-3, -6e-3)]
+    poses[:, 2, 3] = 3.5e-3, 3.2e-3, 3.9e-3, 5.0e-3, 3.5e-3
+    heights = object_height([primitive("sphere", (4e-3,))], poses, grid.x, grid.y)
+    heights[2] = np.minimum(heights[2], -0.2e-3)  # as wide as the pad
+    for rule in ("unilateral", "threshold"):
+        together = ElasticSurround(grid, contact_rule=rule, final_sigma=0.1e-3).surface(heights)
+        with monkeypatch.context() as patch:
+            patch.setattr(pyramid, "_TOGETHER", 0)
+            each = ElasticSurround(grid, contact_rule=rule, final_sigma=0.1e-3).surface(heights)
+        assert not together.contact[3].any() and together.contact[[0, 1, 2, 4]].any(axis=(1, 2)).all()
+        np.testing.assert_allclose(together.height, each.height, atol=2e-9, rtol=0.0)
+        np.testing.assert_array_equal(together.contact, each.contact)
+        np.testing.assert_allclose(together.contact_centre, each.contact_centre, atol=1e-12, rtol=0.0)
+
+
+@pytest.mark.parametrize("pitch", [0.15e-3, 0.4e-3])
+def test_batch_equals_single_bit_for_bit_and_nan_stays_alone(pitch: float) -> None:
+    grid = make_grid(PAD, pitch)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = 0.0, 1e-3, np.nan
     poses[:, 2, 3] = 3.5e-3, 3.2e-3, 3.5e-3
@@ -215,4 +236,5 @@ def test_batch_equals_single_bit_for_bit_and_nan_stays_alone() -> None:
         alone = surround.surface(heights[b : b + 1])
         np.testing.assert_array_equal(together.height[b], alone.height[0])
         np.testing.assert_array_equal(together.contact[b], alone.contact[0])
+        np.testing.assert_array_equal(together.contact_centre[b], alone.contact_centre[0])
     assert np.isnan(together.height[2]).all() and not together.contact[2].any()

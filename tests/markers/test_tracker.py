@@ -178,3 +178,33 @@ def test_contact_settings_reach_sampling_and_tracking(sensor: SensorSpec, grid: 
 def test_sizes_out_of_range(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
         MarkerPerturbation(**bad)
+
+
+@pytest.mark.renderer
+def test_places_in_space_and_image_are_computed_when_asked_for(
+    sensor: SensorSpec, grid: PadGrid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noisy = Fots(perturbation=MarkerPerturbation(noise_px=0.3, dropout=0.2))
+    trackers = [MarkerTracker(sensor, noisy, grid, num_envs=2, device="cpu", seed=3) for _ in range(2)]
+    surface = pressed(grid, [(0, 0, DEEP)], [(1e-3, 0, DEEP)])
+    with monkeypatch.context() as patch:
+        patch.setattr("raytac.markers.tracker.height_at", lambda *_: pytest.fail("computed without need"))
+        late = trackers[0].update(surface)
+        seen = late.displacement.copy()
+    frame = trackers[1].update(surface)
+    assert frame.displacement_px.shape == (2, 99, 2) and np.isnan(frame.displacement_px).any()
+    np.testing.assert_array_equal(seen, frame.displacement)
+    trackers[0].update(pressed(grid, [(2e-3, 0, DEEP)], []))  # what comes later changes nothing
+    copies = pickle.loads(pickle.dumps(late)), late
+    for one in copies:
+        for name in ("displacement", "displacement_px", "rest", "rest_px", "position", "visible"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(frame, name))
+
+
+@pytest.mark.renderer
+def test_pads_that_nothing_touches_need_no_kernel(sensor: SensorSpec, grid: PadGrid, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = MarkerTracker(sensor, "fots", grid, num_envs=2, device="cpu")
+    with monkeypatch.context() as patch:
+        patch.setattr("raytac.markers.fots.FotsKernel.displacement", lambda *_: pytest.fail("launched without need"))
+        assert not tracker.update(pressed(grid, [], [])).displacement.any()
+    assert tracker.update(pressed(grid, [], [(0, 0, DEEP)])).displacement[1].any()

@@ -12,6 +12,7 @@ from raytac.markers import Fots, MarkerFrame, MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization, TactileObserver, gymnasium_space, randomised_sensor
 from raytac.observe.observer import CellMeans
 from raytac.observe.randomization import CameraDrift
+from raytac.optics import RayTraced
 from raytac.specs import load_sensor
 
 SENSOR = load_sensor("gelsight_mini_9x11")
@@ -150,6 +151,22 @@ def test_crop_and_downscale_are_of_the_rendered_image() -> None:
     )
     with pytest.raises(InputError, match="12x8"):
         seen.observe(frame(size=(10, 8)))
+
+
+@pytest.mark.renderer
+@pytest.mark.parametrize("settings", [{"resolution": (12, 12)}, {"crop": (3, 1, 2, 4), "downscale": 2, "difference": True}])
+def test_only_the_crop_is_rendered_and_it_is_that_of_the_whole_image(settings: dict) -> None:
+    made = ObservationSettings(("rgb",), **{"resolution": (16, 12), "optics": RayTraced(bounce=False), **settings})
+    seen, of_whole = (TactileObserver("gelsight_mini", made) for _ in range(2))
+    sensor, whole = seen.make_sensor(), of_whole.make_sensor(optics=made.optics)
+    surface = sensor.press("sphere").surface
+    cropped, given = sensor.update(surface).rgb, whole.update(surface).rgb
+    assert cropped is not None and given is not None
+    k, (width, height) = made.downscale, seen.layout.observed
+    assert cropped.shape[1:3] == (k * height, k * width) and given.shape[1:3] == seen.layout.rendered[::-1]
+    found, expected = seen.observe(sensor.update(surface), sensor), of_whole.observe(whole.update(surface), whole)
+    np.testing.assert_array_equal(found["rgb"], expected["rgb"])
+    assert len(np.unique(found["rgb"])) > 10
 
 
 @pytest.mark.renderer

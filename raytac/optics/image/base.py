@@ -25,7 +25,8 @@ from raytac.optics.ink import darkened, ink_at
 class ImageHeights:
     """Surface seen by the pixels of B images, as device arrays of B·H·W.
 
-    Lengths are in image pixels (of the pitch along x).
+    Lengths are in image pixels (of the pitch along x). Of a crop there are the pixels around it too, whose heights its slopes need
+    (``grown``); ``here`` picks its own.
     """
 
     height: Any
@@ -36,27 +37,51 @@ class ImageHeights:
     """1 where the object touches, else 0 (UInt8); None if nobody asked."""
     envs: int
     resolution: tuple[int, int]
-    """(width, height) [px]."""
+    """(width, height) of the whole image [px]."""
     aspect: float = 1.0
     """Pitch along x over pitch along y."""
     ink: Any = None
     """Share of marker dots; None without dots."""
+    crop: tuple[int, int, int, int] | None = None
+    """Piece that is rendered, (left, top, width, height) [px]; None is all."""
 
     def pixel(self, mi: Any) -> tuple[Any, Any, Any, Any]:
-        """(index, index in the image, column, row) of every pixel of the batch."""
-        width, height = self.resolution
+        """(index in these arrays, index in the whole image, column, row) of every pixel that is rendered."""
+        first_x, first_y, width, height = self.crop or (0, 0, *self.resolution)
         i = dr.arange(mi.UInt32, self.envs * width * height)
         p = i % (width * height)
-        return i, p, p % width, p // width
+        column, row = p % width, p // width
+        if self.crop is None:
+            return i, p, column, row
+        column, row = column + first_x, row + first_y
+        left, top, wide, high = grown(self.crop, self.resolution)
+        i = i // (width * height) * (wide * high) + (row - top) * wide + (column - left)
+        return i, row * self.resolution[0] + column, column, row
+
+    def here(self, mi: Any, values: Any) -> Any:
+        """``values`` of these arrays at the pixels that are rendered."""
+        if self.crop is None or values is None:
+            return values
+        return dr.gather(type(values), values, self.pixel(mi)[0])
 
     def slopes(self, mi: Any, of: Any) -> tuple[Any, Any, list[Any]]:
         """(s_x, s_y, the four neighbours' values) by central differences of ``of``; the rim repeats the pixels next to it (upstream)."""
         width, height = self.resolution
+        left, top, wide, _ = grown(self.crop, self.resolution)
         i, _, column, row = self.pixel(mi)
-        first = i - row * width - column
-        inner = first + dr.clip(row, 1, height - 2) * width + dr.clip(column, 1, width - 2)
-        near = [dr.gather(mi.Float, of, k) for k in (inner + 1, inner - 1, inner + width, inner - width)]
+        first = i - (row - top) * wide - (column - left)
+        inner = first + (dr.clip(row, 1, height - 2) - top) * wide + (dr.clip(column, 1, width - 2) - left)
+        near = [dr.gather(mi.Float, of, k) for k in (inner + 1, inner - 1, inner + wide, inner - wide)]
         return 0.5 * (near[0] - near[1]), 0.5 * self.aspect * (near[2] - near[3]), near
+
+
+def grown(crop: tuple[int, int, int, int] | None, resolution: tuple[int, int]) -> tuple[int, int, int, int]:
+    """A crop of an image with the pixels around it that its slopes need, three a side at least; None is the whole image."""
+    columns, rows = resolution
+    left, top, width, height = crop or (0, 0, columns, rows)
+    x0, y0 = max(min(left - 1, columns - 3), 0), max(min(top - 1, rows - 3), 0)
+    x1, y1 = min(max(left + width + 1, 3), columns), min(max(top + height + 1, 3), rows)
+    return x0, y0, x1 - x0, y1 - y0
 
 
 def see_heights(
@@ -78,11 +103,13 @@ def see_heights(
     z ← z + (Z − z) / (1 − ∇Z · t), two of them from z = 0; where the coat is steeper than half the ray the step is that of slope 1/2.
     """
     g = layout
-    width, height = camera.resolution
+    wide = replace(camera, crop=grown(camera.crop, camera.resolution))
+    width, height = wide.size
     envs = dr.width(heights) // (g.nx * g.ny)
     i = dr.arange(mi.UInt32, envs * width * height)
-    env, p = i // (width * height), i % (width * height)
-    (ox, oy, oz), (tx, ty) = camera.ray(mi.Float(p % width) + 0.5, mi.Float(p // width) + 0.5)
+    env = i // (width * height)
+    column, row = wide.pixel(i % (width * height))
+    (ox, oy, oz), (tx, ty) = camera.ray(mi.Float(column) + 0.5, mi.Float(row) + 0.5)
 
     def cell(z: Any) -> tuple[Any, Any, Any]:
         return g.cell(mi, 0, ox + (z - oz) * tx, oy + (z - oz) * ty)
@@ -105,7 +132,7 @@ def see_heights(
         nearest = k + dr.select(wx > 0.5, 1, 0) + dr.select(wy > 0.5, g.nx, 0)
         touched = dr.gather(mi.UInt8, contact, first + nearest)
     dots = None if ink is None else ink_at(mi, g, ink, env, ox + (z - oz) * tx, oy + (z - oz) * ty)
-    return ImageHeights(height, displacement, touched, envs, camera.resolution, pitch[0] / pitch[1], dots)
+    return ImageHeights(height, displacement, touched, envs, camera.resolution, pitch[0] / pitch[1], dots, camera.crop)
 
 
 class ImageMode(DeviceMode):
@@ -127,7 +154,7 @@ class ImageMode(DeviceMode):
         """Device memory that ``_levels`` holds at its peak, in floats a pixel."""
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
-        width, height = self.camera.resolution
+        _, _, width, height = grown(self.camera.crop, self.camera.resolution)
         nodes = grid.rest.size * (9 if self.needs_contact else 8)  # height, ink and contact
         # Heights, displacement and ink, what the mode holds; contact and flags; three channels and their bytes.
         return self._lit * (nodes + round(width * height * (4 * (3 + self._floats_per_pixel()) + 2 + 15)))
@@ -142,7 +169,7 @@ class ImageMode(DeviceMode):
     def _inked_levels(self, seen: ImageHeights, inputs: FrameInputs) -> tuple[list[Float], UInt8]:
         """``_levels`` with the dots of the markers, if there are some."""
         channels, flags = self._levels(seen, inputs.own)
-        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.ink)), flags
+        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.here(self.mi, seen.ink))), flags
 
     def _see(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> ImageHeights:
         seen = see_heights(self.mi, self.layout, self.camera, self.pitch, inputs.rest, heights, contact, inputs.ink)
@@ -166,6 +193,7 @@ class ImageMode(DeviceMode):
     def image_heights(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """(−z, rest − z) of the coat through every pixel's centre [image pixels], each (B, H, W) float32."""
         seen, _, failed = self._seen_now(surface, dotted=False)
-        heights, displacements = (np.array(v).reshape(self._shape(surface.batch)) for v in (seen.height, seen.displacement))
+        own = (np.array(seen.here(self.mi, v)) for v in (seen.height, seen.displacement))
+        heights, displacements = (v.reshape(self._shape(surface.batch)) for v in own)
         heights[failed] = displacements[failed] = np.nan
         return heights, displacements

@@ -34,6 +34,10 @@ class MlpMode(ImageMode):
         self._check_view()
         self._view = view_slope(self.sensor)
 
+    @property
+    def _crops(self) -> bool:
+        return True
+
     def _check_view(self) -> None:
         """Raise InputError if the network is of another view: places are among its inputs."""
         own, fitted = view_size(self.sensor), self.weights.view
@@ -63,7 +67,8 @@ class MlpMode(ImageMode):
         sx, sy, _ = seen.slopes(mi, seen.displacement)
         _, p, column, row = seen.pixel(mi)
         u, v = self._place(dr, mi.Float(column), mi.Float(row))
-        change = forward(dr, self.weights, inputs(dr, sx, sy, mi.Float(seen.contact), u, v, self._view))
+        touched = mi.Float(seen.here(mi, seen.contact))
+        change = forward(dr, self.weights, inputs(dr, sx, sy, touched, u, v, self._view))
         rest = dr.gather(mi.Vector4f, arrays, p)
         return [LEVELS * c + rest[k] for k, c in enumerate(change)], mi.UInt8(0)
 

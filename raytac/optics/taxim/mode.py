@@ -70,6 +70,7 @@ class TableShader:
         displaced = table.slopes_of == "displacement"
         of = seen.displacement if displaced else seen.height
         sx, sy, near = seen.slopes(mi, of)
+        here, contact = seen.here(mi, of), seen.here(mi, seen.contact)
         _, p, column, row = seen.pixel(mi)
         n = table.n_bins
         # A flat place has direction 0; atan2(0, 0) says so on every device that Dr.Jit knows, but is not promised to.
@@ -80,7 +81,7 @@ class TableShader:
         j = dr.minimum(mi.UInt32(dr.maximum(direction + np.pi, 0) * ((n - 1) / (2 * np.pi))), n - 1)
         which = i * n + j
         if table.surround is not None:
-            which += dr.select(seen.contact == 0, mi.UInt32(n * n), 0)
+            which += dr.select(contact == 0, mi.UInt32(n * n), 0)
         x = (mi.Float(column) + 0.5) * self.scale[0] - 0.5
         y = (mi.Float(row) + 0.5) * self.scale[1] - 0.5
 
@@ -91,16 +92,16 @@ class TableShader:
             return *(sum((c[6 * k + m] * basis[m] for m in range(6)), mi.Float(0)) for k in range(3)), c[18]
 
         if displaced:
-            still = (of == 0) & (near[0] == 0) & (near[1] == 0) & (near[2] == 0) & (near[3] == 0)
-            looked_up = ~still if seen.contact is None else ~still | (seen.contact != 0)
+            still = (here == 0) & (near[0] == 0) & (near[1] == 0) & (near[2] == 0) & (near[3] == 0)
+            looked_up = ~still if contact is None else ~still | (contact != 0)
             # A branch: packets are dear, and most pads are at rest in most places.
             *change, covered = dr.if_stmt((), looked_up, binned, lambda: (mi.Float(0),) * 4, label="bins")
             change = [dr.select(still, 0, d) for d in change]
         else:
             *change, covered = binned()
         flags = mi.UInt8(0)
-        if table.covered is not None and seen.contact is not None:
-            flags = seen.contact | dr.select((seen.contact != 0) & (covered == 0), mi.UInt8(_UNCOVERED), 0)
+        if table.covered is not None and contact is not None:
+            flags = contact | dr.select((contact != 0) & (covered == 0), mi.UInt8(_UNCOVERED), 0)
         if self._caster is not None and inputs.shadow is not None:
             change = self._caster.cast(seen, of, direction, change, inputs.shadow)
         packed = dr.gather(mi.Vector4f, inputs.background, p)
@@ -132,6 +133,10 @@ class TaximMode(ImageMode):
             raise InputError("resolution", value=f"{width}x{height}", rule=rule)
         self.needs_contact = self.shadows or self.table.covered is not None or self.table.surround is not None
         self._shader = TableShader(self.mi, self.table, self.camera.resolution, self.pitch[0], shadow=self.shadows)
+
+    @property
+    def _crops(self) -> bool:
+        return not self.shadows  # which come from anywhere in the image
 
     @property
     def view_ratio(self) -> tuple[float, float]:

@@ -47,23 +47,35 @@ class FastTracer(Tracer):
         """True if shadows are cast."""
         return casts_shadows(self.sensor, self.config.shadows)
 
+    @property
+    def _crops(self) -> bool:
+        return self.config.flat_field is None  # which is taken of the whole image
+
     def _build(self, grid: PadGrid) -> FastArrays:
         mi, bounce = self.mi, None
         lamps = [Lamp.from_spec(mi, led) for led in self.sensor.lights.leds]
         if self._lit and self.config.bounce:
             scene = SensorScene(mi, self.sensor, grid)
             case = CaseLight.fit(scene, self._scene_lamps, self.groups, self.seed)
-            bounce = BounceField.build(mi, self.layout, case)
+            bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         self._arrays = FastArrays(lamps, bounce, [])
         self._set_flat_field(grid)
-        return replace(self._arrays, scale=self.response.device_scale(mi))
+        return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
+
+    @property
+    def _lit_channels(self) -> list[int]:
+        """Channels of all layers that an LED gives light to."""
+        leds = zip(self.sensor.lights.leds, self.groups, strict=True)
+        return sorted({3 * group + c for led, group in leds for c in range(3) if led.power[c] > 0.0})
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
-        width, height = self.camera.resolution
+        width, height = self.camera.size
         layout, channels = CoatLayout.from_grid(grid), 3 * len(self.layer_names)
         # A pixel's levels before and after they are interleaved, and in bytes; a channel each.
         pixel = 27 * ("rgb" in self.outputs) + 4 * channels * ("layers" in self.outputs)
-        indirect = BounceField.memory_per_env(layout, channels) if self.config.bounce else 0
+        indirect = 0
+        if self.config.bounce:
+            indirect = BounceField.memory_per_env(layout, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 
@@ -111,7 +123,7 @@ class FastTracer(Tracer):
             for c in range(3):
                 out[3 * group + c] += lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
         if grids is not None and inputs.own.bounce is not None:
-            for k, e in enumerate(inputs.own.bounce.irradiance(mi, grids, seen)):
+            for k, e in inputs.own.bounce.irradiance(mi, grids, seen):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
 

@@ -15,13 +15,14 @@ the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
@@ -37,6 +38,10 @@ REACH = 7
 """Radius of the neighbourhood that lights a patch [patches]."""
 TILT = 1.2
 """Largest tangent of a normal's tilt in the fit."""
+_BULGE = 0.2
+"""Height of a bulge over the gel's thickness up to which what is in view is known: more than a gel that cannot be compressed shows."""
+_RAYS = 33
+"""Camera rays along a side of the image that tell which patches are in view."""
 
 
 def _monomials(u: Any, v: Any) -> list[Any]:
@@ -96,40 +101,66 @@ def patches_of(layout: CoatLayout) -> NodeGrid:
     return NodeGrid(nx, ny, layout.x0, layout.y0, dx, dy)
 
 
+def patches_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:
+    """First column, first row, columns and rows of the patches between which a camera's pixels see the coat of a gel.
+
+    It is as thick [m] at most as at rest and a bulge.
+    """
+    left, top, width, height = camera.piece
+    u, v = np.meshgrid(np.linspace(left, left + width, _RAYS), np.linspace(top, top + height, _RAYS))
+    origin, slope = camera.ray(u, v)
+    z = thickness * np.array([-1.0, _BULGE])[:, None, None] - origin[2]
+    spans = []
+    for k, (first, step, count) in enumerate(((g.x0, g.dx, g.nx), (g.y0, g.dy, g.ny))):
+        seen = (origin[k] + z * slope[k] - first) / step
+        start = int(np.clip(np.floor(seen.min()) - 1, 0, count - 2))
+        stop = int(np.clip(np.ceil(seen.max()) + 2, start + 2, count))
+        spans.append((start, stop - start))
+    return spans[0][0], spans[1][0], spans[0][1], spans[1][1]
+
+
 @dataclass(frozen=True)
 class BounceField:
     """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, computed each frame.
 
-    (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal.
+    (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal. It is
+    gathered for the patches in view and the channels that have light: LEDs of one colour leave the others of their layer dark.
     """
 
     patches: NodeGrid
+    view: tuple[int, int, int, int]
+    """Patches for which light is gathered: first column, first row, columns and rows."""
+    lit: tuple[int, ...]
+    """Channels with light, of all layers."""
     case: list[Any]
-    """Packed (e, v_x, v_y, v_z) of every node, one array a channel."""
-    offset_x: Any
-    offset_y: Any
-    """Columns and rows from a patch to those of its neighbourhood."""
+    """Packed (e, v_x, v_y, v_z) of every node, one array a lit channel."""
 
     @classmethod
-    def build(cls, mi: Any, layout: CoatLayout, case: CaseLight) -> BounceField:
-        """Lay the grid over the pad and evaluate the case's light on it."""
+    def build(
+        cls, mi: Any, layout: CoatLayout, case: CaseLight, camera: Pinhole, thickness: float, lit: Sequence[int]
+    ) -> BounceField:
+        """Lay the grid over the pad and evaluate the case's light on it.
+
+        ``thickness`` of the gel [m]; ``lit``: channels that an LED gives light to.
+        """
         g = patches_of(layout)
         x, y = np.meshgrid(g.x0 + g.dx * np.arange(g.nx), g.y0 + g.dy * np.arange(g.ny))
-        k = np.arange(-REACH, REACH + 1)
-        ox, oy = (a.ravel() for a in np.meshgrid(k, k))
-        near = (ox**2 + oy**2 <= REACH**2) & ((ox != 0) | (oy != 0))
-        offsets = (mi.Int32(o[near].astype(np.int32)) for o in (ox, oy))
-        return cls(g, [mi.Float(c.ravel()) for c in case.on(x.ravel(), y.ravel())], *offsets)
+        on_nodes = case.on(x.ravel(), y.ravel())
+        return cls(g, patches_in_view(g, camera, thickness), tuple(lit), [mi.Float(on_nodes[k].ravel()) for k in lit])
 
     @staticmethod
-    def memory_per_env(layout: CoatLayout, channels: int) -> int:
-        """Bytes that the grid takes while it is filled: packed results of each channel, patches, their light by layer, heights."""
+    def memory_per_env(layout: CoatLayout, camera: Pinhole, thickness: float, lit: Sequence[int]) -> int:
+        """Bytes that the grid takes while it is filled: packed results of each lit channel, patches, their light, heights."""
         g = patches_of(layout)
-        return g.nx * g.ny * (16 * channels + 16 + 16 * (channels // 3) + 4)
+        _, _, columns, rows = patches_in_view(g, camera, thickness)
+        return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """Packed (e, v_x, v_y, v_z) for the coat ``field``, an array a channel; ``radiosity``: B [radiance · sr] of each at a sample."""
-        g, channels, offsets = self.patches, len(self.case), dr.width(self.offset_x)
+        """Packed (e, v_x, v_y, v_z) of the patches in view of the coat ``field``, an array a lit channel.
+
+        ``radiosity``: B [radiance · sr] of every channel at a sample.
+        """
+        g = self.patches
         i = dr.arange(mi.UInt32, envs * (g.nx * g.ny))
         env, ix, iy = i // (g.nx * g.ny), i % g.nx, (i // g.nx) % g.ny
         x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
@@ -141,13 +172,19 @@ class BounceField:
         n = dr.normalize(mi.Normal3f(*g.slopes(mi, z, i, ix, iy), -1))
         b = radiosity(PixelSample(env, mi.Point3f(x, y, z), n, mi.Vector3f(0, 0, -1)))
         patches = dr.ravel(mi.Vector4f(z, n.x, n.y, n.z))
-        # Four channels a packet, so that one gather brings the colours of a layer.
-        packets = [dr.ravel(mi.Vector4f(*b[k : k + 3], 0)) for k in range(0, channels, 3)]
+        # Four channels a packet, so that one gather brings them.
+        lit = [b[k] for k in self.lit]
+        packets = [dr.ravel(mi.Vector4f(*lit[k : k + 4], *[0] * (4 - len(lit[k : k + 4])))) for k in range(0, len(lit), 4)]
         dr.eval(patches, packets)
+        left, top, columns, rows = self.view
+        w = dr.arange(mi.UInt32, envs * (columns * rows))
+        env, ix, iy = w // (columns * rows), w % columns + left, (w // columns) % rows + top
+        i = (env * g.ny + iy) * g.nx + ix
+        here = dr.gather(mi.Vector4f, patches, i)
+        z, n = here.x, mi.Vector3f(here.y, here.z, here.w)
         area = g.dx * g.dy / np.pi
 
-        def add(k: Any, v: list[Any]) -> tuple[Any, list[Any]]:
-            ox, oy = dr.gather(mi.Int32, self.offset_x, k), dr.gather(mi.Int32, self.offset_y, k)
+        def add(ox: Any, oy: Any, v: list[Any]) -> tuple[Any, Any, list[Any]]:
             jx, jy = mi.Int32(ix) + ox, mi.Int32(iy) + oy
             ok = (jx >= 0) & (jx < g.nx) & (jy >= 0) & (jy < g.ny)
             j = mi.UInt32((mi.Int32(env) * g.ny + jy) * g.nx + jx)
@@ -159,14 +196,18 @@ class BounceField:
             # ΔA_j is the patch's area on the slope: its footprint over |n_z|.
             weight = dr.select(ok & (cos_i > 0) & (cos_j > 0), area * cos_j / (-q.w * r2 * r2), 0)
             out = list(v)
-            for layer, packet in enumerate(packets):
+            for m, packet in enumerate(packets):
                 light = dr.gather(mi.Vector4f, packet, j, ok)
-                for c in range(3):
-                    out[3 * layer + c] = out[3 * layer + c] + d * (weight * light[c])
-            return k + 1, out
+                for c in range(len(out[4 * m : 4 * m + 4])):
+                    out[4 * m + c] = out[4 * m + c] + d * (weight * light[c])
+            # Row by row through a disc; the patch itself is among them and gives nothing.
+            ends = (ox + 1) * (ox + 1) + oy * oy > REACH**2
+            following = dr.select(ends, oy + 1, oy)
+            first = -mi.Int32(dr.sqrt(mi.Float(dr.maximum(REACH**2 - following * following, 0))))
+            return dr.select(ends, first, ox + 1), following, out
 
-        start = (mi.UInt32(0), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in range(channels)])
-        _, gathered = dr.while_loop(start, lambda k, v: k < offsets, add, label="coat bounce")
+        start = (mi.Int32(0), mi.Int32(-REACH), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in self.lit])
+        *_, gathered = dr.while_loop(start, lambda ox, oy, v: oy <= REACH, add, label="coat bounce")
         node = i - env * (g.nx * g.ny)
         result = []
         for base, v in zip(self.case, gathered, strict=True):
@@ -175,9 +216,16 @@ class BounceField:
         dr.eval(result)
         return result
 
-    def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample) -> list[Any]:
-        """E [radiance · sr] of every channel at the points and normals of ``seen``."""
-        n, g = seen.n, self.patches
-        i, wx, wy = g.cell(mi, seen.env, seen.p.x, seen.p.y)
-        fields = (bilinear(g.corners(mi.Vector4f, grid, i), wx, wy) for grid in grids)
-        return [dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0) for e in fields]
+    def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample) -> list[tuple[int, Any]]:
+        """(channel, E [radiance · sr]) of the lit channels at the points and normals of ``seen``."""
+        n, g, (left, top, columns, rows) = seen.n, self.patches, self.view
+        k, wx, wy = g.cell(mi, 0, seen.p.x, seen.p.y)
+        # Within the patches in view, whatever the ray has hit.
+        ix, iy = (
+            dr.clip(mi.Int32(at) - first, 0, count - 2)
+            for at, first, count in ((k % g.nx, left, columns), (k // g.nx, top, rows))
+        )
+        view = replace(g, nx=columns, ny=rows)
+        i = (seen.env * rows + mi.UInt32(iy)) * columns + mi.UInt32(ix)
+        fields = (bilinear(view.corners(mi.Vector4f, grid, i), wx, wy) for grid in grids)
+        return [(c, dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0)) for c, e in zip(self.lit, fields, strict=True)]
