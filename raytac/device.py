@@ -1,4 +1,4 @@
-"""Devices: choose CPU or CUDA once, and find the LLVM library that Dr.Jit compiles CPU code with.
+"""Devices: choose CPU or CUDA, and find the LLVM library of Dr.Jit's CPU code.
 
 Nothing here imports Mitsuba, Dr.Jit or Warp, so that asking is cheap and safe.
 """

@@ -1,4 +1,7 @@
-"""A check that ``import ipc`` means raytac's own solver: other packages of that name can be installed."""
+"""A check that ``import ipc`` means raytac's own solver.
+
+Other packages of that name can be installed.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rotations and rigid transforms: matrices, quaternions, rotation vectors, wrenches, and checks of poses that users give."""
+"""Rotations and rigid transforms: matrices, quaternions, rotation vectors, wrenches.
+
+Poses that users give are checked here.
+"""
 
 from __future__ import annotations
 

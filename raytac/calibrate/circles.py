@@ -1,4 +1,4 @@
-"""Contact circles found in images of ball presses: where the colour steps most along the whole circle.
+"""Contact circles in images of ball presses: where the colour changes most along a circle.
 
 With D the image minus that of the untouched sensor, the score of a circle is the mean over its angles of the step |D(r − δ) − D(r + δ)|,
 Euclidean over the channels [levels]. The shading of a pressed ball is strongest at the rim of its contact and falls off within the

@@ -1,4 +1,6 @@
-"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses, with direct light as forward model.
+"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses.
+
+The forward model is direct light.
 
 Residuals are those of the presses with the real background B as flat field, and of the image at rest,
 
@@ -82,7 +84,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitState:
-    """State of a fit: lights and response, s of the imprint at its inner knots, circles (N, 3) [px]."""
+    """State of a fit: lights, response, s at the imprint's inner knots, circles (N, 3) [px]."""
 
     p: LightParameters
     slopes: np.ndarray
@@ -90,7 +92,10 @@ class FitState:
 
 
 class DirectFit:
-    """The least-squares problem. Pixels are those near the circles of ``shots``, which also are the prior of the circles."""
+    """The least-squares problem on the pixels near the circles of ``shots``.
+
+    Those circles are also the prior of the circles.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,6 @@
-"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle, shared by all presses.
+"""Imprint of a ball: one radial profile of slopes about each contact circle.
+
+All presses of a calibration share it.
 
 Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
@@ -30,7 +32,10 @@ _TABLE = np.linspace(0, KNOTS[-1], 751)
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Coat that pixels see: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
+    """Coat that pixels see, pad frame: points ``p`` [m] and normals ``n``, each (3, M).
+
+    Normals point towards the camera.
+    """
 
     p: np.ndarray
     n: np.ndarray

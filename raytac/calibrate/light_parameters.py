@@ -1,4 +1,6 @@
-"""Parameters of a fit of lights: place, aim, lobe, height and power of every LED, glow of the case, response; and ties between LEDs.
+"""Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
+
+An LED has place, aim, lobe, height and power.
 
 A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
 nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
@@ -184,7 +186,10 @@ LEAST = 1.0
 
 @dataclass(frozen=True)
 class Ties:
-    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,), in standard deviations."""
+    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,).
+
+    Both are in standard deviations.
+    """
 
     matrix: np.ndarray
     offset: np.ndarray

@@ -1,4 +1,4 @@
-"""Photographs of ball presses, as floats in 8-bit levels, and what those levels mean in linear light."""
+"""Photographs of ball presses as floats in 8-bit levels, and their linear light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real images of ball presses, read from the three layouts that calibrations are published in.
+"""Real images of ball presses, read from three published layouts.
 
 - ``labels.csv`` (columns ``diameter``, ``index``, ``cx_px``, ``cy_px``, ``r_px``, and perhaps ``edge_score``, ``fully_visible``) beside
   ``background.png`` and ``DIAMETER_INDEX.png``, such as ``6.310mm_07.png``.

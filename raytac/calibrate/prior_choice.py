@@ -1,4 +1,4 @@
-"""Strength of a fit's priors, chosen by cross-validation within the presses that are fitted to.
+"""Strength of a fit's priors, by cross-validation within the presses that are fitted.
 
 Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
 halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a

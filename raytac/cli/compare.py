@@ -1,4 +1,4 @@
-"""``raytac compare``: what each optical mode costs, and how far it is from the converged reference."""
+"""``raytac compare``: time of each optical mode, and its error against the reference."""
 
 from __future__ import annotations
 

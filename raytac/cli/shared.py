@@ -1,4 +1,4 @@
-"""Options that several commands have, and the data set that ``calibrate`` and ``compare-real`` read."""
+"""Options of several commands, and the data set of ``calibrate`` and ``compare-real``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A contact sheet: the first presses of a data set at a glance, images over maps of their indentation, with a scale."""
+"""A contact sheet: the first presses of a data set, images over maps of their indentation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""``PressDataset``: presses of a data set by number, as dictionaries of arrays; needs NumPy and pyarrow alone."""
+"""``PressDataset``: presses of a data set by number, as dictionaries of arrays.
+
+It needs NumPy and pyarrow alone.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ from raytac.errors import InputError
 
 
 class PressDataset:
-    """Sound presses of a data set; what ``torch.utils.data.DataLoader`` takes as a map-style data set, without PyTorch.
+    """Sound presses of a data set, as a map-style data set of PyTorch has them.
+
+    ``torch.utils.data.DataLoader`` takes it; PyTorch is not needed.
 
     .. code-block:: python
 

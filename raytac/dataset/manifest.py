@@ -1,4 +1,7 @@
-"""``manifest.parquet``: one row a press, failed or not, with its parameters, its forces and where its arrays are."""
+"""``manifest.parquet``: one row a press, with parameters, forces and place of its arrays.
+
+Failed presses have rows too.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the presses of a shard to its arrays: what one worker does, on whatever machine it runs."""
+"""From the presses of a shard to its arrays: the work of one worker."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Built:
 
 
 class ShardRenderer:
-    """Renders shards of one plan, in any order; what a shard holds does not depend on those before.
+    """Renders shards of one plan, in any order; a shard does not depend on those before.
 
     .. code-block:: python
 

@@ -1,4 +1,4 @@
-"""Render a data set into a folder: what is missing or damaged there, on the engine of one's choice."""
+"""Render a data set into a folder: the shards that are missing or damaged, on any engine."""
 
 from __future__ import annotations
 

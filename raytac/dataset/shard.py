@@ -1,4 +1,4 @@
-"""Shards on disk: a whole ``.npz`` of arrays and a ``.json`` of rows each, checked by SHA-256."""
+"""Shards on disk: a ``.npz`` of arrays and a ``.json`` of rows each, checked by SHA-256."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images on disk: 8-bit PNG, linear OpenEXR with named channels, and sheets of several pictures."""
+"""Images on disk: 8-bit PNG, linear OpenEXR with named channels, sheets of pictures."""
 
 from __future__ import annotations
 

@@ -14,7 +14,10 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Base of an ``Args`` dataclass: ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
+    """Base of an ``Args`` dataclass.
+
+    Write ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``.
+    """
 
     out: Path | None = None
     """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""

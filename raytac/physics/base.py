@@ -23,7 +23,9 @@ OfSurface = np.ndarray | Callable[[GelSurface], np.ndarray]
 
 
 class PadReading:
-    """B pads of one sensor at one instant, in a press or in a world; pad frame. Forces are those of all that touches, on the gel.
+    """B pads of one sensor at one instant, in a press or in a world; pad frame.
+
+    Forces are those of all that touches, on the gel.
 
     Attributes:
         failed: environments whose physics broke down, (B,), bool; their arrays hold NaN.
@@ -150,7 +152,9 @@ class Pad(Protocol):
 
 
 class PhysicsConfig(Protocol):
-    """Configuration of one physics: a frozen dataclass that checks itself. ``raytac.physics.register`` makes it known by a name.
+    """Configuration of one physics: a frozen dataclass that checks itself.
+
+    ``raytac.physics.register`` makes it known by a name.
 
     A field ``level`` that is None is filled with the scene's, else ``coarse``.
     """

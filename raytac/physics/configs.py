@@ -1,4 +1,4 @@
-"""Configurations of the physics that come with raytac; making one imports neither MuJoCo nor the solver."""
+"""Configurations of raytac's own physics; they import neither MuJoCo nor the solver."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rigid:
-    """Rigid pad on MuJoCo: geometry and Gaussians give the gel's surface, a load law ties force to depth."""
+    """Rigid pad on MuJoCo: a load law ties force to depth, Gaussians give the gel's surface."""
 
     is_simulated: ClassVar[bool] = False
 

@@ -1,4 +1,7 @@
-"""From the geoms of a MuJoCo model to the parts that the height-field code senses, so that any MuJoCo object can be pressed in."""
+"""From the geoms of a MuJoCo model to parts of the height-field code.
+
+So any MuJoCo object can be pressed in.
+"""
 
 from __future__ import annotations
 

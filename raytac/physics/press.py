@@ -1,4 +1,4 @@
-"""Pads of a press: per-environment targets, checks of the trajectory, and the loop over its stages that all pads share."""
+"""Pads of a press: targets by environment, checks of the trajectory, loop over its stages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from raytac.specs.sensor import GelpadSpec, SensorSpec
 
 
 class PressTargets:
-    """Targets of B environments; a number that is not finite marks its environment as ``lost``: it fails from the start.
+    """Targets of B environments.
+
+    A number that is not finite marks its environment as ``lost``: it fails from the start.
 
     Attributes:
         offsets: added to the object's x, y [m], (B, 2).
@@ -180,7 +182,7 @@ def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Par
 
 
 class PressPad(ABC):
-    """Base of the pads of a press: the object before the gel, and the loop over the stages of its trajectory.
+    """Base of the pads of a press: the object before the gel, and the loop over the stages.
 
     A subclass says where a press starts (``reset``), how the object moves through a stage (``begin``, ``advance``) and what is then
     to be read (``read``).

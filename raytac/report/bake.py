@@ -1,4 +1,4 @@
-"""Bake a table and write its folder: files as Taxim has them, coverage, error by scene against the ray tracer."""
+"""Bake a table and write its folder: Taxim's files, coverage, error by scene."""
 
 from __future__ import annotations
 

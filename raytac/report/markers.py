@@ -1,4 +1,4 @@
-"""Calibration of a pad's marker motion: the fitted file, errors on held-out presses as table and figures, and metrics."""
+"""Calibration of a pad's marker motion: fitted file, errors on held-out presses, metrics."""
 
 from __future__ import annotations
 

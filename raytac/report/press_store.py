@@ -1,4 +1,4 @@
-"""Finished presses of the soft pad, kept on disk so that an interrupted calibration goes on where it stopped."""
+"""Finished presses of the soft pad on disk, so that an interrupted calibration goes on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ _CODE = ("ipc", "raytac.physics")
 
 
 class PressStore:
-    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it: gelpad, press, level, device, code and versions."""
+    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it.
+
+    That is gelpad, press, level, device, code and versions.
+    """
 
     def __init__(
         self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, code: str, say: Callable[[str], object] = print

@@ -1,4 +1,4 @@
-"""``raytac compare-real``: every optical mode against real photographs of presses that it was not fitted to."""
+"""``raytac compare-real``: optical modes against photographs of other presses."""
 
 from __future__ import annotations
 

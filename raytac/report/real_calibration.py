@@ -1,4 +1,4 @@
-"""``raytac calibrate DATASET``: one optical mode fitted to real presses, its errors on others, and its files."""
+"""``raytac calibrate DATASET``: fit one optical mode to real presses, with errors on others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Optical modes of one sensor, each built once: a ray tracer fits the case's light and compiles kernels, which takes seconds."""
+"""Optical modes of one sensor, each built once.
+
+A ray tracer fits the case's light and compiles kernels, which takes seconds.
+"""
 
 from __future__ import annotations
 

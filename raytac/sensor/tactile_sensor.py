@@ -1,4 +1,7 @@
-"""``TactileSensor``: one sensor, one physics, one optical mode; a press or a surface goes in, a ``TactileFrame`` comes out."""
+"""``TactileSensor``: one sensor, one physics, one optical mode.
+
+A press or a surface goes in, a ``TactileFrame`` comes out.
+"""
 
 from __future__ import annotations
 

@@ -103,7 +103,10 @@ class ObjectSpec:
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One leg of the trajectory; targets are absolute, measured from first touch at zero shear and twist."""
+    """One stage of the trajectory.
+
+    Targets are absolute, measured from first touch at zero shear and twist.
+    """
 
     kind: str
     """``indent shear twist release``."""

@@ -1,4 +1,4 @@
-"""Rules that need more than one value of a sensor: what must fit, see, or stay clear of what."""
+"""Rules that need more than one value of a sensor."""
 
 from __future__ import annotations
 

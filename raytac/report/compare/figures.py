@@ -1,4 +1,4 @@
-"""Pictures of a comparison: error against time, and a sheet of images with their signed errors for each scene."""
+"""Pictures of a comparison: error against time, and images with signed errors by scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error and time of the cheap marker models against surface tracking, on presses that no fit has seen."""
+"""Error and time of cheap marker models against surface tracking, on held-out presses."""
 
 from __future__ import annotations
 

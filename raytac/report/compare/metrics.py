@@ -1,4 +1,4 @@
-"""Figures over all scenes of a comparison: summary of each mode, equal error, and the flat keys of ``metrics.json``."""
+"""Figures over all scenes of a comparison: summary by mode, equal error, flat keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Optical modes of a comparison and their settings: all registered modes, and the package ``taxim``."""
+"""Optical modes of a comparison: all registered modes, and the package ``taxim``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Mode:
 
 
 class _Sampled:
-    """A mode with noise at one number of samples; several share one tracer, which is costly to build."""
+    """A mode with noise at one number of samples; several share one costly tracer."""
 
     def __init__(self, mode: Any, spp: int, seed: int) -> None:
         self._render = partial(mode.render, spp=spp, seed=seed)

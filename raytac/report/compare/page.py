@@ -1,4 +1,4 @@
-"""Write a comparison: report.html, pareto.png, a sheet of images a scene, results.parquet and metrics.json."""
+"""Files of a comparison: report, figures, sheets of images, table, metrics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PyPI package ``taxim`` as a peer: its own sensor and calibration, timed on the same contacts."""
+"""The PyPI package ``taxim`` as a peer: its own sensor and table, on the same contacts."""
 
 from __future__ import annotations
 

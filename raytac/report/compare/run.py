@@ -1,4 +1,4 @@
-"""``raytac compare``: every optical mode on the same gel surfaces in one run, error beside time.
+"""``raytac compare``: every optical mode on the same gel surfaces, error beside time.
 
 Rows (scene x resolution x mode) are measured one after another and kept in ``out/rows``, converged references in ``out/references``:
 the same command run again goes on where it stopped.
@@ -281,7 +281,7 @@ class _Run:
 
 
 class _Scene:
-    """One press at one resolution, with what its rows are compared to; masks are made when a row needs them."""
+    """One press at one resolution, with its references; masks are made when a row needs them."""
 
     def __init__(self, name: str, surface: GelSurface, references: References, tracers: Tracers, size: tuple[int, int]) -> None:
         self.name, self.surface, self._tracers, self._size = name, surface, tracers, size

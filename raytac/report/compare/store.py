@@ -1,4 +1,4 @@
-"""Finished rows of a long comparison, kept on disk so that an interrupted run goes on where it stopped."""
+"""Finished rows of a comparison on disk, so that an interrupted run goes on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ Value = str | int | float | bool | None
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one scene, resolution and mode by column name, None where one is not defined or not known; and the image."""
+    """Figures of one scene, resolution and mode by column name; and the image.
+
+    A figure is None where it is not defined or not known.
+    """
 
     figures: dict[str, Value]
     image: np.ndarray
@@ -87,7 +90,10 @@ def _digest_image(image: np.ndarray) -> str:
 
 
 class References:
-    """Images of the ``reference`` integrator without limit of depth, in ``folder`` under a hash of all that shapes them."""
+    """Images of the ``reference`` integrator without limit of depth, kept in ``folder``.
+
+    Their names are hashes of all that shapes them.
+    """
 
     def __init__(
         self, folder: Path, tracers: Tracers, size: tuple[int, int], spp: int, say: Callable[[str], object] = print
