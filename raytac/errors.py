@@ -124,7 +124,9 @@ class MeshError(SpecError):
 
 
 def short_repr(value: object, limit: int = 80) -> str:
-    """``repr`` cut to ``limit`` characters, for any value; a path as plain text and whole up to ``_LONGEST_PATH`` characters.
+    """``repr`` cut to ``limit`` characters, for any value.
+
+    A path is plain text, and whole up to ``_LONGEST_PATH`` characters.
 
     Integers too long to be printed, deep and long containers, and objects whose ``repr`` fails are abbreviated.
     """
@@ -140,7 +142,10 @@ def short_repr(value: object, limit: int = 80) -> str:
 
 
 def _pieces(value: object, limit: int, levels: int) -> Iterator[str]:
-    """``repr`` of ``value`` piece by piece, so that a reader can stop; no piece needs more than ``levels`` nested calls."""
+    """``repr`` of ``value`` piece by piece, so that a reader can stop.
+
+    No piece needs more than ``levels`` nested calls.
+    """
     if isinstance(value, (list, tuple, dict)) and type(value).__repr__ in (list.__repr__, tuple.__repr__, dict.__repr__):
         first, last = {list: "[]", tuple: "()", dict: "{}"}[next(t for t in (list, tuple, dict) if isinstance(value, t))]
         yield first

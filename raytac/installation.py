@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def foreign_ipc() -> str | None:
-    """Return where ``import ipc`` would come from if that is not raytac's own ``ipc`` package; None if all is well.
+    """Return the place of a foreign ``ipc`` package that ``import ipc`` would take, or None.
 
     The other package is not run: its file is read as text.
     """

@@ -56,7 +56,7 @@ def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
-    """x, y and radius [m] in the pad frame of circles x, y, radius [px of the sensor's resolution], (N, 3).
+    """x, y and radius [m] in the pad frame of circles (N, 3) [px of the sensor's resolution].
 
     A circle in the image is that of the rim, which lies about a² / 2R nearer to the camera than the pad at rest.
     """
@@ -82,7 +82,9 @@ def pixel_geometry(
     ball_radius: np.ndarray,
     slopes: np.ndarray,
 ) -> PixelGeometry:
-    """Coat seen by the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses ``press`` (M,).
+    """Coat seen by the pixels ``u``, ``v`` (M,) of the presses ``press`` (M,).
+
+    Pixels are those of the sensor's resolution.
 
     ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
     The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.
@@ -117,7 +119,9 @@ def pixel_geometry(
 def press_surface(
     sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
 ) -> GelSurface:
-    """The pad under every ball as a batch of surfaces on ``grid``; arguments as for ``pixel_geometry``.
+    """The pad under every ball as a batch of surfaces on ``grid``.
+
+    Arguments as of ``pixel_geometry``.
 
     Raises InputError: a contact circle as wide as its ball.
     """

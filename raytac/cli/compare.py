@@ -59,7 +59,7 @@ class CompareArgs(SolverOptions):
         return print_paths(written)
 
     def settings(self) -> CompareSettings:
-        """Settings that the options mean. Raises InputError for names or numbers that cannot be read."""
+        """Settings of the options. Raises InputError for names or numbers that cannot be read."""
         sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
         chosen = CompareSettings(
             sensor=self.sensor,

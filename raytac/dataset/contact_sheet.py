@@ -29,7 +29,7 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 
 
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
-    """Figure of the first ``count`` presses: number, object, depth, image and indentation of the pad.
+    """Figure of the first ``count`` presses: number, object, depth, image and indentation.
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 

@@ -98,7 +98,10 @@ class PressDataset:
         return arrays | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
-        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest. Errors as for ``data[i]``."""
+        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest.
+
+        Errors as for ``data[i]``.
+        """
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
 
@@ -160,7 +163,10 @@ def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[s
 
 
 def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:
-    """Kinds of the arrays of a shard as ``dataset.json`` has them, with its sensor's shapes; and the sizes that are known."""
+    """Kinds of a shard's arrays as in ``dataset.json``, and the sizes that are known.
+
+    Shapes are those of its sensor.
+    """
     own: dict[str, Any] = description["sensors"][file.sensor]["arrays"]
     declared = {**description["arrays"], **description["arrays_of_a_shard"]}
     kinds = {name: ArrayKind(item["dtype"], tuple(own.get(name, item["shape"])), "", "") for name, item in declared.items()}

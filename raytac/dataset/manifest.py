@@ -30,7 +30,7 @@ def check_pyarrow() -> None:
 
 
 def write_manifest(folder: Path, records: Iterable[ShardRecord]) -> Path:
-    """Write the rows of shards, in the order given; units and meanings are in the fields' metadata.
+    """Write the rows of shards in the order given; fields' metadata hold units and meanings.
 
     Raises:
         InputError: a row has a value of the wrong kind.

@@ -31,7 +31,7 @@ def cache_folder(kind: str) -> Path | None:
 
 
 def read_cached(path: Path | None) -> bytes | None:
-    """Contents that ``keep_cached`` kept; None if there are none or, with a warning, if they are damaged."""
+    """Contents that ``keep_cached`` kept; None if there are none, or damaged ones (warns)."""
     if path is None:
         return None
     try:

@@ -40,7 +40,7 @@ def parse_resolution(text: str) -> tuple[int, int]:
 
 
 def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once, in the order given.
+    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once.
 
     Raises:
         InputError: none, or one that is not in ``choices`` (None is any).

@@ -88,7 +88,9 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
 
 
 def load_marker_motion(name_or_path: str | Path, *, base: Path | None = None) -> MarkerMotionSpec:
-    """Read and check a file of ``scenes/markers/``: a shipped name such as ``"gelsight_mini"`` or a path, relative to ``base`` if given.
+    """Read and check a file of ``scenes/markers/``.
+
+    A shipped name such as ``"gelsight_mini"``, or a path, relative to ``base`` if given.
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range.

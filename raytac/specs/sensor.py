@@ -127,7 +127,7 @@ class GelpadSpec:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays.
+        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m] in the radii.
 
         s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
         carried along one of radius Ry.
@@ -184,7 +184,7 @@ class CameraSpec:
         check_fields(vars(self), SENSOR_SCHEMA["camera"], "camera")
 
     def pitch_at(self, resolution: tuple[int, int]) -> Vec2:
-        """Size along x and y [m] of a pixel on the plane z = 0 where the whole image has ``resolution`` (width, height) [px]."""
+        """Size along x and y [m] of a pixel on z = 0 at a ``resolution`` (width, height) [px]."""
         (px, py), (nx, ny), (width, height) = self.pixel_pitch, self.resolution, resolution
         return px * nx / width, py * ny / height
 
@@ -301,10 +301,7 @@ class OpticsSpec:
 
 @dataclass(frozen=True)
 class LedSpec:
-    """One LED: a rectangle that emits from its front side with intensity ∝ cosⁿ θ.
-
-    Its radiance is ∝ cos^(n−1) θ.
-    """
+    """One LED: a rectangle that emits from its front side with radiance ∝ cos^(n−1) θ."""
 
     name: str
     layer: str
@@ -330,7 +327,7 @@ class LedSpec:
 
     @property
     def edges(self) -> tuple[Vec3, Vec3]:
-        """Unit directions u, v of the rectangle's edges, pad frame: u along z × axis, v = axis × u; (u, v, axis) right-handed."""
+        """Unit vectors u along z × axis and v = axis × u of the edges, pad frame; right-handed."""
         ax, ay, az = self.axis
         flat = math.hypot(ax, ay)
         ux, uy = (-ay / flat, ax / flat) if flat > 1e-9 else (1.0, 0.0)
@@ -368,9 +365,7 @@ SENSOR_PARTS: Final = {
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """A sensor.
-
-    Each part checks its own ranges when it is made, and ``validate_sensor`` checks them together.
+    """A sensor: parts check their own ranges, ``validate_sensor`` checks them together.
 
     The latter is done for a file and for every sensor that is used, not here, so that a fit may move lights through each other.
     """
