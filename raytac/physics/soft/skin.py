@@ -77,7 +77,8 @@ def _weights(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _squares(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Squared distances [m²], (P, n)."""
-    return ((points[:, None] - vertices[None]) ** 2).sum(axis=-1)
+    x, y, z = ((points[:, None, k] - vertices[:, k]) ** 2 for k in range(3))
+    return x + y + z
 
 
 def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
