@@ -79,13 +79,16 @@ class PadReading:
 
     @cached_property
     def wrench(self) -> np.ndarray:
-        """Force on the pad [N] and its torque about the pad frame's origin [N m], (B, 6); NaN of a bare surface."""
+        """Force on the pad [N] and torque about the frame's origin [N m], (B, 6).
+
+        NaN of a bare surface.
+        """
         if self._wrench is None:
             return np.full((len(self.failed), 6), np.nan)
         return self._wrench(self.surface) if callable(self._wrench) else self._wrench
 
     def traction(self) -> np.ndarray:
-        """Traction on the pad [Pa], (B, Ny, Nx, 3), as ``TactileFrame.traction``; NaN if it is not known."""
+        """Traction on the pad [Pa], (B, Ny, Nx, 3), as ``TactileFrame.traction``; NaN if unknown."""
         if self._traction is None:
             return np.full((*self.surface.height.shape, 3), np.nan, np.float32)
         return self._traction(self.surface) if callable(self._traction) else self._traction
@@ -147,7 +150,10 @@ class Pad(Protocol):
         ...
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx), inf where it is not; None without an object."""
+        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
+
+        inf where it is not; None without an object.
+        """
         ...
 
 

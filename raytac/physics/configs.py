@@ -65,7 +65,10 @@ class Ipc:
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
     def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
-        """The pad of a press; the solver traces no rays, so that CUDA needs no OptiX. See ``PhysicsConfig.build``."""
+        """The pad of a press, as ``PhysicsConfig.build``.
+
+        The solver traces no rays, so that CUDA needs no OptiX.
+        """
         from raytac.physics.soft.availability import check_solver
 
         check_solver("physics='ipc'")

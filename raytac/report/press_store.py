@@ -53,7 +53,7 @@ class PressStore:
         return states
 
     def write(self, press: Press, states: PressStates) -> None:
-        """Keep the states of a press, with a digest, so that neither half of a file nor a damaged one looks finished."""
+        """Keep the states of a press, with a digest, so that damage is seen."""
         mesh = states.coat.mesh
         arrays = {name: getattr(mesh, name) for name in ("rest", "faces", "lines_x", "lines_y")}
         arrays |= {"loads": np.array(states.loads), "poses": states.poses, "positions": states.coat.positions}
@@ -64,7 +64,7 @@ class PressStore:
 
 
 def press_code() -> str:
-    """Digest of the source code that a press depends on: the presses' own, and all of the solver and of physics."""
+    """Digest of the source code that a press depends on: its own, solver and physics."""
     return code_digest("raytac.markers.calibration_presses", *_modules())
 
 

@@ -76,7 +76,10 @@ class _Sampled:
 
 
 def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False) -> tuple[Mode, ...]:
-    """Every mode of the comparison; the sampled ones once for each of ``spp`` samples a pixel. ``quick`` builds no costly variants."""
+    """Every mode of the comparison; the sampled ones once for each of ``spp``.
+
+    ``quick`` builds no costly variants.
+    """
     modes = []
     for name in OPTICS.names:
         for variant in OPTICS.config_class(name).variants():

@@ -18,7 +18,9 @@ TEMPLATE = "compare_report.html.j2"
 
 
 def write_comparison(comparison: Comparison, out: Path, wall_s: float) -> list[Path]:
-    """Write all files of the report into ``out`` at once; those of an earlier run are replaced, sheets of other scenes removed.
+    """Write all files of the report into ``out`` at once, in place of those of an earlier run.
+
+    Sheets of other scenes are removed.
 
     Returns the files written. ``wall_s`` is the time of this run.
     """

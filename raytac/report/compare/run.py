@@ -204,7 +204,7 @@ class _Run:
         )
 
     def _digest(self, mode: Mode) -> str:
-        """Digest of the code behind a mode's row; reading sources takes a while, so each is read once."""
+        """Digest of the code behind a mode's row; each source is read once."""
         code = mode.code()
         if code not in self._digests:
             self._digests[code] = code_digest(*code, *CODE)
@@ -268,7 +268,10 @@ class _Run:
         return figures | {"batch_ms_per_frame": float(np.median(calls)) / self.batch, "batch_calls": len(calls)}
 
     def _memory(self, built: OpticalMode, surface: GelSurface, batched: bool) -> dict[str, Value]:
-        """Peak of the device arrays of one call, and its growth per environment [MiB]; None if not Dr.Jit."""
+        """Peak of the device arrays of one call, and its growth per environment [MiB].
+
+        None if not Dr.Jit.
+        """
         from raytac.optics.runtime import peak_bytes
 
         one, many = (moving([surface], n, 1)[0] for n in (1, self.batch))
@@ -297,7 +300,10 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region: half the difference of independent halves varies as their mean."""
+        """Noise of the reference by region.
+
+        Half the difference of independent halves varies as their mean.
+        """
         one, two = self._halves
         figures = {}
         for region, mask in self.masks.items():

@@ -49,7 +49,7 @@ class RowStore:
         self.folder, self.say = Path(folder), say
 
     def read(self, name: str, key: str) -> Row | None:
-        """The row written under ``name`` and ``key``, or None if there is none or its files are damaged."""
+        """The row written under ``name`` and ``key``; None if there is none or it is damaged."""
         path = self._path(name, key)
         if not path.is_file():
             return None
@@ -65,7 +65,7 @@ class RowStore:
             return None
 
     def write(self, name: str, key: str, row: Row) -> None:
-        """Keep a row; the JSON file comes last, so that an interrupt leaves no row that looks finished."""
+        """Keep a row; the JSON file comes last, so that no interrupted row looks finished."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._path(name, key)
         write_atomic(path.with_suffix(".png"), png_bytes(row.image))
@@ -106,11 +106,11 @@ class References:
         self._basis = "\n".join(basis).encode()
 
     def key(self, surface: GelSurface) -> str:
-        """Content hash of sensor, lights, surface, size, samples, seed, device, versions and code; 20 hex digits."""
+        """Hash of sensor, surface, size, samples, seed, device, versions and code; 20 hex digits."""
         return hashlib.sha256(self._basis + surface.height.astype(np.float32).tobytes()).hexdigest()[:20]
 
     def halves(self, scene: str, surface: GelSurface) -> np.ndarray:
-        """Two linear images of ``spp`` / 2 samples and independent seeds, (2, H, W, 3); read if kept."""
+        """Two linear images of ``spp`` / 2 samples and own seeds, (2, H, W, 3); read if kept."""
         path = self.folder / f"{scene}-{self.key(surface)}.npz"
         kept = self._read(path)
         if kept is not None:

@@ -59,7 +59,7 @@ class _Sparse:
 
 
 def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
-    """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis: linear elasticity on constant-strain tetrahedra.
+    """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis, by linear elasticity.
 
     A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
     """
